@@ -1,0 +1,163 @@
+"""Cameras: wavefront sensor and science."""
+
+from __future__ import annotations
+
+import abc
+from typing import final
+
+from escape_hw.api.device import Device
+from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, FrameStatus
+from escape_hw.errors import DeviceError, FrameTimeout, SettingRejected
+
+
+class Camera(Device):
+    """A camera. ``start`` and ``stop`` may be repeated; ``next_frame`` starts it when needed.
+
+    Drivers fill in ``_open``, ``_close``, ``_check``, ``_configure``, ``_start``, ``_stop`` and
+    ``_next_frame``.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._running = False
+        self._delivered = self._lost = self._timeouts = 0
+        self._last_index: int | None = None
+
+    @property
+    @abc.abstractmethod
+    def info(self) -> CameraInfo:
+        """Identity and fixed properties; available once open."""
+
+    @property
+    @abc.abstractmethod
+    def settings(self) -> CameraSettings:
+        """The settings in force, as read back from the device."""
+
+    @property
+    def is_running(self) -> bool:
+        """True while the camera acquires."""
+        return self._running
+
+    @final
+    def check(self, want: CameraSettings) -> CameraSettings:
+        """The nearest settings the device can do; changes nothing.
+
+        Raises
+        ------
+        SettingRejected
+            Nothing near ``want`` is possible; the message gives the allowed range.
+        """
+        self.require_open()
+        rows, columns = self.info.sensor_shape
+        region = want.region
+        if (
+            min(region.x, region.y) < 0
+            or min(region.width, region.height) < 1
+            or region.x + region.width > columns
+            or region.y + region.height > rows
+        ):
+            raise SettingRejected(
+                self.name, f"region {region} does not lie on the sensor of {columns} x {rows} pixels"
+            )
+        for name in ("exposure_s", "frame_rate_hz"):
+            if not getattr(want, name) > 0:
+                raise SettingRejected(self.name, f"{name} is {getattr(want, name)}; it must be positive")
+        return self._check(want)
+
+    @final
+    def configure(self, want: CameraSettings) -> CameraSettings:
+        """Set the camera; acquisition stops and restarts around it.
+
+        Returns
+        -------
+        CameraSettings
+            What the hardware really does, never what was asked.
+        """
+        achievable = self.check(want)
+        running = self._running
+        self.stop()
+        self._configure(achievable)
+        if running:
+            self.start()
+        return self.settings
+
+    @final
+    def start(self) -> None:
+        """Start acquisition and reset the counters; does nothing when running."""
+        self.require_open()
+        if not self._running:
+            self._delivered = self._lost = self._timeouts = 0
+            self._last_index = None
+            self._start()
+            self._running = True
+
+    @final
+    def stop(self) -> None:
+        """Stop acquisition; does nothing when stopped."""
+        if self._running:
+            self._running = False
+            self._stop()
+
+    @final
+    def next_frame(self, timeout_s: float = 1.0) -> Frame:
+        """Wait for the next frame.
+
+        Parameters
+        ----------
+        timeout_s
+            Longest wait in seconds, counted on the device's own clock.
+
+        Raises
+        ------
+        FrameTimeout
+            No frame in time.
+        DeviceLost
+            The camera has gone.
+        """
+        self.require_open()
+        if not timeout_s > 0:
+            raise SettingRejected(self.name, f"timeout_s is {timeout_s}; it must be positive")
+        self.start()
+        try:
+            frame = self._next_frame(timeout_s)
+        except FrameTimeout:
+            self._timeouts += 1
+            raise
+        if self._last_index is not None:
+            if frame.index <= self._last_index:
+                raise DeviceError(
+                    self.name,
+                    f"frame index went from {self._last_index} to {frame.index}; "
+                    "the counter must rise (was the camera reset?)",
+                )
+            self._lost += frame.index - self._last_index - 1
+        self._last_index = frame.index
+        self._delivered += 1
+        return frame
+
+    def status(self) -> FrameStatus:
+        """Counters since ``start``."""
+        return FrameStatus(self._delivered, self._lost, self._timeouts)
+
+    def _before_close(self) -> None:
+        self.stop()
+
+    @abc.abstractmethod
+    def _check(self, want: CameraSettings) -> CameraSettings:
+        """Nearest achievable settings, or raise :class:`SettingRejected`."""
+
+    @abc.abstractmethod
+    def _configure(self, settings: CameraSettings) -> None:
+        """Apply settings that came from ``_check``."""
+
+    @abc.abstractmethod
+    def _start(self) -> None:
+        """Start acquisition."""
+
+    @abc.abstractmethod
+    def _stop(self) -> None:
+        """Stop acquisition."""
+
+    @abc.abstractmethod
+    def _next_frame(self, timeout_s: float) -> Frame:
+        """Deliver the next frame or raise :class:`FrameTimeout`."""

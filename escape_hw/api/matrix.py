@@ -1,0 +1,84 @@
+"""Interaction matrices that carry what they mean."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InteractionMatrix:
+    """An interaction matrix with its sub-aperture mask, basis, errors and provenance.
+
+    Parameters
+    ----------
+    data
+        ``(n_slopes, n_modes)``, slopes per unit mode (paper Eq. s = D c).
+    sigma
+        Standard error of every element, same shape; zeros where the matrix is computed.
+    m2c
+        Mode-to-command matrix ``(n_act, n_modes)``; columns have unit rms surface over the pupil.
+    valid
+        Valid sub-apertures, boolean ``(n_rows, n_columns)``.
+    system
+        Name of the system it was measured on.
+    method
+        ``push-pull``, ``docrime``, ``docrime-whitened`` or ``escape``.
+    simulated
+        True when any device that took part was simulated.
+    metrics
+        Scalars that describe the measurement (frames, poke, delay, lost frames, ...).
+    """
+
+    data: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    m2c: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    system: str
+    method: str
+    simulated: bool
+    metrics: dict[str, Any] = field(default_factory=dict)
+    slope_unit: str = "pixel"
+
+    def __post_init__(self) -> None:
+        n_slopes, n_modes = self.data.shape
+        if self.sigma.shape != self.data.shape:
+            raise ValueError(f"sigma has shape {self.sigma.shape}, the matrix {self.data.shape}")
+        if self.m2c.ndim != 2 or self.m2c.shape[1] != n_modes:
+            raise ValueError(f"m2c has shape {self.m2c.shape}; {n_modes} columns are needed")
+        if 2 * int(self.valid.sum()) != n_slopes:
+            raise ValueError(f"{n_slopes} slopes do not fit {int(self.valid.sum())} valid sub-apertures")
+
+    @property
+    def n_slopes(self) -> int:
+        """Number of slopes."""
+        return int(self.data.shape[0])
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes."""
+        return int(self.data.shape[1])
+
+    def snr(self) -> NDArray[np.float64]:
+        """Signal-to-noise ratio per mode ``(n_modes,)``: rms of the column over rms of its errors.
+
+        The noise power is subtracted from the column's power, so pure noise gives 0, not 1.
+        Infinite where no error is stated.
+        """
+        noise = np.mean(np.square(self.sigma, dtype=float), axis=0)
+        power = np.mean(np.square(self.data, dtype=float), axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(noise > 0, np.sqrt(np.maximum(power - noise, 0) / noise), np.inf)
+
+    def maps(self, mode: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Slope maps (x, y) of one mode, each ``(n_rows, n_columns)``, NaN outside the pupil."""
+        n = self.n_slopes // 2
+        both = []
+        for part in (self.data[:n, mode], self.data[n:, mode]):
+            image = np.full(self.valid.shape, np.nan)
+            image[self.valid] = part
+            both.append(image)
+        return both[0], both[1]

@@ -1,0 +1,64 @@
+"""The bench's turbulence: a rotating phase screen that can be put into the beam."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import final
+
+from escape_hw.api.device import Device
+from escape_hw.errors import SettingRejected
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenState:
+    """State of the phase screen: number of the screen, in or out of the beam, speed.
+
+    ``speed_m_s`` is the speed of the screen across the pupil in metres per second.
+    """
+
+    screen: int
+    inserted: bool
+    speed_m_s: float
+
+
+class PhaseScreen(Device):
+    """A changer with one or more rotating phase screens.
+
+    With the screen out, the bench has a calibration source: that is what the push-pull baseline
+    is measured on. A telescope has no such device, and neither the open-loop DO-CRIME nor the
+    ESCAPE procedure ever asks for it.
+    """
+
+    @property
+    @abc.abstractmethod
+    def state(self) -> ScreenState:
+        """The present state."""
+
+    @property
+    @abc.abstractmethod
+    def n_screens(self) -> int:
+        """How many screens the changer holds."""
+
+    @final
+    def set(
+        self, *, screen: int | None = None, inserted: bool | None = None, speed_m_s: float | None = None
+    ) -> ScreenState:
+        """Change what is given, keep the rest; returns the state reached."""
+        self.require_open()
+        now = self.state
+        want = ScreenState(
+            now.screen if screen is None else screen,
+            now.inserted if inserted is None else inserted,
+            now.speed_m_s if speed_m_s is None else speed_m_s,
+        )
+        if not 0 <= want.screen < self.n_screens:
+            raise SettingRejected(self.name, f"screen {want.screen} is not one of 0..{self.n_screens - 1}")
+        if not want.speed_m_s >= 0:
+            raise SettingRejected(self.name, f"speed_m_s is {want.speed_m_s}; it must not be negative")
+        self._set(want)
+        return self.state
+
+    @abc.abstractmethod
+    def _set(self, want: ScreenState) -> None:
+        """Go to a checked state."""

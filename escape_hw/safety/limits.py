@@ -1,0 +1,65 @@
+"""Limits that every command to a deformable mirror obeys."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class MirrorLimits:
+    """Limits in fractions of full stroke; ``None`` switches a rule off.
+
+    Parameters
+    ----------
+    max_stroke
+        Largest magnitude of any actuator's command, 0 to 1.
+    max_slew
+        Largest change of any actuator from one command to the next.
+    max_neighbour
+        Largest difference between adjacent actuators.
+    max_mean
+        Largest magnitude of the mean over the enabled actuators (piston drift).
+    disabled
+        Indices of actuators that must stay at zero.
+    """
+
+    max_stroke: float = 1.0
+    max_slew: float | None = None
+    max_neighbour: float | None = None
+    max_mean: float | None = None
+    disabled: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.max_stroke <= 1.0:
+            raise ValueError(f"max_stroke is {self.max_stroke}; it must lie in (0, 1]")
+        for name in ("max_slew", "max_neighbour", "max_mean"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{name} is {value}; it must be positive, or None to switch it off")
+
+
+def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Pairs of adjacent actuators on a grid.
+
+    Parameters
+    ----------
+    layout
+        Boolean map ``(rows, cols)`` that is true where an actuator stands; actuators are
+        numbered in row-major order.
+
+    Returns
+    -------
+    ndarray of int, ``(n_pairs, 2)``
+        Every horizontal and vertical neighbour pair once.
+    """
+    number = np.full(layout.shape, -1, dtype=np.intp)
+    number[layout] = np.arange(int(layout.sum()))
+    pairs = [
+        np.stack([a[both], b[both]], axis=1)
+        for a, b in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:]))
+        for both in [(a >= 0) & (b >= 0)]
+    ]
+    return np.concatenate(pairs)
