@@ -1,0 +1,148 @@
+"""What the procedures return; every number comes with its standard error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.registration import PARAMETERS, UNITS, Registration
+from escape_hw.api.sensor import SubApertureGrid
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A value, its standard error and its unit."""
+
+    value: float
+    sigma: float
+    unit: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {"value": self.value, "sigma": self.sigma, "unit": self.unit}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TemporalResponse:
+    """Response of the sensor to a step of the mirror, in frames.
+
+    ``weights[l]`` is the share of the final response that appears in the ``l``-th frame after the
+    command was sent; they sum to 1. ``delay`` is the mean of that distribution in frames.
+    """
+
+    weights: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+    @property
+    def delay(self) -> float:
+        """Mean delay in frames."""
+        return float(np.arange(self.weights.size) @ self.weights)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SprintIteration:
+    """One iteration of SPRINT: parameters, gain, relative step norm and reduced chi-squared."""
+
+    registration: Registration
+    gain: float
+    step_norm: float
+    chi2: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegistrationEstimate:
+    """Registration found by SPRINT.
+
+    Parameters
+    ----------
+    covariance
+        ``(5, 5)`` in the order and units of ``PARAMETERS``, errors of the model included.
+    width
+        Scale of the influence functions' width relative to nominal.
+    """
+
+    registration: Registration
+    covariance: NDArray[np.float64]
+    gain: Measured
+    width: Measured
+    converged: bool
+    iterations: tuple[SprintIteration, ...]
+    chi2: float
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """Standard errors ``(5,)`` in the order of ``PARAMETERS``."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def measured(self) -> dict[str, Measured]:
+        """Every parameter with its standard error and unit."""
+        values = self.registration.to_array()
+        return {
+            name: Measured(float(v), float(s), UNITS[name])
+            for name, v, s in zip(PARAMETERS, values, self.sigma, strict=True)
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationResult:
+    """A measured or pseudo-synthetic interaction matrix and how it came about.
+
+    ``partial`` is true when the operator stopped the run early. ``mean_frame`` is the mean of the
+    camera frames used to find the sub-aperture grid. ``measured`` is the DO-CRIME matrix that an
+    ESCAPE matrix was derived from.
+    """
+
+    matrix: InteractionMatrix
+    grid: SubApertureGrid
+    frames: int
+    lost_frames: int
+    sky_seconds: float
+    response: TemporalResponse | None = None
+    registration: RegistrationEstimate | None = None
+    measured: InteractionMatrix | None = None
+    partial: bool = False
+    mean_frame: NDArray[np.float32] | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StrehlEstimate:
+    """Strehl ratio three ways (paper, lab results): peak, optical transfer function, encircled energy."""
+
+    peak: Measured
+    otf: Measured
+    encircled: Measured
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopResult:
+    """A closed-loop run with one matrix.
+
+    ``psf`` and ``model_psf`` are dark-subtracted images of the science camera with the same
+    integration; ``latency_us`` holds wall-clock p50, p99 and max of the frame-to-command path.
+    ``residual_nm`` is a decimated record of the residual wavefront rms seen by the sensor.
+    """
+
+    method: str
+    gain: float
+    leak: float
+    dropped_modes: int
+    frames: int
+    lost_frames: int
+    rate_hz: float
+    stable: bool
+    residual_rms_nm: float
+    strehl: StrehlEstimate | None
+    latency_us: dict[str, float]
+    psf: NDArray[np.float32] | None = None
+    model_psf: NDArray[np.float32] | None = None
+    residual_nm: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    last_command: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    last_frame: NDArray[np.uint16] | None = None
+    partial: bool = False
+    notes: tuple[str, ...] = ()
