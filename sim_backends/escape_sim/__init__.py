@@ -1,1 +1,1 @@
-"""Twins of every device, their optics, and the synthetic models that SPRINT inverts."""
+"""Simulated twins of the instruments, their optics, and SPRINT's synthetic models."""
