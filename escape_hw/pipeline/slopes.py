@@ -111,7 +111,9 @@ class SlopeExtractor:
         self.dark = np.zeros(shape, np.float32) if dark is None else np.ascontiguousarray(dark, np.float32)
         response = np.ones(shape, np.float32) if flat is None else np.asarray(flat, np.float32)
         if self.dark.shape != shape or response.shape != shape:
-            raise ValueError(f"dark {self.dark.shape} and flat {response.shape} must have the region's {shape}")
+            raise ValueError(
+                f"dark {self.dark.shape} and flat {response.shape} must have the region's {shape}"
+            )
         if not (response > 0).all():
             raise ValueError("the flat has pixels that are not positive")
         self._gain = np.ascontiguousarray(1 / response)

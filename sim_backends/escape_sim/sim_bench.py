@@ -191,7 +191,9 @@ class SimBench:
         if not exposures.has(number):
             # Nobody read the wavefront sensor meanwhile: look at a few moments of our own.
             for start in end_s - exposures.exposure_s * np.arange(4, 0, -1) / 4:
-                exposures.add(number, self.optical_path(float(start), float(start + exposures.exposure_s / 4)))
+                exposures.add(
+                    number, self.optical_path(float(start), float(start + exposures.exposure_s / 4))
+                )
         return exposures.take(number)
 
     # ------------------------------------------------------------------ construction
@@ -227,7 +229,9 @@ class SimBench:
         """Tip and tilt of the beam in radians."""
         vib = self.config.twin.vibration
         f = np.asarray(vib.frequency_hz)
-        tip, tilt = (np.asarray(vib.amplitude_rad) * np.sin(2 * np.pi * f * time_s + self._vibration_phase)).sum(1)
+        tip, tilt = (
+            np.asarray(vib.amplitude_rad) * np.sin(2 * np.pi * f * time_s + self._vibration_phase)
+        ).sum(1)
         return float(tip), float(tilt)
 
     def _make_sensor(self) -> SensorOptics:
