@@ -111,24 +111,9 @@ class CommandGuard:
         CommandRejected
             Wrong type or shape, or any value that is not finite (its index is named).
         """
-        asked = self._as_array(command)
-        if asked.dtype.kind not in "fiu":
-            raise CommandRejected(
-                self.device, f"command has type {asked.dtype}; give real numbers, fractions of full stroke"
-            )
-        if asked.shape != (self.n_act,):
-            raise CommandRejected(
-                self.device, f"command has shape {asked.shape}; this mirror takes ({self.n_act},)"
-            )
-        if asked.dtype == np.float64:
-            wanted = np.array(asked, dtype=np.float64, order="C")
-        else:
-            with np.errstate(all="ignore"):
-                wanted = np.array(asked, dtype=np.float64, order="C")
-        # The sum of squares is the cheapest test that one NaN or infinity cannot pass.
-        if not math.isfinite(wanted.dot(wanted)):
-            self._require_finite(wanted)
-        return wanted
+        # A caller that has numpy raise on overflow must still get CommandRejected.
+        with np.errstate(all="ignore"):
+            return self._validated(command)
 
     def limit(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
         """Limit a command; the result obeys every rule at once. Remembers nothing.
@@ -145,12 +130,13 @@ class CommandGuard:
         CommandRejected
             See :meth:`validate`.
         """
-        wanted = self.validate(command)
-        if self.obeys(wanted):
-            return _frozen(wanted), _UNTOUCHED
-        legal, clipped, disabled, scale, removed = self._legalise(wanted)
-        safe, slewed = self._approach(legal)
-        return _frozen(safe), GuardReport(clipped, slewed, disabled, scale, removed)
+        with np.errstate(all="ignore"):
+            wanted = self._validated(command)
+            if self.obeys(wanted):
+                return _frozen(wanted), _UNTOUCHED
+            legal, clipped, disabled, scale, removed = self._legalise(wanted)
+            safe, slewed = self._approach(legal)
+            return _frozen(safe), GuardReport(clipped, slewed, disabled, scale, removed)
 
     def accept(self, shape: NDArray[np.float64]) -> None:
         """Remember a shape from :meth:`limit` as the one that the mirror has now."""
@@ -198,6 +184,22 @@ class CommandGuard:
             if step > lim.max_neighbour + _ULP:
                 return f"two neighbours exceed max_neighbour = {lim.max_neighbour} ({step:.6g})"
         return None
+
+    def _validated(self, command: ArrayLike) -> NDArray[np.float64]:
+        asked = self._as_array(command)
+        if asked.dtype.kind not in "fiu":
+            raise CommandRejected(
+                self.device, f"command has type {asked.dtype}; give real numbers, fractions of full stroke"
+            )
+        if asked.shape != (self.n_act,):
+            raise CommandRejected(
+                self.device, f"command has shape {asked.shape}; this mirror takes ({self.n_act},)"
+            )
+        wanted = np.array(asked, dtype=np.float64, order="C")
+        # The sum of squares is the cheapest test that one NaN or infinity cannot pass.
+        if not math.isfinite(wanted.dot(wanted)):
+            self._require_finite(wanted)
+        return wanted
 
     def _as_array(self, command: ArrayLike) -> NDArray[np.generic]:
         """Make an array of it, and whatever goes wrong on the way a :class:`CommandRejected`."""
