@@ -109,7 +109,7 @@ class Device(abc.ABC):
         try:
             step()
         except Exception as second:
-            log.exception("%s: a further failure while clearing up", self.name)
+            log.warning("further failure while clearing up: %s: %s", type(second).__name__, second)
             cause.add_note(f"and then, while clearing up: {type(second).__name__}: {second}")
 
     @abc.abstractmethod
