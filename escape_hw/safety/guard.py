@@ -263,8 +263,8 @@ class CommandGuard:
         """Go from the last shape towards a legal one as far as the slew rule allows.
 
         Each actuator goes as far as it may, so that one far away does not hold the others back.
-        Where that breaks a rule that couples actuators, all move in proportion: a point on the
-        straight line between two legal shapes is legal.
+        Where that breaks a rule (the mean may, as the far ones lag), all move in proportion: a
+        point on the straight line between two legal shapes is legal.
         """
         slew = self.limits.max_slew
         if slew is None:

@@ -313,6 +313,37 @@ def test_one_actuator_far_away_does_not_hold_the_others_back() -> None:
     np.testing.assert_allclose(np.delete(safe, 7), 0.05)
 
 
+def test_actuators_that_lag_do_not_let_the_mean_drift() -> None:
+    command = np.full(N, 0.1)
+    command[0] = -0.1 * (N - 1)
+    command *= 0.4
+    assert command.mean() == pytest.approx(0)
+    limits = MirrorLimits(max_slew=0.05, max_mean=0.005)
+    guard = guard_with(limits)
+    for _ in range(30):
+        before = guard.last
+        safe, _ = guard(command)
+        assert breaches(limits, before, safe) == []
+    np.testing.assert_allclose(safe, command, atol=1e-12)
+
+
+def test_rounding_never_adds_to_the_stroke() -> None:
+    stroke, start = 0.3, -0.28
+    assert start + (stroke - start) > stroke
+    guard = guard_with(MirrorLimits(max_stroke=stroke, max_slew=0.59))
+    guard.reset([start] * (N - 1) + [-stroke])
+    safe, report = guard(np.full(N, stroke))
+    assert report.slewed == 1
+    assert safe.max() == safe[0] == stroke
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_absurd_piston_keeps_its_sign(sign: float) -> None:
+    safe, report = guard_with(MirrorLimits(max_mean=0.1))(np.full(N, sign * 1e308))
+    np.testing.assert_allclose(safe, sign * 0.1)
+    assert np.isfinite(report.mean_removed)
+
+
 @pytest.mark.parametrize(
     ("limits", "shape", "words"),
     [
