@@ -235,7 +235,7 @@ class CommandGuard:
         """
         lim = self.limits
         disabled = int(np.count_nonzero(wanted[self._disabled]))
-        shape = np.clip(wanted, -_ABSURD, _ABSURD)
+        shape = _clamp(wanted, _ABSURD)
         shape[self._disabled] = 0.0
         removed = 0.0
         if lim.max_mean is not None:
@@ -244,7 +244,7 @@ class CommandGuard:
                 removed = mean - math.copysign(lim.max_mean, mean)
                 shape[self._enabled] -= removed
         clipped = int(np.count_nonzero(np.abs(shape) > lim.max_stroke))
-        np.clip(shape, -lim.max_stroke, lim.max_stroke, out=shape)
+        shape = _clamp(shape, lim.max_stroke)
         scale = self._scale(shape)
         return (shape if scale == 1.0 else shape * scale), clipped, disabled, scale, removed
 
@@ -274,7 +274,7 @@ class CommandGuard:
         slewed = int(np.count_nonzero(far > slew + _ULP))
         if not slewed:
             return legal, 0
-        each = self._within_stroke(self.last + np.clip(move, -slew, slew))
+        each = self._within_stroke(self.last + _clamp(move, slew))
         if self.obeys(each):
             return each, slewed
         return self._within_stroke(self.last + move * (slew / far.max())), slewed
@@ -282,11 +282,16 @@ class CommandGuard:
     def _within_stroke(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
         """Take off what rounding added beyond the stroke (or beyond the last shape, if that is)."""
         bound = max(self.limits.max_stroke, _peak(self.last))
-        return np.clip(shape, -bound, bound)
+        return _clamp(shape, bound)
 
 
 def _peak(values: NDArray[np.float64]) -> float:
     return float(np.abs(values).max(initial=0.0))
+
+
+def _clamp(values: NDArray[np.float64], bound: float) -> NDArray[np.float64]:
+    """Clip to ``-bound .. bound`` (several times faster than ``np.clip`` on so few values)."""
+    return np.minimum(np.maximum(values, -bound), bound)
 
 
 def _frozen(shape: NDArray[np.float64]) -> NDArray[np.float64]:
