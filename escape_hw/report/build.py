@@ -92,7 +92,7 @@ def _verdict(document: dict[str, Any]) -> str:
         f"{html.escape(check['text'])}</li>"
         for check in checks
     )
-    return html.section("Criteria", f'<ul class="notes">{items}</ul>')
+    return html.section("Criteria", f'<ul class="checks">{items}</ul>')
 
 
 def _registration(run: RunContent) -> str:

@@ -38,7 +38,7 @@ def stacked_psfs(loops: Mapping[str, LoopResult], psf_px: float | None = None) -
     shown = {label: loop for label, loop in loops.items() if loop.psf is not None}
     model = next((loop.model_psf for loop in shown.values() if loop.model_psf is not None), None)
     n = len(shown) + (model is not None)
-    figure = style.new_figure(0.9 + 2.3 * max(n, 1), 3.7)
+    figure = style.new_figure(0.9 + 2.3 * max(n, 1), 3.35)
     panels = list(figure.subplots(1, max(n, 1), squeeze=False)[0])
     reference = (
         _peak(model) if model is not None else max((_peak(s.psf) for s in shown.values()), default=1.0)

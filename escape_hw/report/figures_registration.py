@@ -24,7 +24,7 @@ def convergence(estimate: RegistrationEstimate, planted: Registration | None = N
     """
     steps = estimate.iterations
     number = np.arange(1, len(steps) + 1)
-    figure = style.new_figure(7.6, 8.4)
+    figure = style.new_figure(7.8, 8.2)
     panels = figure.subplots(6, 1, sharex=True, height_ratios=[1.6, 1, 1, 1, 1, 1])
     norm = np.array([step.step_norm for step in steps], float)
     panels[0].plot(number, np.where(norm > 0, norm, np.nan), "o-", color=style.SERIES[0], ms=3, lw=1.3)
@@ -76,7 +76,7 @@ def error_curves(curves: Mapping[str, Any]) -> Figure:
             panel.loglog(frames, bound, "--", lw=1.1, color=style.INK, label="Cramér-Rao bound")
         if name in curves.get("goal", {}):
             panel.axhline(curves["goal"][name], color=style.MUTED, lw=1.0, ls=":", label="goal")
-        style.tidy(panel).set_title(title)
+        style.tidy(panel).set_title(title, fontsize=9.5)
         panel.set(xlabel="frames", ylabel=f"rms error [{_SHORT_UNITS[unit]}]")
     handles, labels = panels[0].get_legend_handles_labels()
     style.bare(panels[5]).legend(

@@ -50,7 +50,10 @@ def table(content: Table, caption: str = "") -> str:
 
 def figure(key: str, content: Figure, caption: str) -> str:
     """A figure as inline SVG with its caption."""
-    drawing = style.svg(content, key).replace("<svg", f'<svg role="img" aria-labelledby="{key}-caption"', 1)
+    # The same scale for all: text is equally large in wide and in narrow figures.
+    width = f'style="max-width:{6.7 * content.get_figwidth():.1f}rem"'
+    drawing = style.svg(content, key)
+    drawing = drawing.replace("<svg", f'<svg role="img" aria-labelledby="{key}-caption" {width}', 1)
     return f'<figure>{drawing}<figcaption id="{key}-caption">{escape(caption)}</figcaption></figure>'
 
 
