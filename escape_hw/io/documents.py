@@ -42,8 +42,8 @@ def dumps(document: Mapping[str, Any]) -> str:
     return json.dumps(plain(document), indent=2, allow_nan=False, ensure_ascii=False)
 
 
-def head(command: str, system: str, simulated: bool, seed: int | None) -> dict[str, Any]:
-    """What every document begins with."""
+def head(command: str, system: str | None, simulated: bool | None, seed: int | None) -> dict[str, Any]:
+    """What every document begins with; ``None`` where a command concerns no system."""
     return {
         "schema": SCHEMA,
         "command": command,

@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import platformdirs
 
-from escape_hw.errors import ProductError
+from escape_hw.errors import EscapeError, ProductError
 from escape_hw.io.documents import dumps
 from escape_hw.io.provenance import git_state, software_version
 from escape_hw.io.storage import check_writable, make_folder, storage_error, write_atomic
@@ -82,8 +82,10 @@ class RunFolder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close the log; an error that ends the run is written into it first."""
-        if error is not None:
-            log.error("the run ended with an error", exc_info=error)
+        if isinstance(error, EscapeError):
+            log.error("the run ended: %s: %s", type(error).__name__, error)
+        elif error is not None:
+            log.error("the run ended with an unexpected error", exc_info=error)
         if self._handler is not None:
             for name in ("escape_hw", "escape_sim", "escape_drivers"):
                 logging.getLogger(name).removeHandler(self._handler)
