@@ -8,13 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 
+import escape_hw
 import escape_hw.errors
-
-#: Name of the distribution whose version is written into products.
-DISTRIBUTION = "escape-hw"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +54,9 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-@cache
 def software_version() -> str:
-    """Version of the installed package, ``unknown`` when it runs uninstalled."""
-    try:
-        return metadata.version(DISTRIBUTION)
-    except metadata.PackageNotFoundError:
-        return "unknown"
+    """Version of this package."""
+    return escape_hw.__version__
 
 
 @cache

@@ -20,6 +20,7 @@ from escape_hw.io.storage import check_writable, make_folder, storage_error, wri
 
 #: Room asked for before a run begins, in bytes; a run's products are a few megabytes.
 NEED_BYTES = 50_000_000
+LOG = "run.log"
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ class RunFolder:
 
     def __enter__(self) -> Self:
         """Start the log."""
-        path = self.path / "run.log"
+        path = self.path / LOG
         try:
             handler = logging.FileHandler(path, encoding="utf-8")
         except OSError as error:
@@ -159,10 +160,12 @@ def _claim(wanted: Path) -> Path:
     for number in range(1, 10_000):
         path = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
         try:
-            path.mkdir()
+            path.mkdir(exist_ok=True)
+            if any(path.iterdir()):
+                continue
+            # Only one of several that find the folder empty can create the log.
+            (path / LOG).touch(exist_ok=False)
         except FileExistsError:
-            if path.is_dir() and not any(path.iterdir()):
-                return path
             continue
         except OSError as error:
             raise storage_error(path, error) from error

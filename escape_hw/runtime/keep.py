@@ -17,8 +17,8 @@ from escape_hw.runtime.records import BenchRecord
 
 
 def key_of(label: str) -> str:
-    """A label as a product's name: ``push-pull`` becomes ``push_pull``."""
-    return re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
+    """A label as a product's name: ``DO-CRIME SHORT`` becomes ``docrime_short``."""
+    return re.sub(r"[^a-z0-9]+", "_", label.lower().replace("do-crime", "docrime")).strip("_")
 
 
 def keep_calibration(

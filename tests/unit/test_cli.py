@@ -19,6 +19,7 @@ from escape_hw.errors import CalibrationError, DeviceLost
 from escape_hw.io.fits import load_matrix, save_matrix
 from escape_hw.io.provenance import Provenance
 from escape_hw.io.psf import load_loop, save_loop
+from escape_hw.report.build import write_report
 
 ORIGIN = Provenance(basis="kl", seed=1)
 REGISTRATION = {"shift_x", "shift_y", "rotation", "radial_scaling", "tangential_scaling"}
@@ -26,8 +27,16 @@ REGISTRATION = {"shift_x", "shift_y", "rotation", "radial_scaling", "tangential_
 
 @pytest.fixture
 def bench(monkeypatch, tmp_path):
+    """Fake devices and procedures, and no time spent on figures."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr("escape_hw.runtime.keep.write_report", lambda folder: folder)
     return fake_bench.install(monkeypatch)
+
+
+@pytest.fixture
+def reports(bench, monkeypatch):
+    """The real report after all."""
+    monkeypatch.setattr("escape_hw.runtime.keep.write_report", write_report)
 
 
 @pytest.fixture
@@ -100,11 +109,12 @@ def test_config_check_init_schema(escape, document, tmp_path):
     code, found, err = document("config", "check", file, "--set", "twin.registration.shift_z=1")
     assert code == 2
     assert found["error"]["type"] == "ConfigError"
-    assert "shift_x" in err  # the nearest name
+    assert "did you mean 'twin.registration.shift_" in err
     assert document("config", "schema")[1]["title"] == "ESCAPE system"
     assert "[devices.dm]" in escape("config", "init")[1]
 
 
+@pytest.mark.usefixtures("reports")
 def test_calibrate_document_has_every_promised_field(document, bench, tmp_path):
     code, found, _ = document("calibrate", "razor-shwfs", "--out", tmp_path / "run", "--seed", 7)
     assert code == 0
@@ -331,7 +341,7 @@ def test_ctrl_c_in_a_calibration_saves_what_there_is(document, bench, tmp_path, 
     assert bench.benches[0].closed
     assert bench.benches[0].screen.state.inserted
     assert signal.getsignal(number) is before
-    assert "ABORTED" in (tmp_path / "run" / "report.html").read_text()
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["partial"] is True
 
 
 def test_ctrl_c_in_the_loop(document, bench, im, tmp_path):
@@ -387,14 +397,72 @@ def test_quiet_shows_no_progress(escape, bench, tmp_path):
     assert escape(*words)[2] == ""
 
 
-def test_reproduce_shwfs(escape, bench, tmp_path):
-    bench.changes = {}
-    code, out, err = escape("reproduce", "shwfs", "--out", tmp_path / "run")
-    assert code == 1, err  # the made-up registration lies off the planted one, or the Strehl ratios are equal
-    assert "planted" in out
+@pytest.mark.usefixtures("reports")
+def test_reproduce_shwfs_shows_registration_strehl_and_report(escape, bench, tmp_path):
+    run = tmp_path / "run"
+    code, out, err = escape("reproduce", "shwfs", "--out", run, "--loop-frames", 321)
+    assert code == 0, err
+    for word in ("planted", "Shift Y", "push-pull", "DO-CRIME", "ESCAPE", "Strehl, OTF", "±"):
+        assert word in out
+    assert out.strip().splitlines()[-1] == f"report: {run / 'report.html'}"
+    assert bench.benches[0].screen_seen == {
+        "push-pull": False,
+        "escape": True,
+        "model_psf": False,
+        "loop": True,
+    }
+    loops = [options for name, options in bench.calls if name == "closed_loop"]
+    assert [loop["method"] for loop in loops] == ["push-pull", "docrime-whitened", "escape"]
+    assert all(loop["gain"] == 0.35 and loop["frames"] == 321 for loop in loops)
+    assert bench.benches[0].config.twin.registration.shift_y == -71.0
+    page = (run / "report.html").read_text()
+    for word in ("SIMULATED", "SPRINT convergence", "Stacked closed-loop PSFs", "Search for each matrix"):
+        assert word in page
+    assert load_loop(run / "loop_escape.fits").header["PARENT1"] == "escape.fits"
 
 
-def test_show_compare_report(escape, document, bench, im, tmp_path):
+def test_reproduce_judges_its_own_result(document, bench, tmp_path):
+    words = ("reproduce", "shwfs", "--out", tmp_path / "run")
+    code, found, _ = document(*words, "--set", "twin.registration.shift_x=30")
+    assert code == 1
+    failed = [check["text"] for check in found["criteria"] if not check["met"]]
+    assert len(failed) == 1
+    assert "planted registration" in failed[0]
+
+
+def test_reproduce_table1(escape, document, bench, tmp_path):
+    words = ("reproduce", "table1", "--out", tmp_path / "run", "--short", 1000, "--long", 5000)
+    code, out, _ = escape(*words)
+    assert code == 0
+    assert "α SHORT" in out
+    assert "α LONG" in out
+    assert [options["frames"] for _, options in bench.calls] == [1000, 5000]
+    code, found, _ = document(*words)
+    assert set(found["table1"]) == {"SHORT", "LONG"}
+    assert sum("agree" in check["text"] for check in found["criteria"]) == 5
+    assert set(found["products"]) == {
+        "docrime_short", "escape_short", "docrime_long", "escape_long", "report",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("place", ["push-pull", "escape", "model_psf", "closed_loop"])
+def test_ctrl_c_in_a_reproduction_keeps_what_is_done(document, bench, tmp_path, place):
+    bench.hook = lambda name: name == place and os.kill(os.getpid(), signal.SIGINT)
+    code, found, _ = document("reproduce", "shwfs", "--out", tmp_path / "run")
+    assert code == 130
+    assert found["partial"] is True
+    assert found["criteria"] == []
+    done = {"push-pull": 0, "escape": 1, "model_psf": 3, "closed_loop": 3}[place]
+    paths = [
+        Path(path) for name, path in found["products"].items() if name in ("push_pull", "docrime", "escape")
+    ]
+    assert sum(not path.name.endswith(".partial.fits") for path in paths) == done
+    assert bench.benches[0].closed
+    assert bench.benches[0].screen.state.inserted
+
+
+@pytest.mark.usefixtures("reports")
+def test_show_compare_report(escape, document, im, tmp_path):
     assert "SHA-256" in escape("show", im)[1]
     code, found, _ = document("show", im)
     assert (code, found["header"]["KIND"], found["metrics"]["poke"]) == (0, "IM", 0.02)
@@ -407,7 +475,9 @@ def test_show_compare_report(escape, document, bench, im, tmp_path):
     assert found["correlation"][50] > 0.99
     assert found["registration_difference"] is None
     assert "relative rms difference" in escape("compare", im, im)[1]
-    run = Path(document("calibrate", "razor-shwfs", "--out", tmp_path / "run")[1]["folder"])
+    run = Path(
+        document("calibrate", "razor-shwfs", "--method", "docrime", "--out", tmp_path / "run")[1]["folder"]
+    )
     before = (run / "report.html").read_text()
     moved = run.rename(tmp_path / "moved")
     (moved / "report.html").unlink()
