@@ -1,0 +1,85 @@
+"""The application: names, help and options; the work is imported when a command runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from escape_hw.cli import calibrate, loop, products, reproduce, systems
+
+app = typer.Typer(
+    name="escape",
+    help="Calibrates adaptive-optics systems without a calibration source.",
+    epilog="Exit codes: 0 done · 1 finished but failed its own criterion · 2 bad usage or configuration, "
+    "nothing opened · 3 device or safety fault, mirror made safe · 130 aborted, partial data saved.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+app.command("systems")(systems.systems)
+app.add_typer(systems.config_app, name="config")
+app.command("calibrate")(calibrate.calibrate)
+app.command("sprint")(calibrate.sprint)
+app.command("loop")(loop.loop)
+app.add_typer(reproduce.app, name="reproduce")
+app.command("show")(products.show)
+app.command("compare")(products.compare)
+app.command("report")(products.report)
+
+
+@app.command("perf", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def perf(
+    context: typer.Context,
+    stages: Annotated[list[str] | None, typer.Argument(help="Stages to measure [default: all].")] = None,
+) -> None:
+    """Measure speed against OOPAO and pyRTC; one row per measurement."""
+    # The benchmarks bring their own options and heavy imports.
+    from escape_hw.cli.perf import main
+
+    raise typer.Exit(main([*(stages or []), *context.args]))
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from escape_hw import __version__
+
+        typer.echo(f"escape {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    """Options of the program itself."""
+
+
+def run(arguments: Sequence[str] | None = None) -> None:
+    """Run with these arguments (the process's own by default); ends the process."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if "--json" not in words:
+        app(words, prog_name="escape")
+    try:
+        # Not standalone: a wrong option, too, must yield a document.
+        code = app(words, prog_name="escape", standalone_mode=False)
+    except Exception as error:
+        if not hasattr(error, "format_message") or not hasattr(error, "exit_code"):
+            raise
+        _tell_usage(error, words)
+        code = error.exit_code
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _tell_usage(error: Exception, words: Sequence[str]) -> None:
+    from escape_hw.io.documents import dumps
+
+    message = str(error.format_message())  # type: ignore[attr-defined]
+    typer.echo(f"error: {message}", err=True)
+    command = next((word for word in words if not word.startswith("-")), "")
+    typer.echo(dumps({"schema": 1, "command": command, "error": {"type": "UsageError", "message": message}}))

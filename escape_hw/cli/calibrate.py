@@ -1,0 +1,203 @@
+"""``escape calibrate`` and ``escape sprint``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.session import Session, session
+
+if TYPE_CHECKING:
+    from escape_hw.api.procedure import Procedure
+    from escape_hw.api.results import CalibrationResult
+    from escape_hw.bench import Bench
+    from escape_hw.io.run_folder import RunFolder
+    from escape_hw.runtime.records import BenchRecord
+
+METHODS = ("push-pull", "docrime", "escape")
+
+
+def calibrate(
+    system: options.System,
+    method: Annotated[str, typer.Option("--method", help="push-pull, docrime or escape.")] = "escape",
+    frames: Annotated[int | None, typer.Option("--frames", min=1, help="Frames to measure with.")] = None,
+    poke: Annotated[
+        float | None, typer.Option("--poke", help="Poke, rms surface as a fraction of full stroke.")
+    ] = None,
+    modes: Annotated[int | None, typer.Option("--modes", min=1, help="Number of modes.")] = None,
+    accuracy: Annotated[
+        float | None,
+        typer.Option("--accuracy", help="Wanted standard error of the shifts, % of a sub-aperture (escape)."),
+    ] = None,
+    plain: Annotated[
+        bool, typer.Option("--plain", help="The paper's estimator, turbulence not whitened (docrime).")
+    ] = False,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Measure an interaction matrix and, with ESCAPE, the registration behind it."""
+    with session("calibrate", json=json, quiet=quiet) as one:
+        from escape_hw.config.load import load_system
+
+        start = _procedure(method, frames, poke, accuracy, plain)
+        overrides = [*(set or []), *([] if modes is None else [f"basis.n_modes={modes}"])]
+        choice = options.Choice.of(system, overrides, seed, mode)
+        config = load_system(choice.system, overrides=choice.set, seed=seed, mode=mode)
+        with one.run_folder(config, f"calibrate-{method}", out) as folder:
+            with one.bench(choice) as bench:
+                from escape_hw.runtime.records import BenchRecord
+
+                record = BenchRecord.of(bench)
+                result, stop = one.attempt(start(bench))
+            _finish(one, folder, record, result, accuracy)
+            if stop is not None:
+                raise stop
+
+
+def _procedure(
+    method: str, frames: int | None, poke: float | None, accuracy: float | None, plain: bool
+) -> Callable[[Bench], Procedure[CalibrationResult]]:
+    """The chosen procedure; refuses what does not go together before anything is opened."""
+    from escape_hw.errors import ConfigError
+    from escape_hw.runtime.records import without_turbulence
+
+    if method not in METHODS:
+        raise ConfigError(f"--method {method}: unknown; it is one of {', '.join(METHODS)}")
+    if poke is not None and not 0 < poke <= 1:
+        raise ConfigError(f"--poke {poke:g}: it must lie in (0, 1], a fraction of full stroke")
+    if accuracy is not None and (method != "escape" or not accuracy > 0):
+        raise ConfigError("--accuracy: it goes with --method escape and must be positive")
+    if plain and method != "docrime":
+        raise ConfigError("--plain: it goes with --method docrime")
+
+    def push_pull(bench: Bench) -> Procedure[CalibrationResult]:
+        from escape_hw.calibration.push_pull import push_pull
+
+        with without_turbulence(bench):
+            return (yield from push_pull(bench, poke=poke, frames=frames))
+
+    def docrime(bench: Bench) -> Procedure[CalibrationResult]:
+        from escape_hw.calibration.docrime import docrime
+
+        return (yield from docrime(bench, frames=frames, poke=poke, whiten=not plain))
+
+    def escape(bench: Bench) -> Procedure[CalibrationResult]:
+        from escape_hw.calibration.escape import escape
+
+        return (yield from escape(bench, frames=frames, poke=poke, accuracy=accuracy))
+
+    return {"push-pull": push_pull, "docrime": docrime, "escape": escape}[method]
+
+
+def _finish(
+    one: Session, folder: RunFolder, record: BenchRecord, result: CalibrationResult, accuracy: float | None
+) -> None:
+    """Save, judge, report and show a calibration."""
+    from escape_hw.io.documents import calibration_document
+    from escape_hw.runtime import criteria
+    from escape_hw.runtime.keep import finish, keep_calibration
+    from escape_hw.runtime.reproduce import measured_part
+
+    measured = measured_part(result)
+    labels: dict[str, Any] = {"im": {"measured": "DO-CRIME", "column": ""}}
+    parents = {}
+    if measured is not None:
+        parents = {"docrime": keep_calibration(folder, record, "docrime", measured)}
+        labels["docrime"] = {"label": "DO-CRIME"}
+    keep_calibration(folder, record, "im", result, parents)
+    checks = []
+    if result.matrix.method == "escape" and not result.partial:
+        checks.append(criteria.converged("ESCAPE", result.registration))
+    if accuracy is not None and result.registration is not None:
+        worst = float(result.registration.sigma[:2].max())
+        text = f"standard error of the shifts: {worst:.3g} (wanted {accuracy:g}) % of a sub-aperture"
+        checks.append(criteria.check(text, worst <= accuracy))
+    document = finish(
+        folder,
+        {
+            **record.head("calibrate"),
+            "title": f"Calibration of {record.system}",
+            **calibration_document(result),
+            "criteria": checks,
+            "labels": labels,
+            **record.tail(one.wall_seconds),
+        },
+    )
+    one.result(document, met=all(entry["met"] for entry in checks))
+    _show(one, record, result, document)
+
+
+def _show(one: Session, record: BenchRecord, result: CalibrationResult, document: dict[str, Any]) -> None:
+    from escape_hw.cli.views import bands, calibration_lines, checks_view, products_view, rich_table
+    from escape_hw.report.tables import registration_table
+
+    one.show(bands(record.simulated, result.partial), *calibration_lines(result))
+    if result.registration is not None:
+        one.show(rich_table(registration_table({"": result.registration}, record.planted)))
+    one.show(*checks_view(document["criteria"]), *products_view(document["products"]))
+
+
+def sprint(
+    system: options.System,
+    im: options.Matrix,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Find the registration behind a measured interaction matrix; opens no device."""
+    with session("sprint", json=json, quiet=quiet) as one:
+        from escape_hw.config.load import load_system
+
+        config = load_system(system, overrides=tuple(set or ()), seed=seed, mode=mode)
+        with one.run_folder(config, "sprint", out) as folder:
+            _sprint(one, folder, config, im)
+
+
+def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
+    from dataclasses import replace
+
+    from escape_hw.calibration.sprint import sprint
+    from escape_hw.cli.views import bands, checks_view, products_view, rich_table
+    from escape_hw.config.registry import model_factory
+    from escape_hw.io import documents
+    from escape_hw.io.fits import load_matrix, save_matrix
+    from escape_hw.io.provenance import utc_text
+    from escape_hw.report.tables import registration_table
+    from escape_hw.runtime import criteria
+    from escape_hw.runtime.keep import finish
+    from escape_hw.runtime.records import config_record
+
+    product = load_matrix(im, expect_system=config.system.name, expect_actuators=config.devices.dm.n_act)
+    measured = product.result.measured or product.matrix
+    model = model_factory(config.calibration.model)(config, product.grid)
+    estimate = sprint(measured, model, learning_rate=config.calibration.learning_rate)
+    result = replace(product.result, matrix=measured, measured=None, registration=estimate)
+    origin = replace(config_record(config), parents={im.name: product.sha256})
+    folder.add("im", save_matrix(folder.file("im.fits"), result, origin))
+    checks = [criteria.converged(im.name, estimate)]
+    document = finish(
+        folder,
+        {
+            **documents.head("sprint", measured.system, measured.simulated, config.system.seed),
+            "title": f"Registration of {measured.system}",
+            **documents.calibration_document(result),
+            "criteria": checks,
+            "labels": {"im": {"column": ""}},
+            "finished_utc": utc_text(),
+            "wall_seconds": one.wall_seconds,
+        },
+    )
+    one.result(document, met=estimate.converged)
+    one.show(bands(measured.simulated, False), rich_table(registration_table({"": estimate})))
+    one.show(*checks_view(checks), *products_view(document["products"]))

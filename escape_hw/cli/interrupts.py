@@ -1,0 +1,71 @@
+"""Ctrl-C that leaves the mirror flat."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+
+class Interrupts:
+    """Turns SIGINT and SIGTERM into an orderly stop.
+
+    While a procedure runs, the first one sets ``abort``, the second breaks in at once. While the
+    devices are being closed they are only counted, so that nothing keeps the mirror from its flat
+    shape. At any other time they break in at once. Does nothing outside the main thread.
+
+    Parameters
+    ----------
+    tell
+        Called with a line for the operator.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self.abort = threading.Event()
+        self._tell = tell
+        self._in_procedure = self._closing = False
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        """Install the handlers."""
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Put the former handlers back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        self._previous.clear()
+
+    @contextmanager
+    def procedure(self) -> Iterator[threading.Event]:
+        """While a procedure runs: yields the event that aborts it."""
+        self._in_procedure = True
+        try:
+            yield self.abort
+        finally:
+            self._in_procedure = False
+
+    def begin_closing(self) -> None:
+        """From here to :meth:`end_closing` nothing breaks in."""
+        self._closing = True
+
+    def end_closing(self) -> None:
+        """The devices are closed."""
+        self._closing = False
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self._closing:
+            self._tell("already stopping: the mirror is being flattened and the devices closed")
+        elif self._in_procedure and not self.abort.is_set():
+            self.abort.set()
+            self._tell("stopping: the mirror is flattened and what was measured is saved")
+        else:
+            raise KeyboardInterrupt

@@ -1,0 +1,40 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+System = Annotated[str, typer.Argument(help="Name of a system (see 'escape systems') or a TOML file.")]
+Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on standard output.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bars.")]
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="DIR", help="Folder of the run [default: a dated one in your user data]."),
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override any key of the configuration; repeatable."),
+]
+Seed = Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")]
+Mode = Annotated[str | None, typer.Option("--mode", metavar="sim|hardware", help="Twins or real devices.")]
+Matrix = Annotated[Path, typer.Option("--im", metavar="FILE", help="Interaction matrix (FITS).")]
+Force = Annotated[bool, typer.Option("--force", help="Allow a simulated matrix on hardware.")]
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which system, and how its configuration is changed."""
+
+    system: str
+    set: tuple[str, ...] = ()
+    seed: int | None = None
+    mode: str | None = None
+
+    @classmethod
+    def of(cls, system: str, overrides: list[str] | None, seed: int | None, mode: str | None) -> Choice:
+        """From the options as typer delivers them."""
+        return cls(system, tuple(overrides or ()), seed, mode)

@@ -1,0 +1,110 @@
+"""``escape show``, ``escape compare`` and ``escape report``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.session import Session, session
+
+
+def show(
+    file: Annotated[Path, typer.Argument(help="A product (FITS) or the folder of a run.")],
+    json: options.Json = False,
+) -> None:
+    """Summarise a product or a run."""
+    with session("show", json=json) as one:
+        if file.is_dir():
+            _show_run(one, file)
+        else:
+            _show_product(one, file)
+
+
+def _show_product(one: Session, file: Path) -> None:
+    from escape_hw.cli.views import bands, calibration_lines, rich_table
+    from escape_hw.io import documents, fits_file
+    from escape_hw.io.fits import KIND_MATRIX, load_matrix
+    from escape_hw.io.psf import load_loop
+    from escape_hw.report.tables import Table, registration_table, strehl_table
+
+    hdus, _ = fits_file.read(file)
+    header = fits_file.header_dict(hdus)
+    document = documents.head("show", header["SYSTEM"], bool(header["SIMULATE"]), header.get("SEED"))
+    partial = header["FINISH"] == "aborted"
+    one.show(f"{file}: kind {header['KIND']}", bands(bool(header["SIMULATE"]), partial))
+    if header["KIND"] == KIND_MATRIX:
+        matrix = load_matrix(file)
+        document |= documents.calibration_document(matrix.result)
+        document["metrics"] = matrix.matrix.metrics
+        sha256 = matrix.sha256
+        one.show(*calibration_lines(matrix.result))
+        if matrix.registration is not None:
+            one.show(rich_table(registration_table({"": matrix.registration})))
+    else:
+        loop = load_loop(file)
+        document |= documents.loop_document(loop.result)
+        sha256 = loop.sha256
+        one.show(rich_table(strehl_table({loop.result.method: loop.result})))
+    cards = tuple((key, str(value)) for key, value in header.items())
+    one.show(rich_table(Table(("Card", "value"), cards)), f"SHA-256: {sha256}")
+    one.result({**document, "file": file.absolute(), "header": header, "sha256": sha256})
+
+
+def _show_run(one: Session, folder: Path) -> None:
+    from escape_hw.cli.views import bands, checks_view, products_view, rich_table
+    from escape_hw.report.content import read_run
+    from escape_hw.report.tables import registration_table, strehl_table
+
+    run = read_run(folder)
+    document = run.document
+    one.show(f"{document['command']} on {document['system']}", bands(run.simulated, run.partial()))
+    if run.estimates():
+        one.show(rich_table(registration_table(run.estimates(), run.planted)))
+    if run.loops:
+        one.show(rich_table(strehl_table(run.loops)))
+    one.show(*checks_view(document.get("criteria", [])), *products_view(document["products"]))
+    one.result({**document, "folder": run.folder})
+
+
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="A", help="Interaction matrix (FITS).")],
+    second: Annotated[Path, typer.Argument(metavar="B", help="Interaction matrix (FITS).")],
+    json: options.Json = False,
+) -> None:
+    """Compare two interaction matrices mode by mode, and their registrations."""
+    with session("compare", json=json) as one:
+        from escape_hw.cli.views import rich_table
+        from escape_hw.io.documents import head
+        from escape_hw.io.fits import load_matrix
+        from escape_hw.report import comparison
+
+        a, b = load_matrix(first), load_matrix(second)
+        result = comparison.compare(a.result, b.result)
+        one.show(f"A: {first} ({a.matrix.method})", f"B: {second} ({b.matrix.method})")
+        one.show(*comparison.lines(result))
+        one.show(rich_table(comparison.mode_table(result)))
+        if result.registration:
+            one.show(rich_table(comparison.registration_table(result)))
+        simulated = a.matrix.simulated or b.matrix.simulated
+        document: dict[str, Any] = head("compare", a.matrix.system, simulated, None)
+        one.result({**document, "a": first.absolute(), "b": second.absolute(), **result.document()})
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="Folder of a run.")],
+    json: options.Json = False,
+) -> None:
+    """Build report.html of a run again from its products."""
+    with session("report", json=json) as one:
+        from escape_hw.io.documents import head
+        from escape_hw.io.run_folder import read_result
+        from escape_hw.report.build import write_report
+
+        path = write_report(run)
+        old = read_result(run)
+        one.show(f"report: {path}")
+        document = head("report", old["system"], old["simulated"], old["seed"])
+        one.result({**document, "report": path})

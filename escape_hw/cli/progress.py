@@ -1,0 +1,101 @@
+"""Progress bars with the time left, on standard error."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TaskID, TextColumn
+from rich.progress import Progress as RichProgress
+
+from escape_hw.api.procedure import Progress
+
+#: Seconds between two lines where no bar can be drawn.
+_LINE_PERIOD_S = 10.0
+
+
+class ProgressView:
+    """Shows a procedure's progress: bars on a terminal, now and then a line elsewhere."""
+
+    def __init__(self, console: Console, quiet: bool = False) -> None:
+        self._console, self._quiet = console, quiet
+        self._bars: RichProgress | None = None
+        self._task: TaskID | None = None
+        self._stage: str | None = None
+        self._last_line = 0.0
+
+    def __enter__(self) -> Self:
+        """Begin to draw."""
+        if not self._quiet and self._console.is_terminal:
+            self._bars = RichProgress(
+                SpinnerColumn(),
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[unit]}"),
+                TextColumn("{task.fields[left]}", style="cyan"),
+                TextColumn("{task.fields[metrics]}", style="dim"),
+                console=self._console,
+            )
+            self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop drawing."""
+        if self._bars is not None:
+            self._bars.stop()
+            self._bars = None
+
+    def __call__(self, progress: Progress) -> None:
+        """Observe one progress."""
+        if self._quiet:
+            return
+        if self._bars is not None:
+            self._draw(self._bars, progress)
+        else:
+            self._write(progress)
+
+    def _draw(self, bars: RichProgress, progress: Progress) -> None:
+        if progress.stage != self._stage or self._task is None:
+            if self._task is not None:
+                total = next(task.total for task in bars.tasks if task.id == self._task)
+                bars.update(self._task, completed=total, left="done", metrics="")
+            self._stage = progress.stage
+            self._task = bars.add_task(
+                progress.stage, total=progress.total, unit=f"{progress.unit}s", left="", metrics=""
+            )
+        bars.update(
+            self._task,
+            total=progress.total,
+            completed=progress.done,
+            left=time_left(progress.remaining_s),
+            metrics="  ".join(f"{name} {value:.3g}" for name, value in list(progress.metrics.items())[:3]),
+        )
+
+    def _write(self, progress: Progress) -> None:
+        now = time.monotonic()
+        if progress.stage == self._stage and now - self._last_line < _LINE_PERIOD_S:
+            return
+        self._stage, self._last_line = progress.stage, now
+        left = time_left(progress.remaining_s)
+        self._console.print(
+            f"{progress.stage}: {progress.done} of {progress.total} {progress.unit}s"
+            + (f", {left}" if left else ""),
+            highlight=False,
+        )
+
+
+def time_left(seconds: float) -> str:
+    """The time left in words; empty while unknown."""
+    if not 0 <= seconds < 1e7:
+        return ""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s left"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s left"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min left"

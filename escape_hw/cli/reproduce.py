@@ -1,0 +1,119 @@
+"""``escape reproduce``: the paper's tables and figures on the twins, with a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.session import Session, session
+
+app = typer.Typer(help="The paper's tables and figures on the twins, with a report.", no_args_is_help=True)
+_SYSTEM = "razor-shwfs"
+_SystemOption = Annotated[str, typer.Option("--system", help="System to run on.")]
+
+
+@app.command("shwfs")
+def shwfs(
+    system: _SystemOption = _SYSTEM,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")] = 10_000,
+    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 5000,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Calibrate with and without a source, close the loop with every matrix, compare."""
+    with session("reproduce shwfs", json=json, quiet=quiet) as one:
+        from escape_hw.runtime.reproduce import reproduce_shwfs
+        from escape_hw.runtime.reproduce_keep import keep_shwfs
+
+        def start(bench: Any) -> Any:
+            return reproduce_shwfs(bench, frames=frames, loop_frames=loop_frames)
+
+        result, document = _run(one, _paper_case(system, set, seed, mode), "shwfs", out, start, keep_shwfs)
+        _show_shwfs(one, result, document)
+
+
+@app.command("table1")
+def table1(
+    system: _SystemOption = _SYSTEM,
+    short: Annotated[int, typer.Option("--short", min=1, help="Frames of the SHORT run.")] = 10_000,
+    long: Annotated[int, typer.Option("--long", min=1, help="Frames of the LONG run.")] = 100_000,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Registration from 20 seconds and from 3 minutes of data (paper, Table 1)."""
+    with session("reproduce table1", json=json, quiet=quiet) as one:
+        from escape_hw.runtime.reproduce import reproduce_table1
+        from escape_hw.runtime.reproduce_keep import keep_table1
+
+        def start(bench: Any) -> Any:
+            return reproduce_table1(bench, frames={"SHORT": short, "LONG": long})
+
+        result, document = _run(one, _paper_case(system, set, seed, mode), "table1", out, start, keep_table1)
+        _show_registration(one, result.calibrations, document)
+        _show_end(one, document)
+
+
+def _paper_case(
+    system: str, overrides: list[str] | None, seed: int | None, mode: str | None
+) -> options.Choice:
+    """The paper's registration in the twin, unless the user plants another."""
+    from escape_hw.runtime.reproduce import PAPER_CASE
+
+    return options.Choice.of(system, [*PAPER_CASE, *(overrides or [])], seed, mode)
+
+
+def _run(
+    one: Session, choice: options.Choice, kind: str, out: Path | None, start: Any, keep: Any
+) -> tuple[Any, dict[str, Any]]:
+    """Open, run, close, keep; what an aborted run has measured is kept before it says so."""
+    from escape_hw.config.load import load_system
+
+    config = load_system(choice.system, overrides=choice.set, seed=choice.seed, mode=choice.mode)
+    with one.run_folder(config, f"reproduce-{kind}", out) as folder:
+        with one.bench(choice) as bench:
+            from escape_hw.runtime.records import BenchRecord
+
+            record = BenchRecord.of(bench)
+            result, stop = one.attempt(start(bench))
+        document = keep(folder, record, result, one.wall_seconds)
+        one.result(document, met=all(entry["met"] for entry in document["criteria"]))
+        if stop is not None:
+            raise stop
+    return result, document
+
+
+def _show_shwfs(one: Session, result: Any, document: dict[str, Any]) -> None:
+    from escape_hw.cli.views import bands, rich_table
+    from escape_hw.report.tables import strehl_table
+
+    one.show(bands(document["simulated"], False))
+    _show_registration(one, {"": result.calibrations["ESCAPE"]}, document)
+    one.show(rich_table(strehl_table(result.loops)))
+    _show_end(one, document)
+
+
+def _show_registration(one: Session, columns: dict[str, Any], document: dict[str, Any]) -> None:
+    from escape_hw.api.registration import Registration
+    from escape_hw.cli.views import rich_table
+    from escape_hw.report.tables import registration_table
+
+    found = {label: item.registration for label, item in columns.items() if item.registration is not None}
+    planted = Registration(**document["planted"]) if document["planted"] else None
+    one.show(rich_table(registration_table(found, planted)))
+
+
+def _show_end(one: Session, document: dict[str, Any]) -> None:
+    from escape_hw.cli.views import checks_view
+
+    one.show(*checks_view(document["criteria"]), f"report: {document['products']['report']}")

@@ -1,0 +1,181 @@
+"""One command from start to exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import typer
+from rich.console import Console, RenderableType
+
+from escape_hw.cli.interrupts import Interrupts
+from escape_hw.errors import Aborted, EscapeError, StorageError
+
+if TYPE_CHECKING:
+    from escape_hw.api.procedure import Procedure
+    from escape_hw.cli.options import Choice
+    from escape_hw.config.models import SystemConfig
+    from escape_hw.io.run_folder import RunFolder
+    from escape_hw.runtime.system import System
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+#: Exit codes (design, command line).
+DONE, FAILED, USAGE, FAULT, ABORTED = 0, 1, 2, 3, 130
+
+
+class Session:
+    """What a command needs: consoles, the runner, a bench, a run folder, one JSON document."""
+
+    def __init__(self, command: str, json: bool, quiet: bool) -> None:
+        self.command, self.json, self.quiet = command, json, quiet
+        self._stdout = sys.stdout
+        self.errors = Console(stderr=True)
+        self.tables = Console(file=self._stdout)
+        self.interrupts = Interrupts(self.tell)
+        self.folder: RunFolder | None = None
+        self.was_opened = False
+        self.code = DONE
+        self._document: Mapping[str, Any] | None = None
+        self._began = time.monotonic()
+
+    @property
+    def wall_seconds(self) -> float:
+        """Seconds since the command began."""
+        return time.monotonic() - self._began
+
+    def tell(self, line: str) -> None:
+        """A line for the operator, on standard error."""
+        self.errors.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def show(self, *what: RenderableType) -> None:
+        """Results for people, on standard output; silent with ``--json``."""
+        if not self.json:
+            for item in what:
+                self.tables.print(item, highlight=False, markup=False, soft_wrap=isinstance(item, str))
+
+    def result(self, document: Mapping[str, Any], met: bool = True) -> None:
+        """The command's document, printed at its end with ``--json``; ``met`` false: exit code 1."""
+        self._document = document
+        self.code = DONE if met else FAILED
+
+    def run(self, procedure: Procedure[T]) -> T:
+        """Run a procedure with progress; Ctrl-C aborts it.
+
+        Raises
+        ------
+        Aborted
+            With the partial result.
+        """
+        from escape_hw.api.procedure import run
+        from escape_hw.cli.progress import ProgressView
+
+        with ProgressView(self.errors, self.quiet) as view, self.interrupts.procedure() as abort:
+            return run(procedure, observers=(view,), abort=abort)
+
+    def attempt(self, procedure: Procedure[T]) -> tuple[T, Aborted | None]:
+        """Run a procedure; an abort is returned beside what was measured, so that it can be saved.
+
+        Raises
+        ------
+        Aborted
+            Nothing was measured yet.
+        """
+        try:
+            return self.run(procedure), None
+        except Aborted as stop:
+            if stop.partial is None:
+                raise
+            partial: Any = stop.partial
+            return partial, stop
+
+    @contextmanager
+    def run_folder(self, config: SystemConfig, kind: str, out: Path | None) -> Iterator[RunFolder]:
+        """The run's folder with its log and ``config.toml``, made before anything is opened."""
+        from escape_hw.io.run_folder import RunFolder
+
+        with RunFolder(config.system.name, kind, out) as folder:
+            self.folder = folder
+            folder.write_config(config.to_toml())
+            yield folder
+
+    @contextmanager
+    def bench(self, choice: Choice) -> Iterator[System]:
+        """The system, open; closed at the end whatever happens, the mirror flat."""
+        from escape_hw.runtime.system import open_system
+
+        opened = open_system(choice.system, set=choice.set, seed=choice.seed, mode=choice.mode)
+        self.was_opened = True
+        try:
+            with opened as system:
+                try:
+                    yield system
+                finally:
+                    self.interrupts.begin_closing()
+        finally:
+            self.interrupts.end_closing()
+
+    def fail(self, error: BaseException) -> int:
+        """Tell what went wrong; returns the exit code."""
+        code, kind, message = self._verdict(error)
+        self.tell(f"{'aborted' if code == ABORTED else 'error'}: {message}")
+        for note in getattr(error, "__notes__", ()):
+            self.tell(f"  {note}")
+        document = dict(self._document or {"schema": 1, "command": self.command})
+        document["error"] = {"type": kind, "message": message}
+        self._document = document
+        return code
+
+    def _verdict(self, error: BaseException) -> tuple[int, str, str]:
+        if isinstance(error, KeyboardInterrupt):
+            return ABORTED, "Aborted", "interrupted by Ctrl-C"
+        if isinstance(error, StorageError) and not self.was_opened:
+            return USAGE, type(error).__name__, str(error)
+        if isinstance(error, EscapeError):
+            return error.exit_code, type(error).__name__, str(error)
+        message = f"{type(error).__name__}: {error} (this is a defect of ESCAPE)"
+        if self.folder is not None and self.folder.path.is_dir():
+            # The folder has logged the traceback on its way out.
+            message += f"; the traceback is in {self.folder.path / 'run.log'}"
+        else:
+            self.tell("".join(traceback.format_exception(error)).rstrip())
+        return (FAULT if self.was_opened else FAILED), type(error).__name__, message
+
+    def print_document(self) -> None:
+        """Print the document on the real standard output."""
+        from escape_hw.io.documents import dumps
+
+        if self.json and self._document is not None:
+            self._stdout.write(dumps(self._document) + "\n")
+            self._stdout.flush()
+
+
+@contextmanager
+def session(command: str, *, json: bool = False, quiet: bool = False) -> Iterator[Session]:
+    """A command's body; turns every ending into an exit code and at most one document.
+
+    Whatever libraries print on standard output goes to standard error meanwhile.
+    """
+    one = Session(command, json, quiet)
+    with one.interrupts:
+        try:
+            with contextlib.redirect_stdout(sys.stderr):
+                yield one
+            code = one.code
+        except typer.Exit:
+            raise
+        except (EscapeError, KeyboardInterrupt) as error:
+            code = one.fail(error)
+        except Exception as error:
+            log.exception("unexpected")
+            code = one.fail(error)
+    one.print_document()
+    raise typer.Exit(code)

@@ -1,0 +1,59 @@
+"""Results on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from escape_hw.api.results import CalibrationResult
+from escape_hw.report.tables import Table
+
+
+def bands(simulated: bool, partial: bool) -> Text:
+    """The line that says whether a result is simulated and whether it was aborted."""
+    text = (
+        Text("SIMULATED", style="bold black on yellow") if simulated else Text("HARDWARE", style="bold green")
+    )
+    if partial:
+        text.append("  ABORTED: partial data", style="bold red")
+    return text
+
+
+def rich_table(content: Table, title: str | None = None) -> RichTable:
+    """A table of text for the terminal."""
+    table = RichTable(title=title, title_justify="left")
+    for number, heading in enumerate(content.headings):
+        table.add_column(heading, justify="left" if number == 0 else "right", no_wrap=number > 0)
+    for row in content.rows:
+        table.add_row(*(Text(cell) for cell in row))
+    return table
+
+
+def calibration_lines(result: CalibrationResult) -> list[str]:
+    """A calibration in a few lines."""
+    matrix = result.matrix
+    snr = (result.measured or matrix).snr()
+    lines = [
+        f"{matrix.method}: {matrix.n_modes} modes, {result.grid.n_valid} sub-apertures, "
+        f"{result.frames} frames ({result.sky_seconds:.1f} s), {result.lost_frames} lost",
+        f"signal-to-noise ratio per mode: least {snr.min():.2g}, median {sorted(snr)[len(snr) // 2]:.2g}",
+    ]
+    if result.response is not None:
+        lines.append(f"delay: {result.response.delay:.2f} frames")
+    return [*lines, *result.notes]
+
+
+def checks_view(checks: Iterable[Mapping[str, Any]]) -> list[Text]:
+    """Criteria with a tick or a cross."""
+    return [
+        Text(f"{'✓' if entry['met'] else '✗'} {entry['text']}", style="green" if entry["met"] else "bold red")
+        for entry in checks
+    ]
+
+
+def products_view(products: Mapping[str, Any]) -> list[str]:
+    """Where the products lie."""
+    return [f"{name}: {path}" for name, path in products.items()]

@@ -1,0 +1,1 @@
+"""Products on disk: FITS files, run folders, documents."""

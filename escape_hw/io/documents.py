@@ -1,0 +1,124 @@
+"""Results as documents: plain values for ``--json`` and ``result.json``."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.results import CalibrationResult, LoopResult, Measured, RegistrationEstimate
+
+#: Version of the documents' fields.
+SCHEMA = 1
+
+
+def plain(value: Any) -> Any:
+    """Plain JSON values; NaN and infinity, which JSON does not know, become ``None``."""
+    if isinstance(value, Measured):
+        return plain(value.to_dict())
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def dumps(document: Mapping[str, Any]) -> str:
+    """One strict JSON document (RFC 8259: no NaN)."""
+    return json.dumps(plain(document), indent=2, allow_nan=False, ensure_ascii=False)
+
+
+def head(command: str, system: str | None, simulated: bool | None, seed: int | None) -> dict[str, Any]:
+    """What every document begins with; ``None`` where a command concerns no system."""
+    return {
+        "schema": SCHEMA,
+        "command": command,
+        "system": system,
+        "simulated": simulated,
+        "seed": seed,
+    }
+
+
+def snr_document(matrix: InteractionMatrix) -> dict[str, Any]:
+    """Least and median signal-to-noise ratio over the modes; ``None`` for a computed matrix."""
+    snr = matrix.snr()
+    return {"min": float(snr.min()), "median": float(np.median(snr))}
+
+
+def registration_document(estimate: RegistrationEstimate | None) -> dict[str, Any]:
+    """What SPRINT found; all ``None`` when it did not run."""
+    if estimate is None:
+        return {"registration": None, "gain": None, "gain_sigma": None, "iterations": None, "converged": None}
+    return {
+        "registration": {name: value.to_dict() for name, value in estimate.measured().items()},
+        "gain": estimate.gain.value,
+        "gain_sigma": estimate.gain.sigma,
+        "width": estimate.width.to_dict(),
+        "iterations": len(estimate.iterations),
+        "converged": estimate.converged,
+        "chi2": estimate.chi2,
+        "warnings": list(estimate.warnings),
+    }
+
+
+def calibration_document(result: CalibrationResult) -> dict[str, Any]:
+    """A calibration in plain values; the signal-to-noise ratio is that of the measured matrix."""
+    measured = result.measured or result.matrix
+    response = result.response
+    return {
+        "method": result.matrix.method,
+        "frames": result.frames,
+        "lost_frames": result.lost_frames,
+        "sky_seconds": result.sky_seconds,
+        "n_modes": result.matrix.n_modes,
+        "n_sub_apertures": result.grid.n_valid,
+        **registration_document(result.registration),
+        "snr": snr_document(measured),
+        "delay_frames": None if response is None else response.delay,
+        "response": None if response is None else {"weights": response.weights, "sigma": response.sigma},
+        "partial": result.partial,
+        "notes": list(result.notes),
+    }
+
+
+def loop_document(result: LoopResult) -> dict[str, Any]:
+    """A closed-loop run in plain values."""
+    strehl = result.strehl
+    return {
+        "method": result.method,
+        "gain": result.gain,
+        "leak": result.leak,
+        "dropped_modes": result.dropped_modes,
+        "frames": result.frames,
+        "strehl": None
+        if strehl is None
+        else {
+            name: {"value": value.value, "sigma": value.sigma}
+            for name, value in (
+                ("peak", strehl.peak),
+                ("otf", strehl.otf),
+                ("encircled", strehl.encircled),
+            )
+        },
+        "residual_rms_nm": result.residual_rms_nm,
+        "rate_hz": result.rate_hz,
+        "latency_us": dict(result.latency_us),
+        "lost_frames": result.lost_frames,
+        "stable": result.stable,
+        "partial": result.partial,
+        "notes": list(result.notes),
+    }

@@ -1,0 +1,225 @@
+"""Interaction matrices on disk, with all that makes them usable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits as astropy_fits
+from numpy.typing import ArrayLike, NDArray
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.results import CalibrationResult, RegistrationEstimate
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.errors import IncompatibleProduct, ProductError
+from escape_hw.io import fits_file, fits_parts
+from escape_hw.io.provenance import Provenance
+
+KIND_MATRIX = "IM"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatrixProduct:
+    """An interaction matrix read from disk.
+
+    ``config_text`` is the whole configuration it was measured with (TOML), ``header`` the primary
+    header's cards, ``sha256`` the checksum that a product made from this one names as its parent.
+    """
+
+    path: Path
+    result: CalibrationResult
+    config_text: str
+    header: dict[str, Any]
+    sha256: str
+
+    @property
+    def matrix(self) -> InteractionMatrix:
+        """The matrix to close the loop with."""
+        return self.result.matrix
+
+    @property
+    def grid(self) -> SubApertureGrid:
+        """The sub-aperture grid its slopes belong to."""
+        return self.result.grid
+
+    @property
+    def registration(self) -> RegistrationEstimate | None:
+        """The registration it was computed for, when it is a pseudo-synthetic matrix."""
+        return self.result.registration
+
+
+def partial_path(path: Path) -> Path:
+    """The name under which an aborted run keeps what it measured: ``im.partial.fits``."""
+    return path if path.name.endswith(".partial.fits") else path.with_suffix(".partial.fits")
+
+
+def save_matrix(path: Path, result: CalibrationResult, origin: Provenance | None = None) -> Path:
+    """Write a calibration's matrix with grid, errors, basis, registration and configuration.
+
+    Parameters
+    ----------
+    path
+        Wanted name; the result of an aborted run is written as ``*.partial.fits`` instead.
+    result
+        What a calibration procedure returned.
+    origin
+        Where it comes from.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written; no half product is left.
+    ValueError
+        Matrix and grid do not belong together.
+    """
+    origin = origin or Provenance()
+    matrix = result.matrix
+    if not np.array_equal(matrix.valid, result.grid.valid):
+        raise ValueError("the matrix and the grid mark different sub-apertures as valid")
+    if result.partial:
+        path = partial_path(path)
+    head = fits_file.primary(KIND_MATRIX, matrix.system, matrix.simulated, result.partial, origin)
+    head.header["METHOD"] = (fits_file.plain(matrix.method), "how the matrix was made")
+    head.header["FRAMES"] = (int(result.frames), "frames used")
+    head.header["LOST"] = (int(result.lost_frames), "frames lost")
+    hdus = [
+        head,
+        *_pack_matrix(matrix, ""),
+        fits_file.image("M2C", matrix.m2c.astype(np.float64)),
+        fits_file.image("VALID", matrix.valid),
+        *fits_parts.pack_grid(result.grid),
+        fits_parts.pack_metrics(
+            {"sky_seconds": float(result.sky_seconds), "notes": list(result.notes)}, "RUN"
+        ),
+        fits_file.text("CONFIG", origin.config_text),
+    ]
+    if result.measured is not None:
+        hdus += _pack_matrix(result.measured, "MEAS_")
+    if result.registration is not None:
+        hdus += fits_parts.pack_registration(result.registration)
+    if result.response is not None:
+        hdus.append(fits_parts.pack_response(result.response))
+    if result.mean_frame is not None:
+        hdus.append(fits_file.image("FRAME", result.mean_frame.astype(np.float32), "count"))
+    fits_file.write(path, hdus)
+    return path
+
+
+def load_matrix(
+    path: Path | str,
+    *,
+    expect_system: str | None = None,
+    expect_basis: str | None = None,
+    expect_modes: int | None = None,
+    expect_actuators: int | None = None,
+    expect_m2c: ArrayLike | None = None,
+    expect_sub_apertures: tuple[int, int] | None = None,
+    allow_simulated: bool = True,
+) -> MatrixProduct:
+    """Read a matrix; every ``expect_...`` that is given must hold.
+
+    Parameters
+    ----------
+    expect_system, expect_basis, expect_modes, expect_actuators
+        Name of the system, kind of basis, number of modes and of actuators.
+    expect_m2c
+        Mode-to-command matrix ``(n_act, n_modes)``, compared element by element.
+    expect_sub_apertures
+        Shape ``(n_rows, n_columns)`` of the lenslet grid.
+    allow_simulated
+        False on hardware: a simulated matrix is refused.
+
+    Raises
+    ------
+    ProductError
+        Not there, truncated, damaged, of another kind, incomplete or from a newer version.
+    IncompatibleProduct
+        Sound, but not for this system, basis, mirror or mode.
+    """
+    path = Path(path)
+    hdus, sha256 = fits_file.read(path, KIND_MATRIX)
+    header = fits_file.header_dict(hdus)
+    try:
+        result = _unpack(path, hdus, header)
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise ProductError(f"{path}: its parts do not fit together ({error})") from error
+    product = MatrixProduct(path, result, fits_file.read_text(path, hdus, "CONFIG"), header, sha256)
+    matrix = product.matrix
+    _expect(
+        path, "system", header["SYSTEM"], None if expect_system is None else fits_file.plain(expect_system)
+    )
+    _expect(path, "kind of basis", header["BASIS"], expect_basis)
+    _expect(path, "number of actuators", matrix.m2c.shape[0], expect_actuators)
+    _expect(path, "number of modes", matrix.n_modes, expect_modes)
+    _expect(path, "lenslet grid", matrix.valid.shape, expect_sub_apertures)
+    if expect_m2c is not None:
+        _expect_basis(path, matrix.m2c, np.asarray(expect_m2c, float))
+    if matrix.simulated and not allow_simulated:
+        raise IncompatibleProduct(f"{path}: made in simulation; it is not for hardware (--force overrides)")
+    return product
+
+
+def _pack_matrix(matrix: InteractionMatrix, prefix: str) -> list[Any]:
+    return [
+        fits_file.image(
+            f"{prefix}IM", matrix.data.astype(np.float32), matrix.slope_unit, METHOD=matrix.method
+        ),
+        fits_file.image(f"{prefix}SIGMA", matrix.sigma.astype(np.float32), matrix.slope_unit),
+        fits_parts.pack_metrics(matrix.metrics, f"{prefix}METRICS"),
+    ]
+
+
+def _unpack_matrix(
+    path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any], prefix: str
+) -> InteractionMatrix:
+    cards = fits_file.need(path, hdus, f"{prefix}IM").header
+    return InteractionMatrix(
+        data=fits_file.array(path, hdus, f"{prefix}IM", np.float32),
+        sigma=fits_file.array(path, hdus, f"{prefix}SIGMA", np.float32),
+        m2c=fits_file.array(path, hdus, "M2C", np.float64),
+        valid=fits_file.array(path, hdus, "VALID", np.uint8).astype(bool),
+        system=str(header["SYSTEM"]),
+        method=str(cards["METHOD"]),
+        simulated=bool(header["SIMULATE"]),
+        metrics=fits_parts.unpack_metrics(path, hdus, f"{prefix}METRICS"),
+        slope_unit=str(cards["BUNIT"]),
+    )
+
+
+def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> CalibrationResult:
+    run = fits_parts.unpack_metrics(path, hdus, "RUN")
+    frame = fits_file.array(path, hdus, "FRAME", np.float32) if "FRAME" in hdus else None
+    return CalibrationResult(
+        matrix=_unpack_matrix(path, hdus, header, ""),
+        grid=fits_parts.unpack_grid(path, hdus),
+        frames=int(header["FRAMES"]),
+        lost_frames=int(header["LOST"]),
+        sky_seconds=float(run["sky_seconds"]),
+        response=fits_parts.unpack_response(path, hdus),
+        registration=fits_parts.unpack_registration(path, hdus),
+        measured=_unpack_matrix(path, hdus, header, "MEAS_") if "MEAS_IM" in hdus else None,
+        partial=header["FINISH"] == "aborted",
+        mean_frame=frame,
+        notes=tuple(str(note) for note in run["notes"]),
+    )
+
+
+def _expect(path: Path, what: str, found: object, wanted: object) -> None:
+    if wanted is not None and found != wanted:
+        raise IncompatibleProduct(f"{path}: its {what} is {found!r}; {wanted!r} is needed")
+
+
+def _expect_basis(path: Path, found: NDArray[np.float64], wanted: NDArray[np.float64]) -> None:
+    _expect(path, "shape of the basis", found.shape, wanted.shape)
+    worst = float(np.abs(found - wanted).max(initial=0.0))
+    if worst > 1e-9 * max(1.0, float(np.abs(wanted).max(initial=0.0))):
+        raise IncompatibleProduct(
+            f"{path}: its basis differs from this system's (by up to {worst:.3g} of stroke per unit mode)"
+        )

@@ -1,0 +1,90 @@
+"""Where a product comes from: software, configuration, devices, parents, time."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+
+import escape_hw
+import escape_hw.errors
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """What a product says about its origin.
+
+    Parameters
+    ----------
+    config_text
+        The whole configuration as TOML, overrides included.
+    basis
+        Kind of modal basis (``kl``, ``zonal``, ``file``), empty when unknown.
+    seed
+        Seed of the random streams, ``None`` when none was used.
+    serials
+        Serial number of every device by its name in the configuration.
+    parents
+        SHA-256 of every product this one was made from, by file name.
+    started
+        When the measurement began (any time zone; written as UTC).
+    """
+
+    config_text: str = ""
+    basis: str = ""
+    seed: int | None = None
+    serials: Mapping[str, str] = field(default_factory=dict)
+    parents: Mapping[str, str] = field(default_factory=dict)
+    started: datetime | None = None
+
+
+def utc_text(moment: datetime | None = None) -> str:
+    """A time as FITS writes it, in UTC to the millisecond; now when none is given."""
+    moment = datetime.now(UTC) if moment is None else moment.astimezone(UTC)
+    return moment.replace(tzinfo=None).isoformat(timespec="milliseconds")
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def software_version() -> str:
+    """Version of this package."""
+    return escape_hw.__version__
+
+
+@cache
+def git_state() -> str:
+    """Commit of the checkout this code runs from, with ``+changes`` when it was edited.
+
+    ``unknown`` when the code does not run from a git checkout; never fails.
+    """
+    home = Path(escape_hw.errors.__file__).resolve().parent
+    commit = _git(home, "rev-parse", "--short=12", "HEAD")
+    # A site-packages folder may lie inside somebody else's repository: ask git whether it owns us.
+    owned = _git(home, "ls-files", "--error-unmatch", "errors.py")
+    if not commit or not owned:
+        return "unknown"
+    changes = _git(home, "status", "--porcelain", "--untracked-files=no")
+    return commit + ("+changes" if changes else "")
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    try:
+        answer = subprocess.run(
+            ["git", "-C", str(folder), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=5,
+            check=False,
+            stdin=subprocess.DEVNULL,
+        )
+    except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
+        return ""
+    return answer.stdout.strip() if answer.returncode == 0 else ""

@@ -1,0 +1,128 @@
+"""Closed-loop runs on disk: stacked PSF, model PSF, Strehl ratios, residual record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits as astropy_fits
+
+from escape_hw.api.results import LoopResult, Measured, StrehlEstimate
+from escape_hw.errors import ProductError
+from escape_hw.io import fits_file, fits_parts
+from escape_hw.io.fits import partial_path
+from escape_hw.io.provenance import Provenance
+
+KIND_PSF = "PSF"
+_WAYS = ("peak", "otf", "encircled")
+_IMAGES = {
+    "psf": ("PSF", np.float32, "count"),
+    "model_psf": ("MODEL", np.float32, "count"),
+    "residual_nm": ("RESIDUAL", np.float32, "nm"),
+    "last_command": ("COMMAND", np.float64, ""),
+    "last_frame": ("FRAME", np.uint16, "count"),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopProduct:
+    """A closed-loop run read from disk; the fields are those of ``MatrixProduct``."""
+
+    path: Path
+    result: LoopResult
+    config_text: str
+    header: dict[str, Any]
+    sha256: str
+
+
+def save_loop(
+    path: Path, result: LoopResult, system: str, simulated: bool, origin: Provenance | None = None
+) -> Path:
+    """Write a closed-loop run; an aborted one as ``*.partial.fits``.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written; no half product is left.
+    """
+    origin = origin or Provenance()
+    if result.partial:
+        path = partial_path(path)
+    head = fits_file.primary(KIND_PSF, system, simulated, result.partial, origin)
+    head.header["METHOD"] = (fits_file.plain(result.method), "the matrix that closed the loop")
+    head.header["STABLE"] = (bool(result.stable), "the loop stayed stable")
+    run = {
+        name: getattr(result, name)
+        for name in ("gain", "leak", "dropped_modes", "frames", "lost_frames", "rate_hz", "residual_rms_nm")
+    }
+    run |= {"latency_us": dict(result.latency_us), "notes": list(result.notes)}
+    hdus = [head, fits_parts.pack_metrics(run, "RUN"), fits_file.text("CONFIG", origin.config_text)]
+    for name, (extension, dtype, unit) in _IMAGES.items():
+        data = getattr(result, name)
+        if data is not None and data.size:
+            hdus.append(fits_file.image(extension, np.asarray(data, dtype), unit))
+    if result.strehl is not None:
+        rows = [getattr(result.strehl, way) for way in _WAYS]
+        columns = {
+            "NAME": np.array(_WAYS),
+            "VALUE": np.array([row.value for row in rows], float),
+            "SIGMA": np.array([row.sigma for row in rows], float),
+        }
+        hdus.append(fits_file.table("STREHL", columns))
+    fits_file.write(path, hdus)
+    return path
+
+
+def load_loop(path: Path | str) -> LoopProduct:
+    """Read a closed-loop run.
+
+    Raises
+    ------
+    ProductError
+        Not there, truncated, damaged, of another kind, incomplete or from a newer version.
+    """
+    path = Path(path)
+    hdus, sha256 = fits_file.read(path, KIND_PSF)
+    header = fits_file.header_dict(hdus)
+    try:
+        result = _unpack(path, hdus, header)
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise ProductError(f"{path}: its parts do not fit together ({error})") from error
+    return LoopProduct(path, result, fits_file.read_text(path, hdus, "CONFIG"), header, sha256)
+
+
+def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> LoopResult:
+    run = fits_parts.unpack_metrics(path, hdus, "RUN")
+    images = {
+        name: fits_file.array(path, hdus, extension, dtype)
+        for name, (extension, dtype, _unit) in _IMAGES.items()
+        if extension in hdus
+    }
+    strehl = None
+    if "STREHL" in hdus:
+        data = hdus["STREHL"].data
+        values = zip(data["VALUE"], data["SIGMA"], strict=True)
+        strehl = StrehlEstimate(*(Measured(float(value), float(sigma)) for value, sigma in values))
+    return LoopResult(
+        method=str(header["METHOD"]),
+        gain=float(run["gain"]),
+        leak=float(run["leak"]),
+        dropped_modes=int(run["dropped_modes"]),
+        frames=int(run["frames"]),
+        lost_frames=int(run["lost_frames"]),
+        rate_hz=float(run["rate_hz"]),
+        stable=bool(header["STABLE"]),
+        residual_rms_nm=float(run["residual_rms_nm"]),
+        strehl=strehl,
+        latency_us={str(name): float(value) for name, value in run["latency_us"].items()},
+        partial=header["FINISH"] == "aborted",
+        notes=tuple(str(note) for note in run["notes"]),
+        **images,
+    )

@@ -1,0 +1,173 @@
+"""A run's folder: configuration, log, products, result and report in one dated place."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import platformdirs
+
+from escape_hw.errors import EscapeError, ProductError
+from escape_hw.io.documents import dumps
+from escape_hw.io.provenance import git_state, software_version
+from escape_hw.io.storage import check_writable, make_folder, storage_error, write_atomic
+
+#: Room asked for before a run begins, in bytes; a run's products are a few megabytes.
+NEED_BYTES = 50_000_000
+LOG = "run.log"
+
+log = logging.getLogger(__name__)
+
+
+def default_base() -> Path:
+    """Where runs go unless told otherwise: ``runs`` in the user's data directory."""
+    return Path(platformdirs.user_data_dir("escape", appauthor=False)) / "runs"
+
+
+class RunFolder:
+    """The folder of one run; as a context manager it also keeps ``run.log``.
+
+    Parameters
+    ----------
+    system, kind
+        Name of the system and of what is done; both become part of the folder's name.
+    out
+        The folder itself; ``None`` makes a new dated one under :func:`default_base`. A folder that
+        already holds a run is left alone and a sibling with a number is made.
+
+    Raises
+    ------
+    StorageError
+        The folder cannot be made or takes no files. Raised here, before anything moves.
+    """
+
+    def __init__(self, system: str, kind: str, out: Path | str | None = None) -> None:
+        self.system, self.kind = system, kind
+        if out is None:
+            # Local time: these names are for people. Headers and result.json carry UTC.
+            now = datetime.now().astimezone()
+            name = f"{now:%H%M%S}_{_safe(system)}_{_safe(kind)}"
+            wanted = default_base() / f"{now:%Y-%m-%d}" / name
+        else:
+            wanted = Path(out).expanduser().absolute()
+        self.path = _claim(wanted)
+        self.products: dict[str, Path] = {}
+        self._handler: logging.Handler | None = None
+        check_writable(self.path, NEED_BYTES)
+
+    def __enter__(self) -> Self:
+        """Start the log."""
+        path = self.path / LOG
+        try:
+            handler = logging.FileHandler(path, encoding="utf-8")
+        except OSError as error:
+            raise storage_error(path, error) from error
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        handler.setLevel(logging.INFO)
+        package = logging.getLogger("escape_hw")
+        self._level = package.level
+        package.setLevel(logging.INFO)
+        for name in ("escape_hw", "escape_sim", "escape_drivers"):
+            logging.getLogger(name).addHandler(handler)
+        self._handler = handler
+        log.info("%s on %s, ESCAPE %s (%s)", self.kind, self.system, software_version(), git_state())
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the log; an error that ends the run is written into it first."""
+        if isinstance(error, EscapeError):
+            log.error("the run ended: %s: %s", type(error).__name__, error)
+        elif error is not None:
+            log.error("the run ended with an unexpected error", exc_info=error)
+        if self._handler is not None:
+            for name in ("escape_hw", "escape_sim", "escape_drivers"):
+                logging.getLogger(name).removeHandler(self._handler)
+            logging.getLogger("escape_hw").setLevel(self._level)
+            self._handler.close()
+            self._handler = None
+
+    def file(self, name: str) -> Path:
+        """Path of a file in this folder."""
+        return self.path / name
+
+    def add(self, name: str, path: Path) -> Path:
+        """Remember a product under a name that ``result.json`` lists."""
+        self.products[name] = path
+        log.info("product %s: %s", name, path)
+        return path
+
+    def write_config(self, text: str) -> Path:
+        """Write ``config.toml``, the whole configuration of the run."""
+        return self.write_text("config.toml", text)
+
+    def write_text(self, name: str, text: str) -> Path:
+        """Write a text file atomically.
+
+        Raises
+        ------
+        StorageError
+            It cannot be written.
+        """
+        path = self.file(name)
+        write_atomic(path, text.encode())
+        return path
+
+    def write_result(self, document: Mapping[str, Any]) -> Path:
+        """Write ``result.json`` with the products' paths relative to the folder, so that it can be moved."""
+        products = {name: str(path.relative_to(self.path)) for name, path in self.products.items()}
+        return self.write_text("result.json", dumps({**document, "products": products}) + "\n")
+
+
+def read_result(folder: Path | str) -> dict[str, Any]:
+    """The ``result.json`` of a run folder, products as absolute paths.
+
+    Raises
+    ------
+    ProductError
+        No run folder, or its ``result.json`` is damaged.
+    """
+    path = Path(folder) / "result.json"
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ProductError(
+            f"{path}: cannot be read ({error.strerror}); is this the folder of a run?"
+        ) from error
+    except ValueError as error:
+        raise ProductError(f"{path}: damaged; it is no JSON document ({error})") from error
+    if not isinstance(document, dict) or not isinstance(document.get("products"), dict):
+        raise ProductError(f"{path}: it lists no products")
+    home = path.parent.absolute()
+    document["products"] = {str(name): home / str(file) for name, file in document["products"].items()}
+    return document
+
+
+def _safe(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-.") or "run"
+
+
+def _claim(wanted: Path) -> Path:
+    """Make the folder, or the first free sibling when it already holds a run (safe between processes)."""
+    make_folder(wanted.parent)
+    for number in range(1, 10_000):
+        path = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
+        try:
+            path.mkdir(exist_ok=True)
+            if any(path.iterdir()):
+                continue
+            # Only one of several that find the folder empty can create the log.
+            (path / LOG).touch(exist_ok=False)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise storage_error(path, error) from error
+        return path
+    raise storage_error(wanted, FileExistsError(17, "too many folders of that name"))

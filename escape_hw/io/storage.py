@@ -1,0 +1,142 @@
+"""Files that are either whole or not there."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+from escape_hw.errors import StorageError
+
+#: Room to leave on the disk beside the file itself, in bytes.
+MARGIN_BYTES = 1 << 20
+
+_WAYS_OUT = {
+    errno.ENOSPC: "free some space or choose another folder with --out",
+    errno.EDQUOT: "your quota is used up; free some space or choose another folder with --out",
+    errno.EFBIG: "files of this size are not allowed here; choose another folder with --out",
+    errno.EACCES: "you may not write there; choose another folder with --out",
+    errno.EPERM: "you may not write there; choose another folder with --out",
+    errno.EROFS: "the file system is read-only; choose another folder with --out",
+    errno.ENOTDIR: "a part of the path is a file; choose another folder with --out",
+    errno.EISDIR: "a folder of that name exists; choose another name",
+}
+
+
+def storage_error(path: Path, error: OSError) -> StorageError:
+    """Put an operating-system error into words that name the path and the way out."""
+    way_out = _WAYS_OUT.get(error.errno or 0, "check the disk or choose another folder with --out")
+    return StorageError(f"{path}: cannot be written ({error.strerror or error}); {way_out}")
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder and its parents.
+
+    Raises
+    ------
+    StorageError
+        It cannot be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise storage_error(folder, error) from error
+
+
+def check_space(folder: Path, need_bytes: int) -> None:
+    """Refuse early when a file of ``need_bytes`` would not fit.
+
+    Raises
+    ------
+    StorageError
+        Less than ``need_bytes`` plus :data:`MARGIN_BYTES` are free.
+    """
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise storage_error(folder, error) from error
+    if free < need_bytes + MARGIN_BYTES:
+        raise StorageError(
+            f"{folder}: {free / 1e6:.1f} MB free, {(need_bytes + MARGIN_BYTES) / 1e6:.1f} MB needed; "
+            "free some space or choose another folder with --out"
+        )
+
+
+def check_writable(folder: Path, need_bytes: int = 0) -> None:
+    """Prove by writing that a folder takes files, before anything moves.
+
+    Raises
+    ------
+    StorageError
+        It does not.
+    """
+    check_space(folder, need_bytes)
+    try:
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(b"\0" * 4096)
+            probe.flush()
+            os.fsync(probe.fileno())
+    except OSError as error:
+        raise storage_error(folder, error) from error
+
+
+def write_atomic(path: Path, content: bytes) -> None:
+    """Write a file that appears whole or not at all, and survives a power cut once it has appeared.
+
+    The content goes to a temporary file in the same folder, is forced to the disk and then takes
+    the name; an older file of that name stays untouched until then.
+
+    Raises
+    ------
+    StorageError
+        Disk full, no permission, ...; no half file is left.
+    """
+    make_folder(path.parent)
+    check_space(path.parent, len(content))
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    except OSError as error:
+        raise storage_error(path, error) from error
+    temporary = Path(name)
+    try:
+        _write_all(handle, content)
+        temporary.chmod(0o666 & ~_umask())  # mkstemp makes files that nobody else may read
+        temporary.replace(path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise storage_error(path, error) from error
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            temporary.unlink()
+
+
+def _write_all(handle: int, content: bytes) -> None:
+    try:
+        view = memoryview(content)
+        while view:
+            view = view[os.write(handle, view) :]
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _umask() -> int:
+    """The process's mask, read without changing it for other threads where the system allows."""
+    with contextlib.suppress(OSError), open("/proc/self/status", encoding="ascii") as status:
+        for line in status:
+            if line.startswith("Umask:"):
+                return int(line.split()[1], 8)
+    return 0o022
+
+
+def _sync_folder(folder: Path) -> None:
+    """Force the new name to the disk; not every system can open a folder."""
+    with contextlib.suppress(PermissionError, IsADirectoryError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,211 @@
+"""``report.html``: one self-contained page from a run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from escape_hw.io.storage import write_atomic
+from escape_hw.report import figures_bench, figures_matrix, figures_registration, html, tables
+from escape_hw.report.content import RunContent, read_run
+
+REPORT = "report.html"
+
+
+def write_report(folder: Path | str) -> Path:
+    """Build a run folder's report from its ``result.json`` and products.
+
+    Returns
+    -------
+    Path
+        The page written.
+
+    Raises
+    ------
+    ProductError
+        Not a run folder, or a product is missing or damaged.
+    StorageError
+        The page cannot be written.
+    """
+    run = read_run(folder)
+    path = run.folder / REPORT
+    write_atomic(path, render(run).encode())
+    return path
+
+
+def render(run: RunContent) -> str:
+    """The page as text."""
+    document = run.document
+    title = str(document.get("title") or f"{document['command']} on {document['system']}")
+    bands = [
+        ("simulated", "SIMULATED: every number on this page comes from a digital twin")
+        if run.simulated
+        else ("hardware", "HARDWARE")
+    ]
+    if run.partial():
+        bands.append(("aborted", "ABORTED BY THE OPERATOR: partial data"))
+    lead = " · ".join(
+        str(part)
+        for part in (
+            document["system"],
+            document.get("finished_utc") and f"{document['finished_utc']} UTC",
+            f"seed {document['seed']}" if document.get("seed") is not None else None,
+            document.get("software") and f"ESCAPE {document['software']}",
+        )
+        if part
+    )
+    parts = [
+        f"<h1>{html.escape(title)}</h1>",
+        f'<p class="lead">{html.escape(lead)}</p>',
+        html.facts(_facts(run)),
+    ]
+    parts += [
+        _verdict(document),
+        _registration(run),
+        _loops(run),
+        _matrices(run),
+        _sky_time(run),
+        _bench(run),
+    ]
+    parts.append(_origin(run))
+    return html.page(title, bands, [part for part in parts if part])
+
+
+def _facts(run: RunContent) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for label, result in run.calibrations.items():
+        found[f"{label}: frames"] = f"{result.frames:,} ({result.sky_seconds:.1f} s)".replace(",", "\u2009")
+    for label, loop in run.loops.items():
+        if loop.strehl is not None:
+            found[f"{label}: Strehl, peak"] = tables.percent(loop.strehl.peak).strip()
+    if run.document.get("wall_seconds") is not None:
+        found["wall clock"] = f"{float(run.document['wall_seconds']):.0f} s"
+    return found
+
+
+def _verdict(document: dict[str, Any]) -> str:
+    checks = document.get("criteria") or []
+    if not checks:
+        return ""
+    items = "".join(
+        f'<li class="{"good" if check["met"] else "bad"}">{"✓" if check["met"] else "✗"} '
+        f"{html.escape(check['text'])}</li>"
+        for check in checks
+    )
+    return html.section("Criteria", f'<ul class="checks">{items}</ul>')
+
+
+def _registration(run: RunContent) -> str:
+    estimates = run.estimates()
+    if not estimates:
+        return ""
+    caption = "Registration of the mirror seen by the sensor, with standard errors."
+    if run.planted is not None:
+        caption += " The planted truth is shown only here; no estimator reads it."
+    parts = [html.table(tables.registration_table(estimates, run.planted), caption)]
+    for number, (label, estimate) in enumerate(estimates.items()):
+        if estimate.iterations:
+            what = f" ({label})" if label else ""
+            parts.append(
+                html.figure(
+                    f"sprint{number}",
+                    figures_registration.convergence(estimate, run.planted),
+                    f"SPRINT convergence{what}: step norm (top) and the parameters per iteration. "
+                    "Band: final value with its standard error."
+                    + (" Dotted: planted truth." if run.planted is not None else ""),
+                )
+            )
+        parts.append(html.notes(list(estimate.warnings), "bad"))
+    return html.section("Registration", *parts)
+
+
+def _loops(run: RunContent) -> str:
+    if not run.loops:
+        return ""
+    parts = [html.table(tables.strehl_table(run.loops))]
+    if any(loop.psf is not None for loop in run.loops.values()):
+        parts.append(
+            html.figure(
+                "psf",
+                figures_bench.stacked_psfs(run.loops, run.psf_px),
+                "Stacked closed-loop PSFs and the model PSF taken without turbulence, logarithmic stretch. "
+                "Strehl ratios from top to bottom: maximum, optical transfer function, energy within 3 "
+                "pixels of the maximum, each against the model.",
+            )
+        )
+    if any(loop.residual_nm.size for loop in run.loops.values()):
+        parts.append(
+            html.figure(
+                "residual", figures_bench.residual_strip(run.loops), "Residual wavefront seen by the sensor."
+            )
+        )
+    scans = run.document.get("scans") or {}
+    if scans:
+        parts.append(
+            html.figure("gains", figures_bench.gain_scan(scans), "Search for each matrix's own best gain.")
+        )
+    return html.section("Closed loop", *parts)
+
+
+def _matrices(run: RunContent) -> str:
+    matrices = run.matrices()
+    if not matrices:
+        return ""
+    parts = [
+        html.figure(
+            "modes",
+            figures_matrix.mode_maps(matrices),
+            "Interaction matrices: x and y slope maps of evenly spaced modes, each divided by its rms slope.",
+        )
+    ]
+    if any((matrix.sigma > 0).any() for matrix in matrices.values()):
+        parts.append(
+            html.figure(
+                "errors",
+                figures_matrix.errors_per_mode(matrices),
+                "Signal-to-noise ratio and standard error per mode of the measured matrices.",
+            )
+        )
+    remarks = [f"{label}: {note}" for label, result in run.calibrations.items() for note in result.notes]
+    return html.section("Interaction matrices", *parts, html.notes(remarks))
+
+
+def _sky_time(run: RunContent) -> str:
+    curves = run.document.get("sky_time")
+    if not curves:
+        return ""
+    drawing = figures_registration.error_curves(curves)
+    caption = "Error of the registration against the frames used, with the Cramér-Rao bound."
+    return html.section("Sky time", html.figure("skytime", drawing, caption))
+
+
+def _bench(run: RunContent) -> str:
+    parts = []
+    calibration = next((r for r in run.calibrations.values() if r.mean_frame is not None), None)
+    if calibration is not None and calibration.mean_frame is not None:
+        drawing = figures_bench.sensor(calibration.mean_frame, calibration.grid, "mean frame")
+        parts.append(html.figure("mean", drawing, "Mean sensor frame and the lenslet grid found on it."))
+    label, loop = next(reversed(run.loops.items()), ("", None))
+    if loop is not None and loop.last_frame is not None:
+        drawing = figures_bench.sensor(loop.last_frame, None, "one frame")
+        parts.append(html.figure("frame", drawing, f"The last sensor frame of the {label} loop."))
+    layout = run.layout
+    if loop is not None and layout is not None and loop.last_command.size == int(layout.sum()):
+        drawing = figures_bench.mirror(loop.last_command, layout)
+        parts.append(html.figure("mirror", drawing, f"The last mirror command of the {label} loop."))
+    return html.section("Bench", html.side_by_side(*parts))
+
+
+def _origin(run: RunContent) -> str:
+    rows = tuple(
+        (name, path.name, run.digests.get(name, "–"))
+        for name, path in run.document["products"].items()
+        if path.suffix == ".fits"
+    )
+    files = html.table(tables.Table(("Product", "file", "SHA-256"), rows)) if rows else ""
+    return html.section(
+        "Origin",
+        files,
+        html.folded("Configuration", run.config_text),
+        html.folded("Log", run.log_text),
+    )

@@ -1,0 +1,132 @@
+"""How far two interaction matrices agree."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import PARAMETERS, UNITS
+from escape_hw.api.results import CalibrationResult, Measured
+from escape_hw.errors import IncompatibleProduct
+from escape_hw.report.figures_matrix import representative_modes
+from escape_hw.report.tables import TITLES, Table, with_error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """Two matrices side by side, over the sub-apertures that both have.
+
+    Parameters
+    ----------
+    correlation
+        Correlation of the two columns of every mode (about zero, not their means), ``(n_modes,)``.
+    gain_ratio
+        Regression of B on A: the gain of B relative to A, ``(n_modes,)``.
+    relative_rms
+        rms difference over the rms of A, ``(n_modes,)``.
+    total_relative_rms
+        The same over the whole matrix.
+    common
+        Number of sub-apertures that both have.
+    registration
+        B minus A with combined standard errors; empty unless both have one.
+    """
+
+    correlation: NDArray[np.float64]
+    gain_ratio: NDArray[np.float64]
+    relative_rms: NDArray[np.float64]
+    total_relative_rms: float
+    common: int
+    registration: dict[str, Measured]
+
+    def document(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "common_sub_apertures": self.common,
+            "correlation": self.correlation.tolist(),
+            "gain_ratio": self.gain_ratio.tolist(),
+            "relative_rms": self.relative_rms.tolist(),
+            "total_relative_rms": self.total_relative_rms,
+            "median_correlation": float(np.median(self.correlation)),
+            "registration_difference": {k: v.to_dict() for k, v in self.registration.items()} or None,
+        }
+
+
+def compare(a: CalibrationResult, b: CalibrationResult) -> Comparison:
+    """Compare two matrices of the same basis.
+
+    Raises
+    ------
+    IncompatibleProduct
+        Another basis, number of modes or lenslet grid.
+    """
+    if a.matrix.m2c.shape != b.matrix.m2c.shape or not np.allclose(a.matrix.m2c, b.matrix.m2c, atol=1e-9):
+        raise IncompatibleProduct("the two matrices have different bases; their modes cannot be compared")
+    if a.matrix.valid.shape != b.matrix.valid.shape:
+        raise IncompatibleProduct(
+            f"the lenslet grids differ: {a.matrix.valid.shape} and {b.matrix.valid.shape} sub-apertures"
+        )
+    both = a.matrix.valid & b.matrix.valid
+    if not both.any():
+        raise IncompatibleProduct("the two matrices have no valid sub-aperture in common")
+    left, right = (np.asarray(m.data, float)[np.tile(both[m.valid], 2)] for m in (a.matrix, b.matrix))
+    power_left, power_right = np.sum(left**2, axis=0), np.sum(right**2, axis=0)
+    cross = np.sum(left * right, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = cross / np.sqrt(power_left * power_right)
+        gain = cross / power_left
+        relative = np.sqrt(np.sum((right - left) ** 2, axis=0) / power_left)
+    total = math.sqrt(float(np.sum((right - left) ** 2)) / max(float(power_left.sum()), 1e-300))
+    return Comparison(correlation, gain, relative, total, int(both.sum()), _registration(a, b))
+
+
+def _registration(a: CalibrationResult, b: CalibrationResult) -> dict[str, Measured]:
+    if a.registration is None or b.registration is None:
+        return {}
+    first, second = a.registration.measured(), b.registration.measured()
+    return {
+        name: Measured(
+            second[name].value - first[name].value,
+            math.hypot(first[name].sigma, second[name].sigma),
+            UNITS[name],
+        )
+        for name in PARAMETERS
+    }
+
+
+def lines(result: Comparison) -> list[str]:
+    """The comparison in a few lines."""
+    return [
+        f"{result.correlation.size} modes over {result.common} common sub-apertures",
+        f"correlation per mode: least {np.min(result.correlation):.4f}, "
+        f"median {np.median(result.correlation):.4f}",
+        f"gain of B relative to A: median {np.median(result.gain_ratio):.4f}",
+        f"relative rms difference: {100 * result.total_relative_rms:.2f} % over the whole matrix",
+    ]
+
+
+def mode_table(result: Comparison, count: int = 12) -> Table:
+    """Evenly spaced modes with correlation, gain ratio and relative difference."""
+    rows = tuple(
+        (
+            f"{mode + 1}",
+            f"{result.correlation[mode]:.4f}",
+            f"{result.gain_ratio[mode]:.4f}",
+            f"{100 * result.relative_rms[mode]:.2f} %",
+        )
+        for mode in representative_modes(result.correlation.size, count)
+    )
+    return Table(("Mode", "correlation", "gain B / A", "relative rms difference"), rows)
+
+
+def registration_table(result: Comparison) -> Table:
+    """Difference of the registrations with combined errors."""
+    rows = tuple(
+        (f"{TITLES[name][0]} [{TITLES[name][1]}]", with_error(value))
+        for name, value in result.registration.items()
+    )
+    return Table(("Component", "α(B) − α(A)"), rows)

@@ -1,0 +1,134 @@
+"""What a run left behind, read back from its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.registration import Registration
+from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
+from escape_hw.errors import ProductError
+from escape_hw.io import fits_file
+from escape_hw.io.fits import KIND_MATRIX, load_matrix
+from escape_hw.io.psf import KIND_PSF, load_loop
+from escape_hw.io.run_folder import read_result
+
+#: How methods are called in figures and tables.
+METHOD_LABELS = {
+    "push-pull": "push-pull",
+    "docrime": "DO-CRIME",
+    "docrime-whitened": "DO-CRIME",
+    "escape": "ESCAPE",
+}
+
+
+@dataclass(slots=True)
+class RunContent:
+    """Everything a report shows; see :func:`read_run`."""
+
+    folder: Path
+    document: dict[str, Any]
+    calibrations: dict[str, CalibrationResult] = field(default_factory=dict)
+    measured_labels: dict[str, str] = field(default_factory=dict)
+    columns: dict[str, str] = field(default_factory=dict)
+    loops: dict[str, LoopResult] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)
+    config_text: str = ""
+    log_text: str = ""
+
+    @property
+    def simulated(self) -> bool:
+        """True when any device was simulated."""
+        return bool(self.document.get("simulated"))
+
+    @property
+    def planted(self) -> Registration | None:
+        """The registration hidden in the twin, when there was one."""
+        values = self.document.get("planted")
+        return Registration(**values) if values else None
+
+    @property
+    def psf_px(self) -> float | None:
+        """lambda/D on the science camera in pixels."""
+        value = self.document.get("bench", {}).get("psf_px")
+        return float(value) if value else None
+
+    @property
+    def layout(self) -> NDArray[np.bool_] | None:
+        """Map of the actuators."""
+        rows = self.document.get("bench", {}).get("layout")
+        return np.array([[c == "1" for c in row] for row in rows], bool) if rows else None
+
+    def matrices(self) -> dict[str, InteractionMatrix]:
+        """All matrices by label: measured ones before what was computed from them."""
+        found: dict[str, InteractionMatrix] = {}
+        for label, result in self.calibrations.items():
+            if result.measured is not None:
+                found.setdefault(self.measured_labels[label], result.measured)
+            found.setdefault(label, result.matrix)
+        return found
+
+    def estimates(self) -> dict[str, RegistrationEstimate]:
+        """Registrations by the heading of their column."""
+        found = {self.columns[n]: r.registration for n, r in self.calibrations.items() if r.registration}
+        return found
+
+    def partial(self) -> bool:
+        """True when any part of the run was aborted."""
+        return (
+            any(result.partial for result in self.calibrations.values())
+            or any(loop.partial for loop in self.loops.values())
+            or bool(self.document.get("partial"))
+        )
+
+
+def read_run(folder: Path | str) -> RunContent:
+    """Read a run folder: ``result.json`` and every FITS product it names.
+
+    Raises
+    ------
+    ProductError
+        Not a run folder, or a product is missing or damaged.
+    """
+    document = read_result(folder)
+    run = RunContent(Path(folder).absolute(), document)
+    run.config_text, run.log_text = (_text(run.folder / name) for name in ("config.toml", "run.log"))
+    labels: Mapping[str, Mapping[str, str]] = document.get("labels", {})
+    for name, path in document["products"].items():
+        if path.suffix == ".fits":
+            _add(run, name, path, labels.get(name, {}))
+    return run
+
+
+def _add(run: RunContent, name: str, path: Path, label: Mapping[str, str]) -> None:
+    hdus, digest = fits_file.read(path)
+    kind = hdus[0].header["KIND"]
+    run.digests[name] = digest
+    if kind == KIND_MATRIX:
+        result = load_matrix(path).result
+        shown = _free(
+            run.calibrations, label.get("label") or METHOD_LABELS.get(result.matrix.method, name), name
+        )
+        run.calibrations[shown] = result
+        run.measured_labels[shown] = label.get("measured", METHOD_LABELS["docrime"])
+        run.columns[shown] = label.get("column", "" if shown == "ESCAPE" else shown)
+    elif kind == KIND_PSF:
+        loop = load_loop(path).result
+        run.loops[_free(run.loops, label.get("label") or METHOD_LABELS.get(loop.method, name), name)] = loop
+    else:
+        raise ProductError(f"{path}: its kind is {kind!r}; this version knows IM and PSF")
+
+
+def _free(taken: Mapping[str, object], label: str, name: str) -> str:
+    return label if label not in taken else f"{label} ({name})"
+
+
+def _text(path: Path) -> str:
+    """A text file of the run; a run that ended early may lack one."""
+    return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""

@@ -1,0 +1,74 @@
+"""Pieces of a self-contained HTML page; everything that is shown is escaped here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape as escape
+from importlib import resources
+
+from matplotlib.figure import Figure
+
+from escape_hw.report import style
+from escape_hw.report.tables import Table
+
+
+def page(title: str, bands: Sequence[tuple[str, str]], body: Sequence[str]) -> str:
+    """A whole page; ``bands`` are (class, text) pairs across the top."""
+    top = "".join(f'<div class="band {kind}" role="status">{escape(text)}</div>' for kind, text in bands)
+    css = resources.files("escape_hw.report").joinpath("report.css").read_text(encoding="utf-8")
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{css}</style></head>\n"
+        f"<body>{top}<main>\n" + "\n".join(body) + "\n</main></body></html>\n"
+    )
+
+
+def section(title: str, *parts: str) -> str:
+    """A section with a heading; nothing when all parts are empty."""
+    inside = "\n".join(part for part in parts if part)
+    return f"<section><h2>{escape(title)}</h2>\n{inside}</section>" if inside else ""
+
+
+def facts(values: Mapping[str, str]) -> str:
+    """Headline numbers."""
+    cells = "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in values.items())
+    return f'<dl class="facts">{cells}</dl>'
+
+
+def table(content: Table, caption: str = "") -> str:
+    """A table in the book style: rules above, below and under the headings."""
+    head = "".join(f'<th scope="col">{escape(heading)}</th>' for heading in content.headings)
+    rows = "".join(
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in content.rows
+    )
+    below = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return (
+        f'<div class="wide"><table>{below}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+    )
+
+
+def figure(key: str, content: Figure, caption: str) -> str:
+    """A figure as inline SVG with its caption."""
+    # The same scale for all: text is equally large in wide and in narrow figures.
+    width = f'style="max-width:{6.7 * content.get_figwidth():.1f}rem"'
+    drawing = style.svg(content, key)
+    drawing = drawing.replace("<svg", f'<svg role="img" aria-labelledby="{key}-caption" {width}', 1)
+    return f'<figure>{drawing}<figcaption id="{key}-caption">{escape(caption)}</figcaption></figure>'
+
+
+def side_by_side(*parts: str) -> str:
+    """Figures beside each other where the page is wide enough."""
+    inside = "".join(part for part in parts if part)
+    return f'<div class="two">{inside}</div>' if inside else ""
+
+
+def notes(lines: Sequence[str], kind: str = "") -> str:
+    """A list of remarks."""
+    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return f'<ul class="notes {kind}">{items}</ul>' if lines else ""
+
+
+def folded(summary: str, text: str) -> str:
+    """Long text behind a heading that opens."""
+    return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>" if text else ""

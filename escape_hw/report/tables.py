@@ -1,0 +1,104 @@
+"""Results as tables of text, for the terminal and the report alike."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.results import LoopResult, Measured, RegistrationEstimate
+
+#: Names and units as the paper's Table 1 writes them.
+TITLES = {
+    "shift_x": ("Shift X", "% of Sub Aperture"),
+    "shift_y": ("Shift Y", "% of Sub Aperture"),
+    "rotation": ("Rotation", "deg"),
+    "radial_scaling": ("Radial Scaling", "% of Diameter"),
+    "tangential_scaling": ("Tangential Scaling", "% of Diameter"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table of text: headings and rows, the first column naming the row."""
+
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def with_error(value: Measured) -> str:
+    """Value and standard error, both rounded to the error's second digit."""
+    if not math.isfinite(value.value) or not math.isfinite(value.sigma):
+        return f"{value.value:.4g} ± {value.sigma:.2g}".replace("-", "−")
+    if value.sigma <= 0:
+        return f"{value.value:.4g}".replace("-", "−")
+    if value.sigma >= 1e6:
+        return f"{value.value:.4g} ± {value.sigma:.2g}".replace("-", "−")
+    digits = max(0, 1 - math.floor(math.log10(value.sigma)))
+    # Adding 0.0 turns a rounded −0.0 into 0.0.
+    return f"{round(value.value, digits) + 0.0:.{digits}f} ± {value.sigma:.{digits}f}".replace("-", "−")
+
+
+def percent(value: Measured) -> str:
+    """A ratio and its error in percent."""
+    return f"{100 * value.value:5.1f} ± {100 * value.sigma:.1f} %"
+
+
+def registration_table(
+    estimates: Mapping[str, RegistrationEstimate], planted: Registration | None = None
+) -> Table:
+    """Registration in the form of the paper's Table 1: components down, estimates across.
+
+    Parameters
+    ----------
+    estimates
+        By the heading of their column, such as ``SHORT``; an empty heading stands for alpha alone.
+    planted
+        The truth hidden in a twin, shown in a last column, and the pulls (difference over standard
+        error) beside each estimate.
+    """
+    headings = ["Component"]
+    for label in estimates:
+        headings.append(f"α {label}".strip())
+        if planted is not None:
+            headings.append("(α − planted) / σ")
+    if planted is not None:
+        headings.append("planted")
+    rows = []
+    for name in PARAMETERS:
+        title, unit = TITLES[name]
+        row = [f"{title} [{unit}]"]
+        for estimate in estimates.values():
+            value = estimate.measured()[name]
+            row.append(with_error(value))
+            if planted is not None:
+                row.append(_pull(value, getattr(planted, name)))
+        if planted is not None:
+            row.append(f"{getattr(planted, name):g}".replace("-", "−"))
+        rows.append(tuple(row))
+    return Table(tuple(headings), tuple(rows))
+
+
+def _pull(value: Measured, truth: float) -> str:
+    if not value.sigma > 0:
+        return "–"
+    return f"{(value.value - truth) / value.sigma:+.1f}".replace("-", "−")
+
+
+def strehl_table(loops: Mapping[str, LoopResult]) -> Table:
+    """Three Strehl ratios with errors, gain, residual and stability of every loop."""
+    headings = ("Matrix", "Strehl, peak", "Strehl, OTF", "Strehl, encircled", "gain", "residual", "loop")
+    rows = []
+    for label, loop in loops.items():
+        strehl = loop.strehl
+        ratios = (
+            ("–", "–", "–")
+            if strehl is None
+            else tuple(percent(value).strip() for value in (strehl.peak, strehl.otf, strehl.encircled))
+        )
+        state = f"stable for {loop.frames / loop.rate_hz:.0f} s" if loop.stable else "UNSTABLE"
+        if loop.partial:
+            state += ", aborted"
+        rows.append((label, *ratios, f"{loop.gain:.3g}", f"{loop.residual_rms_nm:.0f} nm rms", state))
+    return Table(headings, tuple(rows))

@@ -1,0 +1,80 @@
+"""What a reproduced result must meet to count as reproduced."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.results import LoopResult, RegistrationEstimate
+
+#: Differences between SHORT and LONG in the paper's Table 1, to the last digit printed there.
+PAPER_DIFFERENCES = {
+    "shift_x": 1.3,
+    "shift_y": 0.4,
+    "rotation": 0.02,
+    "radial_scaling": 0.1,
+    "tangential_scaling": 0.19,
+}
+#: Largest pull (difference over standard error) that still counts as recovered.
+_LARGEST_PULL = 4.0
+
+
+def check(text: str, met: bool) -> dict[str, Any]:
+    """One criterion for documents and reports."""
+    return {"text": text, "met": bool(met)}
+
+
+def converged(label: str, estimate: RegistrationEstimate | None) -> dict[str, Any]:
+    """SPRINT converged."""
+    return check(f"{label}: SPRINT converged", estimate is not None and estimate.converged)
+
+
+def recovered(label: str, estimate: RegistrationEstimate, planted: Registration) -> dict[str, Any]:
+    """The planted registration lies within the error bars."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pulls = np.abs(estimate.registration.to_array() - planted.to_array()) / estimate.sigma
+    worst = float(pulls.max())  # NaN, from no error and no difference, counts as not met
+    return check(
+        f"{label}: planted registration recovered within {_LARGEST_PULL:g} standard errors "
+        f"(largest pull {worst:.1f}, {PARAMETERS[int(pulls.argmax())]})",
+        worst <= _LARGEST_PULL,
+    )
+
+
+def agree(short: RegistrationEstimate, long: RegistrationEstimate) -> list[dict[str, Any]]:
+    """SHORT and LONG agree at least as well as the paper's, parameter by parameter."""
+    checks = []
+    for name, value in short.measured().items():
+        difference = abs(value.value - long.measured()[name].value)
+        allowed = PAPER_DIFFERENCES[name]
+        checks.append(
+            check(
+                f"SHORT and LONG agree in {name}: {difference:.3g} (paper: {allowed:g} {value.unit})",
+                difference <= allowed,
+            )
+        )
+    return checks
+
+
+def loops(results: Mapping[str, LoopResult]) -> list[dict[str, Any]]:
+    """Every loop is stable; ESCAPE is not below push-pull beyond the error bar."""
+    checks = [check(f"{label}: loop stable", loop.stable) for label, loop in results.items()]
+    escape, baseline = results.get("ESCAPE"), results.get("push-pull")
+    if escape is None or baseline is None or escape.strehl is None or baseline.strehl is None:
+        return checks
+    for way in ("peak", "otf", "encircled"):
+        ours, theirs = getattr(escape.strehl, way), getattr(baseline.strehl, way)
+        error = math.hypot(ours.sigma, theirs.sigma)
+        difference = ours.value - theirs.value
+        checks.append(
+            check(
+                f"Strehl ({way}) of ESCAPE minus push-pull: {100 * difference:+.1f} ± {100 * error:.1f} %, "
+                "not below zero by more than two standard errors",
+                difference >= -2 * error,
+            )
+        )
+    return checks

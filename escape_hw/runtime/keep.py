@@ -1,0 +1,73 @@
+"""Keeps what a run made: products, ``result.json``, report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from escape_hw.api.results import CalibrationResult, LoopResult
+from escape_hw.io.fits import save_matrix
+from escape_hw.io.provenance import sha256_of
+from escape_hw.io.psf import save_loop
+from escape_hw.io.run_folder import RunFolder
+from escape_hw.report.build import REPORT, write_report
+from escape_hw.runtime.records import BenchRecord
+
+
+def key_of(label: str) -> str:
+    """A label as a product's name: ``DO-CRIME SHORT`` becomes ``docrime_short``."""
+    return re.sub(r"[^a-z0-9]+", "_", label.lower().replace("do-crime", "docrime")).strip("_")
+
+
+def keep_calibration(
+    folder: RunFolder,
+    record: BenchRecord,
+    name: str,
+    result: CalibrationResult,
+    parents: Mapping[str, Path] | None = None,
+) -> Path:
+    """Save a calibration as ``NAME.fits`` and list it among the products.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    known = {path.name: sha256_of(path) for path in (parents or {}).values()}
+    return folder.add(name, save_matrix(folder.file(f"{name}.fits"), result, record.origin(known)))
+
+
+def keep_loop(
+    folder: RunFolder, record: BenchRecord, name: str, result: LoopResult, matrix: Path | None = None
+) -> Path:
+    """Save a closed-loop run as ``NAME.fits``, with the matrix that closed it as its parent.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    parents = {} if matrix is None else {matrix.name: sha256_of(matrix)}
+    path = folder.file(f"{name}.fits")
+    saved = save_loop(path, result, record.system, record.simulated, record.origin(parents))
+    return folder.add(name, saved)
+
+
+def finish(folder: RunFolder, document: Mapping[str, Any]) -> dict[str, Any]:
+    """Write ``result.json``, build the report, and return the document with the products' paths.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    folder.add("report", folder.file(REPORT))
+    folder.write_result(document)
+    write_report(folder.path)
+    return {
+        **document,
+        "folder": str(folder.path),
+        "products": {k: str(v) for k, v in folder.products.items()},
+    }

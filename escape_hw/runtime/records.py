@@ -1,0 +1,96 @@
+"""What a run writes down about the bench it ran on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+from escape_hw.api.registration import Registration
+from escape_hw.bench import Bench
+from escape_hw.config.models import SystemConfig
+from escape_hw.io import documents
+from escape_hw.io.provenance import Provenance, git_state, software_version, utc_text
+
+
+@dataclass(frozen=True, slots=True)
+class BenchRecord:
+    """Identity of an opened bench, kept after it is closed.
+
+    ``planted`` is the registration hidden in a twin: for reports only, no estimator may see it.
+    """
+
+    system: str
+    simulated: bool
+    seed: int
+    config_text: str
+    basis: str
+    serials: Mapping[str, str]
+    layout: tuple[str, ...]
+    psf_px: float | None
+    planted: Registration | None
+    started: datetime = field(default_factory=lambda: datetime.now(UTC))
+
+    @classmethod
+    def of(cls, bench: Bench) -> BenchRecord:
+        """Take it from an open bench."""
+        config = bench.config
+        named = {"dm": bench.dm, "wfs": bench.wfs, "science": bench.science}
+        simulated = bool(bench.simulated)
+        science = config.devices.science
+        return cls(
+            system=config.system.name,
+            simulated=simulated,
+            seed=config.system.seed,
+            config_text=config.to_toml(),
+            basis=config.basis.kind,
+            serials={name: device.info.serial for name, device in named.items() if device is not None},
+            layout=_layout(bench),
+            psf_px=None if science is None else float(science.psf_px),
+            planted=config.twin.registration.to_registration() if simulated else None,
+        )
+
+    def origin(self, parents: Mapping[str, str] | None = None) -> Provenance:
+        """Provenance of a product made on this bench."""
+        return Provenance(self.config_text, self.basis, self.seed, self.serials, parents or {}, self.started)
+
+    def head(self, command: str) -> dict[str, Any]:
+        """What the run's document begins with."""
+        return {
+            **documents.head(command, self.system, self.simulated, self.seed),
+            "software": software_version(),
+            "git": git_state(),
+            "started_utc": utc_text(self.started),
+            "planted": None if self.planted is None else self.planted.to_dict(),
+            "bench": {"layout": list(self.layout), "psf_px": self.psf_px},
+        }
+
+    def tail(self, wall_seconds: float) -> dict[str, Any]:
+        """What the run's document ends with."""
+        return {"finished_utc": utc_text(), "wall_seconds": wall_seconds}
+
+
+def config_record(config: SystemConfig) -> Provenance:
+    """Provenance of a product computed from a configuration alone, with nothing opened."""
+    return Provenance(config.to_toml(), config.basis.kind, config.system.seed, {}, {}, datetime.now(UTC))
+
+
+def _layout(bench: Bench) -> tuple[str, ...]:
+    """Map of the actuators as rows of 0 and 1; empty when they do not stand on a grid."""
+    layout = bench.dm.info.layout
+    return () if layout is None else tuple("".join("1" if spot else "0" for spot in row) for row in layout)
+
+
+@contextmanager
+def without_turbulence(bench: Bench) -> Iterator[None]:
+    """Take the phase screen out of the beam for a while, when the bench has one."""
+    if bench.screen is None or not bench.screen.state.inserted:
+        yield
+        return
+    bench.screen.set(inserted=False)
+    try:
+        yield
+    finally:
+        bench.screen.set(inserted=True)

@@ -1,0 +1,139 @@
+"""The paper's Shack-Hartmann results on one bench: procedures that scripts can use as well."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from escape_hw.api.procedure import Procedure
+from escape_hw.api.results import CalibrationResult, LoopResult
+from escape_hw.bench import Bench
+from escape_hw.errors import Aborted
+from escape_hw.runtime.records import without_turbulence
+
+#: The paper's two runs: 20 seconds and 3 minutes at 500 Hz.
+SHORT_FRAMES, LONG_FRAMES = 10_000, 100_000
+#: The paper's case, as overrides of a configuration; user overrides go after them.
+PAPER_CASE = (
+    "twin.registration.shift_x=-16.0",
+    "twin.registration.shift_y=-71.0",
+    "twin.registration.rotation=-0.77",
+    "twin.registration.radial_scaling=2.9",
+    "twin.registration.tangential_scaling=0.0",
+)
+
+
+@dataclass(slots=True)
+class ShwfsResult:
+    """Push-pull, DO-CRIME and ESCAPE on one Shack-Hartmann bench, each with its loop.
+
+    ``loops`` are the runs at each matrix's own best gain, ``scans`` the runs that found it, both by
+    label; ``partial`` is true when the operator stopped it early.
+    """
+
+    calibrations: dict[str, CalibrationResult] = field(default_factory=dict)
+    loops: dict[str, LoopResult] = field(default_factory=dict)
+    scans: dict[str, list[LoopResult]] = field(default_factory=dict)
+    partial: bool = False
+
+
+@dataclass(slots=True)
+class Table1Result:
+    """ESCAPE with few and with many frames (paper, Table 1), by the heading of the column."""
+
+    calibrations: dict[str, CalibrationResult] = field(default_factory=dict)
+    partial: bool = False
+
+
+def reproduce_shwfs(
+    bench: Bench, *, frames: int = SHORT_FRAMES, loop_frames: int = 5000
+) -> Procedure[ShwfsResult]:
+    """Calibrate with and without a source and close the loop with every matrix.
+
+    The push-pull baseline and the model PSF are taken with the phase screen out; the DO-CRIME and
+    ESCAPE calibrations and all loops run under turbulence. No step reads the twin's truth.
+
+    Parameters
+    ----------
+    bench
+        An open bench with a science camera.
+    frames
+        Frames of the DO-CRIME measurement.
+    loop_frames
+        Frames of each final closed-loop run.
+    """
+    result = ShwfsResult()
+    try:
+        yield from _calibrate(bench, frames, result)
+        if not result.partial:
+            yield from _close_loops(bench, loop_frames, result)
+    except Aborted:
+        result.partial = True
+    return result
+
+
+def _calibrate(bench: Bench, frames: int, result: ShwfsResult) -> Procedure[None]:
+    from escape_hw.calibration.escape import escape
+    from escape_hw.calibration.push_pull import push_pull
+
+    with without_turbulence(bench):
+        baseline = yield from push_pull(bench)
+    result.calibrations["push-pull"] = baseline
+    result.partial = baseline.partial
+    if result.partial:
+        return
+    found = yield from escape(bench, frames=frames)
+    measured = measured_part(found)
+    if measured is not None:
+        result.calibrations["DO-CRIME"] = measured
+    result.calibrations["ESCAPE"] = found
+    result.partial = found.partial
+
+
+def _close_loops(bench: Bench, loop_frames: int, result: ShwfsResult) -> Procedure[None]:
+    from escape_hw.calibration.closed_loop import best_gain, closed_loop, measure_model_psf
+
+    with without_turbulence(bench):
+        model = yield from measure_model_psf(bench)
+    for label, calibration in result.calibrations.items():
+        matrix, grid = calibration.matrix, calibration.grid
+        gain, scan = yield from best_gain(bench, matrix, grid)
+        result.scans[label] = list(scan)
+        if any(run.partial for run in scan):
+            result.partial = True
+            return
+        loop = yield from closed_loop(bench, matrix, grid, gain=gain, frames=loop_frames, model_psf=model)
+        result.loops[label] = loop
+        if loop.partial:
+            result.partial = True
+            return
+
+
+def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -> Procedure[Table1Result]:
+    """ESCAPE with each number of frames (paper, Table 1).
+
+    Parameters
+    ----------
+    frames
+        Frames by the heading of the column; SHORT and LONG of the paper by default.
+    """
+    from escape_hw.calibration.escape import escape
+
+    result = Table1Result()
+    try:
+        for label, count in (frames or {"SHORT": SHORT_FRAMES, "LONG": LONG_FRAMES}).items():
+            found = yield from escape(bench, frames=count)
+            result.calibrations[label] = found
+            if found.partial:
+                result.partial = True
+                break
+    except Aborted:
+        result.partial = True
+    return result
+
+
+def measured_part(result: CalibrationResult) -> CalibrationResult | None:
+    """The DO-CRIME matrix behind an ESCAPE matrix as a calibration of its own."""
+    if result.measured is None:
+        return None
+    return replace(result, matrix=result.measured, measured=None, registration=None, notes=())

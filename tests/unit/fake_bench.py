@@ -1,0 +1,132 @@
+"""A bench without optics and procedures without physics, for the tests of the command line."""
+
+from __future__ import annotations
+
+import sys
+import types
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import fake_results as fake
+import pytest
+
+from escape_hw.api.procedure import Progress
+from escape_hw.config.load import load_system
+from escape_hw.errors import Aborted
+
+
+class FakeScreen:
+    def __init__(self) -> None:
+        self.state = SimpleNamespace(inserted=True)
+
+    def set(self, inserted: bool) -> None:
+        self.state.inserted = inserted
+
+
+class FakeBench:
+    """Looks like an open system; remembers what happened to it."""
+
+    def __init__(self, config: Any) -> None:
+        self.config = config
+        self.simulated = config.system.mode == "sim"
+        info = SimpleNamespace(serial="SIM97", layout=fake.layout())
+        self.dm = SimpleNamespace(info=info)
+        self.wfs = self.science = SimpleNamespace(info=SimpleNamespace(serial="SIMCAM"))
+        self.screen = FakeScreen()
+        self.closed = False
+        self.screen_seen: dict[str, bool] = {}
+
+    def __enter__(self) -> FakeBench:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.closed = True
+
+
+def steps(stage: str, n: int = 3):
+    for i in range(n):
+        yield Progress(stage, i + 1, n, metrics={"rms": 1.0}, elapsed_s=0.1)
+
+
+class FakeProcedures:
+    """Stand-ins for the calibration procedures; ``hook`` runs in the middle of each."""
+
+    def __init__(self) -> None:
+        self.hook: Callable[[str], None] = lambda name: None
+        self.calls: list[tuple[str, dict[str, Any]]] = []
+        self.changes: dict[str, Any] = {}
+        self.benches: list[FakeBench] = []
+
+    def _calibrate(self, bench: FakeBench, name: str, **options: Any):
+        self.calls.append((name, options))
+        bench.screen_seen[name] = bench.screen.state.inserted
+        try:
+            yield from steps(name)
+            self.hook(name)
+            yield from steps(name)
+        except Aborted:
+            return fake.calibration(name, partial=True)
+        return replace(fake.calibration(name), **self.changes)
+
+    def push_pull(self, bench: FakeBench, **options: Any):
+        return self._calibrate(bench, "push-pull", **options)
+
+    def docrime(self, bench: FakeBench, **options: Any):
+        return self._calibrate(bench, "docrime", **options)
+
+    def escape(self, bench: FakeBench, **options: Any):
+        return self._calibrate(bench, "escape", **options)
+
+    def sprint(self, matrix: Any, model: Any, **options: Any):
+        self.calls.append(("sprint", {"method": matrix.method, **options}))
+        return fake.registration()
+
+    def closed_loop(self, bench: FakeBench, matrix: Any, grid: Any, **options: Any):
+        self.calls.append(("closed_loop", {"method": matrix.method, **options}))
+        bench.screen_seen["loop"] = bench.screen.state.inserted
+        try:
+            yield from steps("closed loop")
+            self.hook("closed_loop")
+            yield from steps("closed loop")
+        except Aborted:
+            return fake.loop(matrix.method, partial=True)
+        return replace(fake.loop(matrix.method), **self.changes)
+
+    def best_gain(self, bench: FakeBench, matrix: Any, grid: Any, **options: Any):
+        self.calls.append(("best_gain", {"method": matrix.method}))
+        yield from steps("gain")
+        return 0.35, [replace(fake.loop(matrix.method), gain=g) for g in (0.25, 0.35, 0.45)]
+
+    def measure_model_psf(self, bench: FakeBench):
+        bench.screen_seen["model_psf"] = bench.screen.state.inserted
+        yield from steps("model PSF")
+        self.hook("model_psf")
+        yield from steps("model PSF")
+        return fake.psf(1.0)
+
+
+def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
+    """Put the stand-ins where the command line looks for the real ones."""
+    made = FakeProcedures()
+    homes = {
+        "push_pull": ("push_pull",),
+        "docrime": ("docrime",),
+        "escape": ("escape",),
+        "sprint": ("sprint",),
+        "closed_loop": ("closed_loop", "best_gain", "measure_model_psf"),
+    }
+    for module, names in homes.items():
+        stand_in = types.ModuleType(f"escape_hw.calibration.{module}")
+        for name in names:
+            setattr(stand_in, name, getattr(made, name))
+        monkeypatch.setitem(sys.modules, stand_in.__name__, stand_in)
+
+    def open_system(system: str, *, set: Any = (), seed: Any = None, mode: Any = None) -> FakeBench:
+        made.benches.append(FakeBench(load_system(system, overrides=set, seed=seed, mode=mode)))
+        return made.benches[-1]
+
+    monkeypatch.setattr("escape_hw.runtime.system.open_system", open_system)
+    monkeypatch.setattr("escape_hw.config.registry.model_factory", lambda name: lambda config, grid: None)
+    return made

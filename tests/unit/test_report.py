@@ -1,0 +1,277 @@
+"""Figures say what they should, and the report is one sound page that needs nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from html.parser import HTMLParser
+
+import fake_results as fake
+import numpy as np
+import pytest
+
+from escape_hw.api.registration import PARAMETERS
+from escape_hw.api.results import Measured
+from escape_hw.errors import IncompatibleProduct, ProductError
+from escape_hw.io import documents
+from escape_hw.io.fits import save_matrix
+from escape_hw.io.psf import save_loop
+from escape_hw.io.run_folder import RunFolder
+from escape_hw.report import (
+    comparison,
+    figures_bench,
+    figures_matrix,
+    figures_registration,
+    style,
+    tables,
+)
+from escape_hw.report.build import write_report
+
+LOOPS = {
+    "push-pull": fake.loop("push-pull", strehl=0.63),
+    "ESCAPE": fake.loop("escape", strehl=0.62),
+}
+
+
+def make_run(folder, *, simulated=True, partial=False, lean=False, title="A <title> & more"):
+    """A run folder with everything a report can show (or, lean, one matrix), on a small sensor."""
+    with RunFolder("razor-shwfs", "test", folder) as run:
+        run.write_config("# <script>alert(1)</script>\nschema = 1\n")
+        for method in ("push-pull",) if lean else ("push-pull", "escape"):
+            result = fake.calibration(method, n=8, n_modes=6, partial=partial)
+            run.add(method, save_matrix(run.file(f"{method}.fits"), result))
+        for label, loop in () if lean else LOOPS.items():
+            loop = dataclasses.replace(loop, partial=partial)
+            run.add(
+                f"loop {label}", save_loop(run.file(f"loop-{label}.fits"), loop, "razor-shwfs", simulated)
+            )
+        run.write_result(
+            {
+                **documents.head("test", "razor-shwfs", simulated, 1),
+                "title": title,
+                "planted": fake.PLANTED.to_dict(),
+                "labels": {"escape": {"label": "ESCAPE", "measured": "DO-CRIME", "column": "SHORT"}},
+                "bench": {
+                    "psf_px": 2.46,
+                    "layout": ["".join("01"[int(v)] for v in row) for row in fake.layout()],
+                },
+                "scans": {} if lean else {k: [documents.loop_document(loop)] for k, loop in LOOPS.items()},
+                "criteria": [{"text": "a met one", "met": True}, {"text": "a missed one", "met": False}],
+                "sky_time": None if lean else fake.sky_time(),
+            }
+        )
+    return run.path
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    return write_report(make_run(tmp_path_factory.mktemp("report") / "run")).read_text(encoding="utf-8")
+
+
+class Checker(HTMLParser):
+    """Collects ids and references, and sees that every element is closed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.outside: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in ("meta", "br"):
+            self.open.append(tag)
+        self._note(attrs)
+
+    def handle_startendtag(self, tag, attrs):
+        self._note(attrs)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def _note(self, attrs):
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value)
+            if name in ("src", "href", "xlink:href") and not value.startswith(("#", "data:")):
+                self.outside.append(value)
+
+
+def test_page_is_sound_and_self_contained(page):
+    checker = Checker()
+    checker.feed(page)
+    assert checker.open == []
+    assert checker.outside == []
+    assert len(checker.ids) == len(set(checker.ids))
+    assert "<script" not in page
+    assert "@import" not in page
+    used = set(re.findall(r'(?:url\(#|href="#)([^")]+)', page))
+    assert used <= set(checker.ids)
+
+
+def test_page_shows_everything(page):
+    assert "A &lt;title&gt; &amp; more" in page
+    for word in (
+        "SIMULATED", "SPRINT convergence", "Stacked closed-loop PSFs", "Interaction matrices", "Sky time",
+        "Residual wavefront", "last mirror command", "Mean sensor frame", "best gain", "a missed one",
+        "α SHORT", "planted", "Signal-to-noise", "Configuration", "&lt;script&gt;alert(1)",
+    ):  # fmt: skip
+        assert word in page, word
+    assert page.count("<figure>") == 10
+    assert "ABORTED" not in page
+
+
+def test_neutral_colours_follow_the_page(page):
+    assert "var(--ink)" in page
+    assert style.INK not in page.split("</style>", 1)[1]
+    assert "prefers-color-scheme: dark" in page
+
+
+def test_same_run_gives_the_same_page(tmp_path):
+    folder = make_run(tmp_path / "run", lean=True)
+    first = write_report(folder).read_bytes()
+    assert write_report(folder).read_bytes() == first
+
+
+def test_hardware_and_aborted_runs_say_so(tmp_path):
+    text = write_report(make_run(tmp_path / "run", simulated=False, partial=True, lean=True)).read_text()
+    assert ">HARDWARE<" in text
+    assert "ABORTED BY THE OPERATOR" in text
+    assert "SIMULATED" not in text
+
+
+def test_damaged_product_stops_the_report(tmp_path):
+    folder = make_run(tmp_path / "run")
+    file = folder / "escape.fits"
+    file.write_bytes(file.read_bytes()[:-2880])
+    with pytest.raises(ProductError, match=r"escape\.fits"):
+        write_report(folder)
+    assert not (folder / "report.html").exists()
+
+
+def test_mode_maps_show_every_matrix_and_mode():
+    matrices = {"a": fake.matrix(n=8, n_modes=20), "b": fake.matrix(n=8, n_modes=12)}
+    figure = figures_matrix.mode_maps(matrices, 8)
+    cells = figure.axes[:-1]
+    assert len(cells) == 16
+    assert [cell.get_ylabel() for cell in cells[::2]][:2] == ["mode 1", "mode 4"]
+    assert cells[-2].get_ylabel() == "mode 20"
+    assert not cells[-1].images  # the second matrix has no mode 20
+    rgba = cells[0].images[0].get_array()
+    assert rgba.shape == (8, 17, 4)
+    assert np.all(rgba[:, 8, 3] == 0)
+
+
+def test_mode_maps_share_a_scale_after_normalisation():
+    plain = fake.matrix(noise=0.0, n=8, n_modes=5)
+    loud = dataclasses.replace(plain, data=plain.data * np.array([1, 3, 10, 0.1, 7], np.float32))
+    figure = figures_matrix.mode_maps({"plain": plain, "loud": loud}, 5)
+    for left, right in zip(figure.axes[0:-1:2], figure.axes[1:-1:2], strict=True):
+        np.testing.assert_allclose(left.images[0].get_array(), right.images[0].get_array(), atol=0.02)
+
+
+def test_empty_mode_and_missing_errors_draw():
+    blank = dataclasses.replace(fake.matrix(n=8, n_modes=5), data=np.zeros((104, 5), np.float32))
+    style.png(figures_matrix.mode_maps({"blank": blank}), 40)
+    computed = fake.matrix("escape", noise=0.0, n=8, n_modes=5)
+    style.png(figures_matrix.errors_per_mode({"ESCAPE": computed}), 40)
+
+
+def test_convergence_draws_parameters_truth_and_errors():
+    estimate = fake.registration()
+    figure = figures_registration.convergence(estimate, fake.PLANTED)
+    assert len(figure.axes) == 6
+    assert figure.axes[0].get_yscale() == "log"
+    for panel, name in zip(figure.axes[1:], PARAMETERS, strict=True):
+        track, truth = panel.lines
+        np.testing.assert_allclose(
+            track.get_ydata(), [getattr(step.registration, name) for step in estimate.iterations]
+        )
+        assert truth.get_ydata()[0] == getattr(fake.PLANTED, name)
+        assert "[" in panel.get_ylabel()
+
+
+def test_loops_without_images_or_strehl_draw():
+    bare = dataclasses.replace(
+        LOOPS["ESCAPE"], strehl=None, psf=None, model_psf=None, residual_nm=np.zeros(0)
+    )
+    style.png(figures_bench.stacked_psfs({"bare": bare}), 40)
+    style.png(figures_bench.residual_strip({"bare": bare}), 40)
+    only = dataclasses.replace(LOOPS["ESCAPE"], strehl=None, model_psf=None)
+    style.png(figures_bench.stacked_psfs({"only": only}), 40)
+    style.png(figures_bench.mirror(np.zeros(97), fake.layout()), 40)
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "text"),
+    [
+        (-15.1834, 0.4, "−15.18 ± 0.40"),
+        (-0.7652, 0.0123, "−0.765 ± 0.012"),
+        (2.9, 0.052, "2.900 ± 0.052"),
+        (-0.0001, 0.06, "0.000 ± 0.060"),
+        (12.0, 340.0, "12 ± 340"),
+        (1.5, 0.0, "1.5"),
+        (math.nan, math.nan, "nan ± nan"),
+        (3.0, math.inf, "3 ± inf"),
+    ],
+)
+def test_numbers_are_rounded_to_their_error(value, sigma, text):
+    assert tables.with_error(Measured(value, sigma)) == text
+
+
+def test_registration_table_has_the_papers_form():
+    short, long = fake.registration(seed=3), fake.registration(0.3, seed=4)
+    table = tables.registration_table({"SHORT": short, "LONG": long}, fake.PLANTED)
+    assert table.headings[0::2] == ("Component", "(α − planted) / σ", "(α − planted) / σ")
+    assert (table.headings[1], table.headings[3], table.headings[-1]) == ("α SHORT", "α LONG", "planted")
+    assert [row[0] for row in table.rows] == [
+        "Shift X [% of Sub Aperture]",
+        "Shift Y [% of Sub Aperture]",
+        "Rotation [deg]",
+        "Radial Scaling [% of Diameter]",
+        "Tangential Scaling [% of Diameter]",
+    ]
+    assert table.rows[1][-1] == "−71"
+
+
+def test_compare_finds_gain_and_difference():
+    a = fake.calibration("escape", n=8, n_modes=6)
+    scaled = dataclasses.replace(a.matrix, data=a.matrix.data * np.float32(1.1))
+    result = comparison.compare(a, dataclasses.replace(a, matrix=scaled))
+    np.testing.assert_allclose(result.correlation, 1, rtol=1e-6)
+    np.testing.assert_allclose(result.gain_ratio, 1.1, rtol=1e-5)
+    np.testing.assert_allclose(result.relative_rms, 0.1, rtol=1e-4)
+    assert result.total_relative_rms == pytest.approx(0.1, rel=1e-4)
+    assert all(value.value == 0 and value.sigma > 0 for value in result.registration.values())
+
+
+def test_compare_uses_the_common_sub_apertures():
+    a = fake.calibration("push-pull", n=8, n_modes=6)
+    n = a.grid.n_valid
+    valid = a.matrix.valid.copy()
+    valid[tuple(np.argwhere(valid)[0])] = False
+    keep = np.tile(np.arange(n) > 0, 2)
+    fewer = dataclasses.replace(a.matrix, data=a.matrix.data[keep], sigma=a.matrix.sigma[keep], valid=valid)
+    result = comparison.compare(a, dataclasses.replace(a, matrix=fewer))
+    assert result.common == n - 1
+    assert result.total_relative_rms == 0
+
+
+def test_compare_refuses_another_basis_or_grid():
+    a = fake.calibration("escape", n=8, n_modes=6)
+    other = dataclasses.replace(a, matrix=dataclasses.replace(a.matrix, m2c=a.matrix.m2c + 0.1))
+    with pytest.raises(IncompatibleProduct, match="bases"):
+        comparison.compare(a, other)
+    with pytest.raises(IncompatibleProduct, match="grids"):
+        comparison.compare(a, fake.calibration("escape", n=10, n_modes=6))
+
+
+def test_documents_are_strict_json():
+    text = documents.dumps(
+        {"a": np.float32(1), "b": [math.inf, np.nan], "c": np.arange(2), "d": Measured(1, 2)}
+    )
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    document = documents.calibration_document(fake.calibration("escape"))
+    assert document["snr"]["median"] > 0
+    assert documents.calibration_document(fake.calibration("docrime"))["registration"] is None
