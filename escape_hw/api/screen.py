@@ -14,12 +14,14 @@ from escape_hw.errors import SettingRejected
 class ScreenState:
     """State of the phase screen: number of the screen, in or out of the beam, speed.
 
-    ``speed_m_s`` is the speed of the screen across the pupil in metres per second.
+    ``speed_m_s`` is the speed of the screen across the pupil in metres per second. ``blocked`` is
+    true while a beam stop is in place, for dark frames.
     """
 
     screen: int
     inserted: bool
     speed_m_s: float
+    blocked: bool = False
 
 
 class PhaseScreen(Device):
@@ -42,7 +44,12 @@ class PhaseScreen(Device):
 
     @final
     def set(
-        self, *, screen: int | None = None, inserted: bool | None = None, speed_m_s: float | None = None
+        self,
+        *,
+        screen: int | None = None,
+        inserted: bool | None = None,
+        speed_m_s: float | None = None,
+        blocked: bool | None = None,
     ) -> ScreenState:
         """Change what is given, keep the rest; returns the state reached."""
         self.require_open()
@@ -51,6 +58,7 @@ class PhaseScreen(Device):
             now.screen if screen is None else screen,
             now.inserted if inserted is None else inserted,
             now.speed_m_s if speed_m_s is None else speed_m_s,
+            now.blocked if blocked is None else blocked,
         )
         if not 0 <= want.screen < self.n_screens:
             raise SettingRejected(self.name, f"screen {want.screen} is not one of 0..{self.n_screens - 1}")

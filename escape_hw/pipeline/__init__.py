@@ -1,0 +1,1 @@
+"""From camera frame to mirror command: pure functions on arrays."""

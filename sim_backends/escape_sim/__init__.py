@@ -1,0 +1,1 @@
+"""Simulated twins of the instruments, their optics, and SPRINT's synthetic models."""

@@ -1,0 +1,77 @@
+"""How a simulated mirror moves: latency, settling, creep and saturation."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: A critically damped step is within 5 % of its end after this many time constants.
+_SETTLED = 4.744
+
+
+class MirrorDynamics:
+    """Critically damped actuators with a slow creep, driven by time-stamped commands.
+
+    Parameters
+    ----------
+    n_act
+        Number of actuators.
+    settling_s
+        Time to settle within 5 % of a step, in seconds.
+    creep_fraction
+        Share of a step that appears slowly on top of it.
+    creep_time_s
+        Time constant of the creep in seconds.
+    """
+
+    def __init__(self, n_act: int, settling_s: float, creep_fraction: float, creep_time_s: float) -> None:
+        self._rate = _SETTLED / settling_s
+        self._creep_share, self._creep_time = creep_fraction, creep_time_s
+        self._time = 0.0
+        self._target = np.zeros(n_act)
+        self._position = np.zeros(n_act)
+        self._speed = np.zeros(n_act)
+        self._creep = np.zeros(n_act)
+        self._pending: deque[tuple[float, NDArray[np.float64]]] = deque()
+
+    def command(self, time_s: float, shape: NDArray[np.float64]) -> None:
+        """Take a command that reaches the actuators at ``time_s``; it saturates at full stroke."""
+        self._pending.append((time_s, np.clip(shape, -1.0, 1.0)))
+
+    def mean(self, start_s: float, end_s: float) -> NDArray[np.float64]:
+        """Mean displacement ``(n_act,)`` over an interval, in fractions of full stroke.
+
+        Intervals must come in order of time; what lies before the last one is cut off.
+        """
+        start = max(start_s, self._time)
+        self._advance(start)
+        if end_s <= start:
+            return self._position + self._creep_share * self._creep
+        total = self._advance(end_s)
+        return total / (end_s - start) + self._creep_share * self._creep
+
+    def _advance(self, until_s: float) -> NDArray[np.float64]:
+        """Move on and return the integral of the position over the way."""
+        total = np.zeros_like(self._position)
+        while self._pending and self._pending[0][0] <= until_s:
+            at, shape = self._pending.popleft()
+            total += self._glide(max(at, self._time))
+            self._target = shape
+        return total + self._glide(until_s)
+
+    def _glide(self, until_s: float) -> NDArray[np.float64]:
+        span = until_s - self._time
+        if span <= 0:
+            return np.zeros_like(self._position)
+        w = self._rate
+        decay = np.exp(-w * span)
+        lag = self._position - self._target
+        slope = self._speed + w * lag
+        total = self._target * span + lag * (1 - decay) / w + slope * (1 - decay * (1 + w * span)) / w**2
+        self._position = self._target + (lag + slope * span) * decay
+        self._speed = (self._speed - w * slope * span) * decay
+        self._creep += (self._target - self._creep) * -np.expm1(-span / self._creep_time)
+        self._time = until_s
+        return np.asarray(total)

@@ -1,0 +1,116 @@
+"""Von Karman phase screens on a rotating plate."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+def von_karman_screen(
+    size: int, pixel_m: float, r0_m: float, outer_scale_m: float, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """A periodic screen of von Karman turbulence.
+
+    The power spectrum of the phase is ``0.0229 r0^(-5/3) (f^2 + 1/L0^2)^(-11/6)`` in rad^2 m^2
+    (Roddier 1981; f in cycles per metre).
+
+    Parameters
+    ----------
+    size
+        Pixels across; make ``size * pixel_m`` several outer scales, for the screen holds no
+        structure larger than itself.
+    pixel_m
+        Pixel size in metres.
+    r0_m
+        Fried parameter in metres at the wavelength that the phase refers to.
+    outer_scale_m
+        Outer scale in metres.
+
+    Returns
+    -------
+    ndarray of float32, ``(size, size)``
+        Phase in radians with zero mean.
+    """
+    f = np.fft.fftfreq(size, pixel_m)
+    f2 = f[:, None] ** 2 + f[None, : size // 2 + 1] ** 2
+    psd = 0.0229 * r0_m ** (-5 / 3) * (f2 + outer_scale_m**-2) ** (-11 / 6)
+    psd[0, 0] = 0.0
+    white = np.fft.rfft2(rng.standard_normal((size, size)))
+    # White noise has |FFT|^2 = size^2 on average; the screen needs psd / area per frequency cell.
+    scale = size / (size * pixel_m)
+    return np.asarray(np.fft.irfft2(white * np.sqrt(psd) * scale, s=(size, size)), dtype=np.float32)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _sample(screen, scale, x0, y0, ux, uy, first, last, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add ``scale`` times the bilinear reading of a periodic screen (power-of-two size) to ``out``.
+
+    Row ``i``, column ``j`` reads at ``(x0, y0) + j u + i (-uy, ux)``; only columns
+    ``first[i]..last[i]`` are touched.
+    """
+    mask = screen.shape[0] - 1
+    for i in range(out.shape[0]):
+        for j in range(first[i], last[i]):
+            x = x0 + j * ux - i * uy
+            y = y0 + j * uy + i * ux
+            fx = np.floor(x)
+            fy = np.floor(y)
+            wx = np.float32(x - fx)
+            wy = np.float32(y - fy)
+            a = int(fx) & mask
+            b = int(fy) & mask
+            a1 = (a + 1) & mask
+            b1 = (b + 1) & mask
+            top = screen[b, a] + wx * (screen[b, a1] - screen[b, a])
+            low = screen[b1, a] + wx * (screen[b1, a1] - screen[b1, a])
+            out[i, j] += scale * (top + wy * (low - top))
+
+
+class RotatingScreen:
+    """A plate with a phase screen that turns in front of the pupil.
+
+    The pupil sits ``radius_m`` from the axis, so the pattern crosses it at the asked speed, turns
+    as it goes, and repeats after one revolution, as on the bench.
+
+    Parameters
+    ----------
+    opd_m
+        Optical path difference of the plate ``(size, size)`` in metres, size a power of two.
+    pixel_m
+        Pixel size of plate and pupil in metres.
+    radius_m
+        Distance of the pupil's centre from the axis in metres.
+    lit
+        Where the pupil needs values ``(n, n)``; other pixels are left alone.
+    """
+
+    def __init__(
+        self, opd_m: NDArray[np.float32], pixel_m: float, radius_m: float, lit: NDArray[np.bool_]
+    ) -> None:
+        size = opd_m.shape[0]
+        if opd_m.shape != (size, size) or size & (size - 1):
+            raise ValueError(f"a plate of {opd_m.shape} pixels is not a square with a power-of-two side")
+        self._opd, self._pixel, self._radius = np.ascontiguousarray(opd_m, np.float32), pixel_m, radius_m
+        self._n = lit.shape[0]
+        self._first = np.where(lit.any(axis=1), lit.argmax(axis=1), 0)
+        self._last = np.where(lit.any(axis=1), lit.shape[1] - lit[:, ::-1].argmax(axis=1), 0)
+
+    def add(self, path_m: float, out: NDArray[np.float32]) -> None:
+        """Add the plate's optical path in metres to ``out (n, n)``.
+
+        Parameters
+        ----------
+        path_m
+            Length of the arc travelled at the pupil's centre in metres.
+        """
+        angle = path_m / self._radius
+        c, s = float(np.cos(angle)), float(np.sin(angle))
+        half = (self._n - 1) / 2
+        # Plate coordinates of the pupil's first pixel: axis + R(angle) (radius - half, -half).
+        px, py = self._radius / self._pixel - half, -half
+        middle = self._opd.shape[0] / 2
+        _sample(
+            self._opd, np.float32(1), middle + c * px - s * py, middle + s * px + c * py, c, s,
+            self._first, self._last, out,
+        )  # fmt: skip

@@ -1,0 +1,297 @@
+"""The simulated bench: one clock, one beam, and the hidden truth that no estimator sees."""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.errors import ConfigError
+from escape_sim.detector import Detector
+from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.influence import InfluenceFunctions, MirrorSurface
+from escape_sim.mirror_dynamics import MirrorDynamics
+from escape_sim.psf import FocalPlane
+from escape_sim.screen import RotatingScreen, von_karman_screen
+from escape_sim.shack_hartmann import ShackHartmannOptics
+
+if TYPE_CHECKING:
+    from escape_hw.config.models import SystemConfig
+
+log = logging.getLogger(__name__)
+
+#: Side of the phase plates in pixels and distance of the pupil from their axis.
+_PLATE_PIXELS = 2048
+_PLATE_RADIUS_M = 28e-3
+
+
+class SensorOptics(Protocol):
+    """Optics of a wavefront sensor: optical path in metres to relative intensity."""
+
+    def frame(
+        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """Add the intensity to ``image`` and return it."""
+        ...
+
+
+class SimBench:
+    """Optics, mirror and clock behind the twins of one system.
+
+    Parameters
+    ----------
+    config
+        The system; its ``twin`` section is the hidden truth.
+    """
+
+    def __init__(self, config: SystemConfig) -> None:
+        self.config = config
+        streams = np.random.SeedSequence(config.system.seed).spawn(6)
+        self._plates_seed, hidden, latency, frames, wfs_noise, science_noise = streams
+        self.latency_rng, self.frame_rng = np.random.default_rng(latency), np.random.default_rng(frames)
+        truth = np.random.default_rng(hidden)
+        self.pupil = pupil_geometry(config)
+        self._clock_ns = 0
+        self._wall_start = time.monotonic()
+        dm, twin = config.devices.dm, config.twin
+        self.influence = self._true_influence(truth)
+        self.registration = twin.registration.to_registration()
+        x = self.pupil.coordinates_m
+        self._surface = MirrorSurface(self.influence, self.registration, self.pupil.sub_aperture_m, x, x)
+        self.dynamics = MirrorDynamics(
+            self.influence.n_act, twin.mirror.settling_s, twin.mirror.creep_fraction, twin.mirror.creep_time_s
+        )
+        # Reflection doubles the surface.
+        self._metres = np.float32(2 * dm.stroke_m)
+        self._ncpa = self._aberration(truth, twin.ncpa.rms_m, twin.ncpa.n_modes)
+        self._vibration_phase = truth.uniform(0, 2 * np.pi, (2, len(twin.vibration.frequency_hz)))
+        self._sensor: SensorOptics | None = None
+        self.wfs_detector = Detector(
+            (config.devices.wfs.region[3], config.devices.wfs.region[2]), config.devices.wfs.bit_depth,
+            twin.wfs.full_well_e, twin.wfs.read_noise_e, twin.wfs.dark_e, twin.wfs.background,
+            twin.wfs.fixed_pattern, np.random.default_rng(wfs_noise),
+        )  # fmt: skip
+        self._science_rng = np.random.default_rng(science_noise)
+        self._plates: dict[int, RotatingScreen] = {}
+        self._exposures: _Exposures | None = None
+        screen = config.devices.screen
+        self.screen_number = screen.screen if screen else 0
+        self.screen_inserted, self.beam_blocked = screen is not None, False
+        self._path, self._path_since = 0.0, 0.0
+        self._speed = screen.speed_m_s if screen else 0.0
+
+    # ------------------------------------------------------------------ clock
+    @property
+    def now_ns(self) -> int:
+        """Simulated monotonic time in nanoseconds."""
+        return self._clock_ns
+
+    @property
+    def now_s(self) -> float:
+        """Simulated monotonic time in seconds."""
+        return self._clock_ns * 1e-9
+
+    def advance_to(self, time_s: float) -> None:
+        """Move the clock forward; wait for the wall clock when paced to real time."""
+        self._clock_ns = max(self._clock_ns, round(time_s * 1e9))
+        if self.config.twin.paced:
+            wait = self._wall_start + self.now_s - time.monotonic()
+            if wait > 0:
+                time.sleep(wait)
+
+    # ------------------------------------------------------------------ beam
+    @property
+    def speed_m_s(self) -> float:
+        """Speed of the phase screen across the pupil in metres per second."""
+        return self._speed
+
+    @speed_m_s.setter
+    def speed_m_s(self, value: float) -> None:
+        self._path, self._path_since, self._speed = self._path_at(self.now_s), self.now_s, value
+
+    def _path_at(self, time_s: float) -> float:
+        return self._path + self._speed * (time_s - self._path_since)
+
+    def optical_path(self, start_s: float, end_s: float) -> NDArray[np.float32]:
+        """Mean optical path ``(n, n)`` in metres over an exposure, common to both cameras."""
+        middle = 0.5 * (start_s + end_s)
+        opd = self._surface(self.dynamics.mean(start_s, end_s))
+        opd *= self._metres
+        if self.screen_inserted:
+            self._plate().add(self._path_at(middle), opd)
+        tip, tilt = self._vibration(middle)
+        if tip or tilt:
+            x = self.pupil.coordinates_m.astype(np.float32)
+            opd += (np.float32(tip) * x)[None, :] + (np.float32(tilt) * x)[:, None]
+        return opd
+
+    def wfs_image(self, start_s: float, end_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Intensity on the wavefront sensor over an exposure, and the last optical path."""
+        sensor = self.sensor()
+        steps = self.config.twin.substeps
+        image = np.zeros((self.config.devices.wfs.region[3], self.config.devices.wfs.region[2]), np.float32)
+        edges = np.linspace(start_s, end_s, steps + 1)
+        opd = np.zeros(self.pupil.amplitude.shape, np.float32)
+        for a, b in zip(edges[:-1], edges[1:], strict=True):
+            opd = self.optical_path(float(a), float(b))
+            sensor.frame(opd + self._ncpa, image)
+        return (image / np.float32(steps) if steps > 1 else image), opd
+
+    def sensor(self) -> SensorOptics:
+        """The sensor's optics, built when first used."""
+        if self._sensor is None:
+            self._sensor = self._make_sensor()
+        return self._sensor
+
+    def focal_plane(self, shape: tuple[int, int]) -> FocalPlane:
+        """The science camera's optics for a region."""
+        science = self.config.devices.science
+        if science is None:
+            raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
+        return FocalPlane(
+            self.pupil.amplitude,
+            self.pupil.n_sub * self.pupil.n_pix,
+            self.config.system.wavelength_m,
+            science.psf_px,
+            shape,
+        )
+
+    def science_detector(self, shape: tuple[int, int]) -> Detector:
+        """The science camera's detector for a region."""
+        science, twin = self.config.devices.science, self.config.twin.science
+        if science is None:
+            raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
+        return Detector(
+            shape, science.bit_depth, twin.full_well_e, twin.read_noise_e, twin.dark_e,
+            twin.background, twin.fixed_pattern, self._science_rng,
+        )  # fmt: skip
+
+    # ------------------------------------------------------------------ science camera
+    def watch(self, plane: FocalPlane, exposure_s: float, period_s: float) -> None:
+        """Start integrating the focal plane, frame after frame, from now on."""
+        self._exposures = _Exposures(plane, self.now_s, exposure_s, period_s)
+
+    def unwatch(self) -> None:
+        """Stop integrating."""
+        self._exposures = None
+
+    def observe(self, opd: NDArray[np.float32], time_s: float) -> None:
+        """Offer the science camera the optical path of a moment."""
+        if self._exposures is not None:
+            self._exposures.offer(opd, time_s)
+
+    def integrated(self, number: int, end_s: float) -> NDArray[np.float32]:
+        """Mean focal-plane intensity of science frame ``number``, which ends at ``end_s``."""
+        exposures = self._exposures
+        if exposures is None:
+            raise RuntimeError("the science camera is not running")
+        if not exposures.has(number):
+            # Nobody read the wavefront sensor meanwhile: look at a few moments of our own.
+            for start in end_s - exposures.exposure_s * np.arange(4, 0, -1) / 4:
+                exposures.add(number, self.optical_path(float(start), float(start + exposures.exposure_s / 4)))
+        return exposures.take(number)
+
+    # ------------------------------------------------------------------ construction
+    def _true_influence(self, truth: np.random.Generator) -> InfluenceFunctions:
+        mirror = self.config.twin.mirror
+        positions = actuator_positions(self.config)
+        n = len(positions)
+        return InfluenceFunctions(
+            positions,
+            pitch_on_pupil(self.config),
+            mirror.coupling or self.config.devices.dm.coupling,
+            width=1 + mirror.width_scatter * truth.standard_normal(n),
+            gain=1 + mirror.gain_scatter * truth.standard_normal(n),
+            wing=mirror.wing_fraction,
+        )
+
+    def _aberration(self, truth: np.random.Generator, rms_m: float, n_modes: int) -> NDArray[np.float32]:
+        """A smooth random aberration: low-order polynomials made orthonormal over the pupil."""
+        lit = self.pupil.lit
+        unit = self.pupil.coordinates_m / (self.config.system.pupil_m / 2)
+        x, y = np.meshgrid(unit, unit)
+        powers = [(i, k - i) for k in range(32) for i in range(k + 1)][: n_modes + 3]
+        basis = np.stack([(x**i * y**j)[lit] for i, j in powers], axis=1)
+        # Piston, tip and tilt come first and are dropped: they are alignment, not aberration.
+        modes = np.linalg.qr(basis)[0][:, 3:]
+        aberration = np.zeros(lit.shape, np.float32)
+        if rms_m and modes.shape[1]:
+            mix = modes @ (truth.standard_normal(modes.shape[1]) / np.arange(1, modes.shape[1] + 1) ** 0.5)
+            aberration[lit] = mix * (rms_m / mix.std())
+        return aberration
+
+    def _vibration(self, time_s: float) -> tuple[float, float]:
+        """Tip and tilt of the beam in radians."""
+        vib = self.config.twin.vibration
+        f = np.asarray(vib.frequency_hz)
+        tip, tilt = (np.asarray(vib.amplitude_rad) * np.sin(2 * np.pi * f * time_s + self._vibration_phase)).sum(1)
+        return float(tip), float(tilt)
+
+    def _make_sensor(self) -> SensorOptics:
+        c, twin = self.config, self.config.twin.wfs
+        n_sub, pitch = c.sensor.n_sub, twin.pitch_px or c.sensor.pitch_px
+        width, height = c.devices.wfs.region[2:]
+        origin = (
+            (width - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[0],
+            (height - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[1],
+        )
+        if c.system.optics == "oopao":
+            # Imported here: OOPAO loads for two seconds and 1,600 modules.
+            from escape_sim.oopao_optics import OOPAOShackHartmann
+
+            return OOPAOShackHartmann(c, self.pupil, origin)
+        amplitude = self.pupil.amplitude / np.sqrt(np.sum(np.square(self.pupil.amplitude, dtype=float)))
+        return ShackHartmannOptics(
+            n_sub, self.pupil.n_pix, c.system.wavelength_m, pitch, c.sensor.spot_px, origin, (height, width),
+            amplitude.astype(np.float32),
+        )  # fmt: skip
+
+    def _plate(self) -> RotatingScreen:
+        number = self.screen_number
+        if number not in self._plates:
+            screen = self.config.devices.screen
+            if screen is None:
+                raise ConfigError(f"system {self.config.system.name!r} has no [devices.screen] section")
+            rng = np.random.default_rng(self._plates_seed.spawn(number + 1)[number])
+            pixel = self.pupil.pixel_m
+            phase = von_karman_screen(
+                _PLATE_PIXELS, pixel, screen.screens_r0_m[number], screen.outer_scale_m, rng
+            )
+            opd = phase * np.float32(self.config.system.wavelength_m / (2 * np.pi))
+            self._plates[number] = RotatingScreen(opd, pixel, _PLATE_RADIUS_M, self.pupil.lit)
+        return self._plates[number]
+
+
+class _Exposures:
+    """Sums of focal-plane images, one per science frame."""
+
+    #: Every how many wavefront-sensor frames the focal plane is looked at.
+    STRIDE = 4
+
+    def __init__(self, plane: FocalPlane, start_s: float, exposure_s: float, period_s: float) -> None:
+        self._plane, self._start, self.exposure_s, self._period = plane, start_s, exposure_s, period_s
+        self._sums: dict[int, tuple[NDArray[np.float32], int]] = {}
+        self._skip = 0
+
+    def has(self, number: int) -> bool:
+        return number in self._sums
+
+    def offer(self, opd: NDArray[np.float32], time_s: float) -> None:
+        self._skip = (self._skip + 1) % self.STRIDE
+        number, into = divmod(time_s - self._start, self._period)
+        if self._skip == 0 and number >= 0 and into <= self.exposure_s:
+            self.add(int(number), opd)
+
+    def add(self, number: int, opd: NDArray[np.float32]) -> None:
+        image = self._plane.image(opd)
+        total, count = self._sums.get(number, (np.zeros_like(image), 0))
+        self._sums[number] = (total + image, count + 1)
+
+    def take(self, number: int) -> NDArray[np.float32]:
+        total, count = self._sums.pop(number)
+        for old in [k for k in self._sums if k < number]:
+            del self._sums[old]
+        return np.asarray(total / np.float32(count))
