@@ -74,7 +74,9 @@ def oopao() -> SimpleNamespace:
         try:
             return SimpleNamespace(**{name: getattr(import_module(f"OOPAO.{name}"), name) for name in names})
         except ImportError as missing:
-            raise ConfigError(f"OOPAO cannot be imported ({missing}); install it with: pip install OOPAO") from missing
+            raise ConfigError(
+                f"OOPAO cannot be imported ({missing}); install it with: pip install OOPAO"
+            ) from missing
 
 
 def mis_registration(registration: Registration, sub_aperture_m: float) -> Any:

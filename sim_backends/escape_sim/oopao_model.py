@@ -8,16 +8,63 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
-from escape_sim.influence import circle_layout, layout_positions
+from escape_hw.errors import CalibrationError
+from escape_sim.geometry import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.oopao_bridge import make_lenslets, make_light, mis_registration, oopao, quiet
 
 if TYPE_CHECKING:
     from escape_hw.api.sensor import SubApertureGrid
+    from escape_hw.config.models import SystemConfig
 
 #: Surface in metres of the push and of the pull: a hundredth of a wave, well inside the linear range.
 STEP_M = 5e-9
 #: Actuators propagated together; bounds the memory.
 _BATCH = 16
+
+
+def make_model(config: SystemConfig, grid: SubApertureGrid | None) -> OOPAOModel:
+    """Entry point ``oopao``: the model of the nominal design.
+
+    Parameters
+    ----------
+    config
+        The system; its ``twin`` section is not read.
+    grid
+        Grid found from frames, or ``None`` for the sub-apertures the design lights.
+
+    Raises
+    ------
+    ConfigError
+        OOPAO is not installed.
+    CalibrationError
+        The grid does not fit the design.
+    """
+    pupil = pupil_geometry(config)
+    if grid is not None and grid.valid.shape != (pupil.n_sub, pupil.n_sub):
+        raise CalibrationError(
+            f"the grid has {grid.valid.shape} sub-apertures; sensor.n_sub is {pupil.n_sub} across"
+        )
+    return OOPAOModel(
+        actuator_positions(config),
+        pitch_on_pupil(config),
+        config.devices.dm.coupling,
+        config.devices.dm.stroke_m,
+        pupil.amplitude,
+        pupil.sub_aperture_m,
+        nominal_valid(pupil, config.sensor.min_flux) if grid is None else grid.valid,
+        config.system.wavelength_m,
+        config.sensor.pitch_px if grid is None else grid.pitch_px,
+        config.sensor.spot_px,
+    )
+
+
+def nominal_valid(pupil: PupilGeometry, min_flux: float) -> NDArray[np.bool_]:
+    """Sub-apertures ``(n_sub, n_sub)`` with at least ``min_flux`` of the light of a bright one."""
+    power = np.square(pupil.amplitude, dtype=float).reshape(
+        pupil.n_sub, pupil.n_pix, pupil.n_sub, pupil.n_pix
+    )
+    flux = power.sum(axis=(1, 3))
+    return np.asarray(flux >= min_flux * np.percentile(flux[flux > 0], 95))
 
 
 class OOPAOModel:
@@ -83,7 +130,10 @@ class OOPAOModel:
         self._lenslets = make_lenslets(self._light, n_sub, 2 * round(pitch_px / spot_px))
         dark = valid & ~self._lenslets.sh_data["src_0"].valid_subapertures
         if dark.any():
-            raise ValueError(f"{int(dark.sum())} valid sub-apertures lie outside the pupil")
+            raise CalibrationError(
+                f"{int(dark.sum())} valid sub-apertures of the grid lie outside the design's pupil; "
+                "check the grid's position and sensor.n_sub"
+            )
         self._mirrors: dict[float, Any] = {}
 
     @property

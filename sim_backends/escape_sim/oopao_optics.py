@@ -67,7 +67,9 @@ class OOPAOShackHartmann:
     ) -> None:
         n = n_sub * n_pix
         if amplitude.shape != (n, n):
-            raise ValueError(f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})")
+            raise ValueError(
+                f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})"
+            )
         if n_pix % 2:
             raise ValueError(f"{n_pix} samples per lenslet; OOPAO centres its spots on an even number only")
         self.shape = shape
@@ -102,7 +104,9 @@ class OOPAOShackHartmann:
                 "enlarge the camera region or move the grid's origin"
             )
 
-    def frame(self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    def frame(
+        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
         """Intensity on the camera.
 
         Parameters

@@ -22,7 +22,9 @@ def _run(code: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("module", ["model", "oopao_bridge", "oopao_model", "oopao_optics", "devices"])
 def test_importing_the_twin_does_not_import_oopao(module):
-    done = _run(f"import sys, escape_sim.{module}; print('OOPAO' in sys.modules, 'matplotlib' in sys.modules)")
+    done = _run(
+        f"import sys, escape_sim.{module}; print('OOPAO' in sys.modules, 'matplotlib' in sys.modules)"
+    )
     assert done.stdout.split() == ["False", "False"], done.stderr
 
 
@@ -36,8 +38,8 @@ def test_nothing_is_printed_and_nothing_drawn():
         "on = np.ones((4, 4), bool)\n"
         "m = OOPAOModel(xy, 1e-3, 0.4, 2e-6, np.ones((32, 32), np.float32), 1e-3, on, 635e-9, 16.0, 2.0)\n"
         "m.zonal_matrix(Registration(5, 5, 1, 1, 1))\n"
-        "import matplotlib, sys\n"
-        "sys.stderr.write('%s %s' % (matplotlib.pyplot.get_fignums(), matplotlib.rcParams._get_backend_or_none()))\n"
+        "import matplotlib as mpl, sys\n"
+        "sys.stderr.write('%s %s' % (mpl.pyplot.get_fignums(), mpl.rcParams._get_backend_or_none()))\n"
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""
@@ -49,7 +51,11 @@ def test_a_command_of_the_wrong_length_does_not_end_the_process():
     light = make_light(np.ones((16, 16), np.float32), 1.0, 635e-9)
     with quiet():
         mirror = oopao().DeformableMirror(
-            telescope=light.telescope, nSubap=2, coordinates=np.zeros((3, 2)), pitch=0.5, print_dm_properties=False
+            telescope=light.telescope,
+            nSubap=2,
+            coordinates=np.zeros((3, 2)),
+            pitch=0.5,
+            print_dm_properties=False,
         )
 
     def send():
@@ -76,8 +82,8 @@ def test_only_the_thread_that_uses_oopao_is_muted(capsys):
 
 
 def test_the_random_state_of_the_user_is_left_alone():
-    np.random.seed(5)  # noqa: NPY002 - the legacy state is the one at risk
-    want = np.random.random()  # noqa: NPY002
-    np.random.seed(5)  # noqa: NPY002
+    np.random.seed(5)
+    want = np.random.random()
+    np.random.seed(5)
     make_light(np.ones((16, 16), np.float32), 1.0, 635e-9)
-    assert np.random.random() == want  # noqa: NPY002
+    assert np.random.random() == want
