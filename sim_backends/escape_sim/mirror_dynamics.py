@@ -27,7 +27,7 @@ class MirrorDynamics:
     """
 
     def __init__(self, n_act: int, settling_s: float, creep_fraction: float, creep_time_s: float) -> None:
-        self._rate = _SETTLED / settling_s
+        self._rate = _SETTLED / max(settling_s, 1e-7)
         self._creep_share, self._creep_time = creep_fraction, creep_time_s
         self._time = 0.0
         self._target = np.zeros(n_act)

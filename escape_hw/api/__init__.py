@@ -1,0 +1,1 @@
+"""Interfaces of the devices, of the procedures and of their results."""

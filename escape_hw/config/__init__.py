@@ -1,0 +1,1 @@
+"""Configuration of systems: models, files, overrides and the registry of drivers and twins."""

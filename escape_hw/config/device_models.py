@@ -1,0 +1,177 @@
+"""Configuration of the devices of a system, the same for the twin and for the metal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from escape_hw.api.frames import CameraSettings, Region
+from escape_hw.config import layouts
+from escape_hw.config.section import Breach, Listed, Section, enforce
+from escape_hw.safety.limits import MirrorLimits
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+Mode = Literal["sim", "hardware"]
+Pixels = Annotated[int, Field(ge=0, le=16384)]
+Size = Annotated[int, Field(ge=1, le=16384)]
+
+
+class DeviceConfig(Section):
+    """What every device section has: which driver, which twin, which of them."""
+
+    driver: str = Field(
+        "", description="driver of the real device (entry point in escape.devices); empty: there is none"
+    )
+    sim_driver: str = Field("", description="twin of the device (entry point in escape.devices)")
+    mode: Mode | None = Field(
+        None, description="'sim' or 'hardware' for this device alone; absent: as system.mode"
+    )
+    serial: str = Field("", description="serial number, so that the wrong device is never opened")
+    options: dict[str, str | int | float | bool] = Field(
+        default_factory=dict, description="further settings that only this driver understands"
+    )
+
+
+class LimitsConfig(Section):
+    """Limits that the guard enforces on every command; a rule that is absent is off."""
+
+    max_stroke: float = Field(
+        1.0, gt=0, le=1, description="largest magnitude of a command, fraction of full stroke"
+    )
+    max_slew: float | None = Field(
+        None, gt=0, le=2, description="largest change from one command to the next, fraction of full stroke"
+    )
+    max_neighbour: float | None = Field(
+        None,
+        gt=0,
+        le=2,
+        description="largest difference between adjacent actuators, fraction of full stroke",
+    )
+    max_mean: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="largest magnitude of the mean command (piston), fraction of full stroke",
+    )
+    disabled: Listed[tuple[Annotated[int, Field(ge=0)], ...]] = Field(
+        (), description="numbers of the actuators that must stay at zero"
+    )
+
+    def to_limits(self) -> MirrorLimits:
+        """The limits as the guard takes them."""
+        return MirrorLimits(self.max_stroke, self.max_slew, self.max_neighbour, self.max_mean, self.disabled)
+
+
+class MirrorConfig(DeviceConfig):
+    """Deformable mirror: nominal geometry and limits."""
+
+    layout: str = Field(
+        pattern=layouts.PATTERN,
+        description="where the actuators stand: 'circle-N' or 'square-N' on an N x N grid",
+    )
+    pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
+    pitches_across_pupil: float = Field(
+        gt=0, le=200, description="actuator pitches across the diameter of the pupil"
+    )
+    coupling: float = Field(
+        ge=0.01, le=0.9, description="nominal influence of an actuator at its neighbour, fraction of its peak"
+    )
+    stroke_m: float = Field(gt=0, le=1e-3, description="metres of surface at the actuator for a command of 1")
+    limits: LimitsConfig = Field(default_factory=LimitsConfig, description="limits of every command")
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        return layouts.count(self.layout)
+
+    def actuator_map(self) -> NDArray[np.bool_]:
+        """Boolean map ``(N, N)``, true where an actuator stands."""
+        return layouts.actuator_map(self.layout)
+
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        last = self.n_act - 1
+        bad = [i for i in self.limits.disabled if i > last]
+        enforce(Breach("limits.disabled", i, f"the actuators are numbered 0 to {last}") for i in bad)
+        return self
+
+
+class CameraConfig(DeviceConfig):
+    """A camera as it is read out."""
+
+    sensor_px: Listed[tuple[Size, Size]] = Field(
+        description="width and height of the whole sensor as read out (after binning), pixels"
+    )
+    region: Listed[tuple[Pixels, Pixels, Size, Size]] = Field(
+        description="region read: x, y, width, height, pixels"
+    )
+    bit_depth: int = Field(ge=8, le=16, description="bits per pixel")
+    exposure_s: float = Field(ge=1e-6, le=60, description="exposure time, seconds")
+    frame_rate_hz: float = Field(ge=0.01, le=20000, description="frames per second, hertz")
+    gain_db: float = Field(0.0, ge=0, le=48, description="analogue gain, decibels")
+    timeout_s: float = Field(1.0, gt=0, le=120, description="longest wait for a frame, seconds")
+
+    def settings(self) -> CameraSettings:
+        """The settings as a camera takes them."""
+        return CameraSettings(Region(*self.region), self.exposure_s, self.frame_rate_hz, self.gain_db)
+
+    @model_validator(mode="after")
+    def _camera_rules(self) -> Self:
+        x, y, width, height = self.region
+        columns, rows = self.sensor_px
+        breaches = []
+        if x + width > columns or y + height > rows:
+            breaches.append(
+                Breach(
+                    "region", list(self.region), f"does not lie on the sensor of {columns} x {rows} pixels"
+                )
+            )
+        if self.exposure_s * self.frame_rate_hz > 1:
+            breaches.append(
+                Breach(
+                    "exposure_s",
+                    self.exposure_s,
+                    f"longer than a frame ({1 / self.frame_rate_hz:.4g} s at {self.frame_rate_hz:g} Hz)",
+                )
+            )
+        enforce(breaches)
+        return self
+
+
+class ScienceConfig(CameraConfig):
+    """The science camera, which sees the point-spread function."""
+
+    psf_px: float = Field(ge=0.5, le=100, description="lambda/D in camera pixels")
+
+
+class ScreenConfig(DeviceConfig):
+    """The changer of rotating phase screens: the bench's turbulence."""
+
+    screens_r0_m: Listed[tuple[Annotated[float, Field(gt=0, le=10)], ...]] = Field(
+        min_length=1, description="Fried parameter of each screen at the system's wavelength, metres"
+    )
+    screen: int = Field(0, ge=0, description="number of the screen in use, counted from 0")
+    speed_m_s: float = Field(
+        ge=0, le=100, description="speed of the screen across the pupil, metres per second"
+    )
+    outer_scale_m: float = Field(gt=0, le=1000, description="outer scale of the turbulence, metres")
+
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        n = len(self.screens_r0_m)
+        if self.screen >= n:
+            enforce([Breach("screen", self.screen, f"the {n} screens are numbered 0 to {n - 1}")])
+        return self
+
+
+class DevicesConfig(Section):
+    """The devices of a system."""
+
+    dm: MirrorConfig = Field(description="deformable mirror")
+    wfs: CameraConfig = Field(description="camera of the wavefront sensor")
+    science: ScienceConfig | None = Field(None, description="science camera; absent: there is none")
+    screen: ScreenConfig | None = Field(None, description="phase screens; absent: there are none")

@@ -1,0 +1,142 @@
+"""The configuration of a whole system; keys, ranges and units are the contract with its TOML file."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from escape_hw.config.device_models import DevicesConfig, Mode
+from escape_hw.config.section import Breach, Section, enforce
+from escape_hw.config.toml_text import dump_toml
+from escape_hw.config.twin_models import TwinConfig
+
+
+class SystemSection(Section):
+    """What the system is."""
+
+    name: str = Field(
+        pattern=r"^[a-z0-9][a-z0-9_-]*$",
+        max_length=64,
+        description="name, written into every product (lower case, digits, '-' and '_')",
+    )
+    description: str = Field("", description="one line for lists and reports")
+    mode: Mode = Field("sim", description="'sim': every device is its twin; 'hardware': the real ones")
+    seed: int = Field(1, ge=0, le=2**63 - 1, description="seed of every random stream")
+    wavelength_m: float = Field(ge=1e-7, le=1e-4, description="wavelength of the sensor's light, metres")
+    pupil_m: float = Field(gt=0, le=100, description="diameter of the pupil, metres")
+    optics: Literal["fast", "oopao"] = Field(
+        "fast", description="the twin's optics: 'fast', or 'oopao' for the reference"
+    )
+
+
+class SensorSection(Section):
+    """The wavefront sensor."""
+
+    kind: Literal["shack-hartmann"] = Field("shack-hartmann", description="kind of sensor")
+    n_sub: int = Field(ge=2, le=400, description="sub-apertures across the pupil")
+    pitch_px: float = Field(ge=2, le=1000, description="nominal pitch of the lenslets, camera pixels")
+    spot_px: float = Field(ge=0.5, le=200, description="lambda/d of a sub-aperture, camera pixels")
+    threshold: float = Field(
+        0.02,
+        ge=0,
+        le=0.9,
+        description="centre-of-gravity threshold above the background, fraction of full scale",
+    )
+    min_flux: float = Field(
+        0.5, gt=0, le=1, description="least flux of a valid sub-aperture, fraction of the brightest"
+    )
+    beam_radius_m: Annotated[float, Field(allow_inf_nan=True)] = Field(
+        math.inf, gt=0, description="1/e^2 intensity radius of the Gaussian beam, metres; inf: uniform"
+    )
+
+
+class BasisSection(Section):
+    """Modal basis of the calibration."""
+
+    kind: Literal["kl", "zonal", "file"] = Field(
+        "kl", description="'kl' (Karhunen-Loeve), 'zonal' (single actuators) or 'file'"
+    )
+    n_modes: int = Field(ge=1, le=10000, description="number of modes")
+    file: str = Field("", description="FITS file of the mode-to-command matrix, for kind = 'file'")
+
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        if self.kind == "file" and not self.file:
+            enforce([Breach("file", "''", "kind = 'file' needs the name of a FITS file")])
+        if self.kind != "file" and self.file:
+            enforce([Breach("file", repr(self.file), f"is not read with kind = '{self.kind}'; remove it")])
+        return self
+
+
+class LoopSection(Section):
+    """Leaky integrator."""
+
+    gain: float = Field(0.4, gt=0, le=2, description="gain of the integrator")
+    leak: float = Field(0.01, ge=0, le=1, description="share of the integrator lost per frame")
+    dropped_modes: int = Field(
+        0, ge=0, le=10000, description="weakest eigenmodes left out of the reconstructor"
+    )
+
+
+class CalibrationSection(Section):
+    """Defaults of the calibration procedures."""
+
+    poke: float = Field(
+        0.02,
+        gt=0,
+        le=1,
+        description="DO-CRIME: pokes are uniform in +-poke, rms surface as fraction of full stroke",
+    )
+    frames: int = Field(10000, ge=1, le=100_000_000, description="DO-CRIME: number of frames")
+    push_pull_poke: float = Field(
+        0.01, gt=0, le=1, description="push-pull: poke of each mode, rms surface as fraction of full stroke"
+    )
+    push_pull_frames: int = Field(
+        20, ge=1, le=1_000_000, description="push-pull: frames per push and per pull"
+    )
+    whiten_order: int = Field(
+        6, ge=0, le=64, description="past frames that predict the turbulence; 0: plain estimator"
+    )
+    lags: int = Field(5, ge=1, le=64, description="frames over which the temporal response is estimated")
+    sprint_modes: int = Field(50, ge=1, le=10000, description="SPRINT: largest number of modes used")
+    learning_rate: float = Field(1.0, gt=0, le=1, description="SPRINT: share of each step that is taken")
+    model: str = Field(
+        "fast", min_length=1, description="SPRINT: synthetic model (entry point in escape.models)"
+    )
+
+
+class SystemConfig(Section):
+    """The whole configuration of a system."""
+
+    schema_version: Literal[1] = Field(1, alias="schema", description="version of these keys")
+    system: SystemSection = Field(description="what the system is")
+    sensor: SensorSection = Field(description="the wavefront sensor")
+    devices: DevicesConfig = Field(description="the devices")
+    basis: BasisSection = Field(description="modal basis")
+    loop: LoopSection = Field(default_factory=LoopSection, description="integrator")
+    calibration: CalibrationSection = Field(
+        default_factory=CalibrationSection, description="defaults of the calibration procedures"
+    )
+    twin: TwinConfig = Field(default_factory=TwinConfig, description="the simulated bench")
+
+    def to_toml(self) -> str:
+        """The whole effective configuration, defaults included, as ASCII TOML text.
+
+        Loading the text gives an equal configuration; products carry it in their headers.
+        """
+        return dump_toml(self.model_dump(by_alias=True, exclude_none=True))
+
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        n_act, n_modes = self.devices.dm.n_act, self.basis.n_modes
+        breaches = []
+        if n_modes > n_act:
+            breaches.append(Breach("basis.n_modes", n_modes, f"the mirror has {n_act} actuators"))
+        if self.loop.dropped_modes >= n_modes:
+            breaches.append(
+                Breach("loop.dropped_modes", self.loop.dropped_modes, f"leaves none of the {n_modes} modes")
+            )
+        enforce(breaches)
+        return self

@@ -1,0 +1,138 @@
+"""Configuration of the twins: the truth a calibration never reads.
+
+Whatever is left out describes an ideal device; a bundled system names its imperfections.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from escape_hw.api.registration import Registration
+from escape_hw.config.section import Breach, Listed, Section, enforce
+
+
+class TwinRegistration(Section):
+    """Hidden registration of mirror and sensor (paper, Table 1)."""
+
+    shift_x: float = Field(0.0, ge=-500, le=500, description="shift along columns, % of a sub-aperture")
+    shift_y: float = Field(0.0, ge=-500, le=500, description="shift along rows, % of a sub-aperture")
+    rotation: float = Field(0.0, ge=-180, le=180, description="rotation from +x towards +y, degrees")
+    radial_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along x, % of the diameter")
+    tangential_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along y, % of the diameter")
+
+    def to_registration(self) -> Registration:
+        """The registration as the models take it."""
+        return Registration(
+            self.shift_x, self.shift_y, self.rotation, self.radial_scaling, self.tangential_scaling
+        )
+
+
+class TwinMirror(Section):
+    """How the twin's mirror differs from its data sheet."""
+
+    gain_scatter: float = Field(
+        0.0, ge=0, le=0.5, description="scatter of the actuators' gains, rms fraction"
+    )
+    coupling: float | None = Field(
+        None, ge=0.01, le=0.9, description="true coupling, fraction; absent: as devices.dm.coupling"
+    )
+    width_scatter: float = Field(
+        0.0, ge=0, le=0.5, description="scatter of the influence functions' widths, rms fraction"
+    )
+    wing_fraction: float = Field(
+        0.0,
+        ge=0,
+        le=0.5,
+        description="share of each influence function in wings wider than its core, fraction",
+    )
+    settling_s: float = Field(
+        0.0, ge=0, le=1, description="time constant of the response to a command, seconds"
+    )
+    creep_fraction: float = Field(0.0, ge=0, le=0.5, description="share of a step that creeps, fraction")
+    creep_time_s: float = Field(30.0, gt=0, le=1e5, description="time constant of the creep, seconds")
+
+
+class TwinCamera(Section):
+    """Light and noise of a twin's camera (e- = photo-electrons)."""
+
+    photons_per_frame: float = Field(
+        1e7, gt=0, le=1e12, description="signal over the whole pupil in one exposure, e-"
+    )
+    read_noise_e: float = Field(0.0, ge=0, le=1000, description="read noise of a pixel, e- rms")
+    full_well_e: float = Field(10000.0, ge=100, le=1e7, description="signal of a pixel at full scale, e-")
+    dark_e: float = Field(0.0, ge=0, le=1e5, description="dark signal of a pixel in one exposure, e-")
+    background: float = Field(
+        0.0, ge=0, le=1e5, description="constant level under the image (offset), e- per pixel and frame"
+    )
+    fixed_pattern: float = Field(
+        0.0, ge=0, le=0.5, description="scatter of the pixels' sensitivities, rms fraction"
+    )
+
+
+class TwinSensor(TwinCamera):
+    """The twin's wavefront-sensor camera and the lenslet grid that really falls on it."""
+
+    grid_offset_px: Listed[
+        tuple[Annotated[float, Field(ge=-100, le=100)], Annotated[float, Field(ge=-100, le=100)]]
+    ] = Field((0.0, 0.0), description="offset of the lenslet grid from the region's centre, (x, y) in pixels")
+    pitch_px: float | None = Field(
+        None, ge=2, le=1000, description="true pitch of the lenslets, pixels; absent: as sensor.pitch_px"
+    )
+
+
+class TwinVibration(Section):
+    """Tip-tilt vibration of the bench: sinusoids, one entry of each list per line."""
+
+    amplitude_rad: Listed[tuple[Annotated[float, Field(ge=0, le=1)], ...]] = Field(
+        (), description="amplitude of each line on the sky, radians"
+    )
+    frequency_hz: Listed[tuple[Annotated[float, Field(gt=0, le=20000)], ...]] = Field(
+        (), description="frequency of each line, hertz"
+    )
+
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        n, m = len(self.amplitude_rad), len(self.frequency_hz)
+        if n != m:
+            enforce(
+                [
+                    Breach(
+                        "frequency_hz",
+                        list(self.frequency_hz),
+                        f"needs one frequency for each of the {n} amplitudes, has {m}",
+                    )
+                ]
+            )
+        return self
+
+
+class TwinNcpa(Section):
+    """Non-common-path aberration: what the science camera sees and the sensor does not."""
+
+    rms_m: float = Field(0.0, ge=0, le=1e-4, description="wavefront error, metres rms")
+    n_modes: int = Field(15, ge=1, le=1000, description="number of low-order modes that share it")
+
+
+class TwinConfig(Section):
+    """The simulated bench."""
+
+    substeps: int = Field(2, ge=1, le=50, description="steps of the mirror's motion simulated per exposure")
+    paced: bool = Field(False, description="true: run in real time; false: as fast as the computer can")
+    loss_probability: float = Field(0.0, ge=0, le=0.5, description="probability that a frame is lost")
+    latency_s: float = Field(0.0, ge=0, le=1, description="time from sending a command to its start, seconds")
+    latency_jitter_s: float = Field(0.0, ge=0, le=1, description="scatter of the latency, seconds rms")
+    readout_s: float = Field(
+        0.0, ge=0, le=60, description="time from the end of an exposure to its arrival, seconds"
+    )
+    registration: TwinRegistration = Field(
+        default_factory=TwinRegistration, description="hidden registration"
+    )
+    mirror: TwinMirror = Field(default_factory=TwinMirror, description="imperfections of the mirror")
+    wfs: TwinSensor = Field(default_factory=TwinSensor, description="light and noise of the sensor's camera")
+    science: TwinCamera = Field(
+        default_factory=TwinCamera, description="light and noise of the science camera"
+    )
+    vibration: TwinVibration = Field(default_factory=TwinVibration, description="tip-tilt vibration")
+    ncpa: TwinNcpa = Field(default_factory=TwinNcpa, description="non-common-path aberration")

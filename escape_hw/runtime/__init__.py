@@ -1,0 +1,1 @@
+"""The system that scripts, procedures and the command line work on."""

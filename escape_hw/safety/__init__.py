@@ -1,0 +1,1 @@
+"""Limits and the guard that every mirror command passes."""

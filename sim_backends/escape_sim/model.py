@@ -1,0 +1,135 @@
+"""SPRINT's nominal synthetic model of a Shack-Hartmann system, fast and analytic."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import Registration
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.pipeline.slopes import windows
+from escape_sim.geometry import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.influence import InfluenceFunctions
+from escape_sim.shack_hartmann import lenslet_transform
+
+if TYPE_CHECKING:
+    from escape_hw.config.models import SystemConfig
+
+
+def make_model(config: SystemConfig, grid: SubApertureGrid | None) -> ShackHartmannModel:
+    """Entry point ``fast``; without a grid, the nominal one of the design."""
+    return ShackHartmannModel(config, grid or nominal_grid(config))
+
+
+def nominal_grid(config: SystemConfig) -> SubApertureGrid:
+    """The design's grid, centred on the camera region, valid where the design beam is bright enough."""
+    pupil = pupil_geometry(config)
+    n, p = pupil.n_sub, pupil.n_pix
+    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
+    flux /= np.percentile(flux[flux > 0], 95)
+    valid = flux >= config.sensor.min_flux
+    pitch = config.sensor.pitch_px
+    width, height = config.devices.wfs.region[2:]
+    origin = ((width - 1) / 2 - pitch * (n - 1) / 2, (height - 1) / 2 - pitch * (n - 1) / 2)
+    references = np.zeros((int(valid.sum()), 2), np.float32)
+    return SubApertureGrid(pitch, origin, valid, references, flux.astype(np.float32))
+
+
+class ShackHartmannModel:
+    """Small-signal slopes of a diffractive Shack-Hartmann sensor behind a Gaussian-actuator mirror.
+
+    The centre of gravity of a spot is a smooth function of the phase on its lenslet; its first
+    derivative at a flat wavefront is a fixed weight map per lenslet, so a matrix is one small
+    product per sub-aperture and no frame is ever rendered.
+
+    Parameters
+    ----------
+    config
+        The design: sensor, mirror and beam. Its ``twin`` section is not read.
+    grid
+        The grid found on the camera.
+    """
+
+    name = "fast"
+
+    def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
+        self._pupil = pupil_geometry(config)
+        if grid.valid.shape != (self._pupil.n_sub, self._pupil.n_sub):
+            raise ValueError(
+                f"the grid has {grid.valid.shape} lenslets, the design {self._pupil.n_sub} x {self._pupil.n_sub}"
+            )
+        self._positions = actuator_positions(config)
+        self._pitch = pitch_on_pupil(config)
+        self._coupling = config.devices.dm.coupling
+        self._metres = 2 * config.devices.dm.stroke_m
+        self._rows, self._columns = np.nonzero(grid.valid)
+        self._x_weights, self._y_weights = self._slope_weights(config, grid)
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        return len(self._positions)
+
+    @property
+    def sub_aperture_m(self) -> float:
+        """Size of a sub-aperture on the pupil in metres."""
+        return self._pupil.sub_aperture_m
+
+    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+        """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
+        # Half the sampling is ample for shapes as smooth as these.
+        pupil = PupilGeometry(
+            self._pupil.n_sub, self._pupil.n_pix // 2, self._pupil.sub_aperture_m,
+            self._pupil.coordinates_m.reshape(-1, 2).mean(axis=1), self._pupil.amplitude[::2, ::2],
+        )  # fmt: skip
+        x = pupil.coordinates_m
+        surfaces = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
+        r2 = x[:, None] ** 2 + x[None, :] ** 2
+        radius = self._pupil.n_sub * self._pupil.sub_aperture_m / 2
+        return surfaces, r2 <= radius**2, pupil.pixel_m
+
+    def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
+        """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
+        x = self._pupil.coordinates_m
+        along_x, along_y = self._influence(width).factors(registration, self.sub_aperture_m, x, x)
+        p, n = self._pupil.n_pix, self._pupil.n_sub
+        gx = along_x[:, :, 0].reshape(n, p, -1)[self._columns]
+        gy = along_y[:, :, 0].reshape(n, p, -1)[self._rows]
+        parts = [np.einsum("kqa,kqa->ka", gy, w @ gx) for w in (self._x_weights, self._y_weights)]
+        return np.asarray(np.concatenate(parts) * self._metres)
+
+    def _influence(self, width: float) -> InfluenceFunctions:
+        return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)
+
+    def _slope_weights(
+        self, config: SystemConfig, grid: SubApertureGrid
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Derivative of each slope by the optical path on its lenslet, ``(n_valid, p, p)`` twice.
+
+        With ``E(u) = sum_p A_p exp(i phi_p) F(u, p)`` and ``s = sum u I / sum I`` over the window,
+        ``ds/dphi_p = -2 A_p Im sum_u (u - s) conj(E(u)) F(u, p) / sum I``.
+        """
+        p, spot = self._pupil.n_pix, config.sensor.spot_px
+        width, height = config.devices.wfs.region[2:]
+        centres = grid.centres_px()
+        boxes = windows(centres, grid.pitch_px, (height, width))
+        wave = 2 * np.pi / config.system.wavelength_m
+        blocks = self._pupil.amplitude.reshape(self._pupil.n_sub, p, self._pupil.n_sub, p)
+        amplitudes = blocks.transpose(0, 2, 1, 3)[self._rows, self._columns].astype(float)
+        out = np.empty((2, len(centres), p, p))
+        for k, (top, end, left, right) in enumerate(boxes):
+            fy, fx = (
+                lenslet_transform(np.array([c]), np.array([first]), p, int(size), spot)[0]
+                for c, first, size in ((centres[k, 1], top, end - top), (centres[k, 0], left, right - left))
+            )
+            amplitude = amplitudes[k]
+            e = fy.T @ amplitude @ fx
+            intensity = np.abs(e) ** 2
+            total = intensity.sum()
+            u, v = np.arange(left, right), np.arange(top, end)
+            sx, sy = (intensity.sum(0) @ u) / total, (intensity.sum(1) @ v) / total
+            for axis, lever in enumerate(((u - sx)[None, :], (v - sy)[:, None])):
+                out[axis, k] = -2 * amplitude * np.imag(fy @ (lever * e.conj()) @ fx.T) / total * wave
+        return out[0], out[1]
