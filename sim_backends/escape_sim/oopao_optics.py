@@ -34,6 +34,28 @@ def trigonometric_reading(at: NDArray[np.float64], period: int) -> NDArray[np.fl
     return np.asarray((1 + 2 * np.cos(turn[..., None] * harmonics).sum(axis=-1)) / period)
 
 
+def read_off(offset_px: NDArray[np.float64], n_pix: int, spot_px: float) -> NDArray[np.float64]:
+    """Matrix from OOPAO's samples of a lenslet's image to camera pixels, along one axis.
+
+    Parameters
+    ----------
+    offset_px
+        Pixels relative to the lenslet's centre, any shape.
+    n_pix
+        Pupil samples across a lenslet.
+    spot_px
+        lambda/d in camera pixels.
+
+    Returns
+    -------
+    ndarray, ``(*offset_px.shape, SAMPLING * n_pix)``
+        Scaled so that a whole field holds the light of the lenslet.
+    """
+    period = SAMPLING * n_pix
+    at = (period - 1) / 2 + offset_px * SAMPLING / spot_px
+    return trigonometric_reading(at, period) * SAMPLING / spot_px
+
+
 class OOPAOShackHartmann:
     """The interface of ``ShackHartmannOptics`` with OOPAO doing the propagation.
 
@@ -83,16 +105,14 @@ class OOPAOShackHartmann:
         field = int(n_pix * spot_px)
         self._field = field
         line = np.arange(n_sub) * pitch_px
-        period = SAMPLING * n_pix
         self._first: list[NDArray[np.intp]] = []
         self._read: list[NDArray[np.float64]] = []
         for start, length in zip(origin_px, shape[::-1], strict=True):
             centres = start + line
             first = np.floor(centres - field / 2 + 1).astype(np.intp)
             pixels = first[:, None] + np.arange(field) - centres[:, None]
-            at = (period - 1) / 2 + pixels * SAMPLING / spot_px
             self._first.append(first)
-            self._read.append(trigonometric_reading(at, period) * SAMPLING / spot_px)
+            self._read.append(read_off(pixels, n_pix, spot_px))
             self._require_inside(first, length)
 
     def _require_inside(self, first: NDArray[np.intp], length: int) -> None:

@@ -30,14 +30,14 @@ def test_importing_the_twin_does_not_import_oopao(module):
 
 def test_nothing_is_printed_and_nothing_drawn():
     done = _run(
-        "import numpy as np\n"
+        "import tomllib\n"
+        "from importlib.resources import files\n"
         "from escape_hw.api.registration import Registration\n"
-        "from escape_sim.oopao_model import OOPAOModel\n"
-        "line = np.array([-1.0, 0.0, 1.0]) * 1e-3\n"
-        "xy = np.stack([a.ravel() for a in np.meshgrid(line, line)], 1)\n"
-        "on = np.ones((4, 4), bool)\n"
-        "m = OOPAOModel(xy, 1e-3, 0.4, 2e-6, np.ones((32, 32), np.float32), 1e-3, on, 635e-9, 16.0, 2.0)\n"
-        "m.zonal_matrix(Registration(5, 5, 1, 1, 1))\n"
+        "from escape_hw.config.models import SystemConfig\n"
+        "from escape_sim.oopao_model import make_model\n"
+        "text = (files('escape_hw.config') / 'systems' / 'razor-shwfs.toml').read_text()\n"
+        "model = make_model(SystemConfig.model_validate(tomllib.loads(text)), None)\n"
+        "model.zonal_matrix(Registration(5, 5, 1, 1, 1))\n"
         "import matplotlib as mpl, sys\n"
         "sys.stderr.write('%s %s' % (mpl.pyplot.get_fignums(), mpl.rcParams._get_backend_or_none()))\n"
     )
