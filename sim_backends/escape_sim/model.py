@@ -12,7 +12,7 @@ from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.pipeline.slopes import windows
 from escape_sim.geometry import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.influence import InfluenceFunctions
-from escape_sim.shack_hartmann import lenslet_transform
+from escape_sim.shack_hartmann import field_pixels, first_pixels, lenslet_transform
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
@@ -65,7 +65,7 @@ class ShackHartmannModel:
         self._coupling = config.devices.dm.coupling
         self._metres = 2 * config.devices.dm.stroke_m
         self._rows, self._columns = np.nonzero(grid.valid)
-        self._x_weights, self._y_weights = self._slope_weights(config, grid)
+        self._weights = self._slope_weights(config, grid)
 
     @property
     def n_act(self) -> int:
@@ -95,41 +95,102 @@ class ShackHartmannModel:
         x = self._pupil.coordinates_m
         along_x, along_y = self._influence(width).factors(registration, self.sub_aperture_m, x, x)
         p, n = self._pupil.n_pix, self._pupil.n_sub
-        gx = along_x[:, :, 0].reshape(n, p, -1)[self._columns]
-        gy = along_y[:, :, 0].reshape(n, p, -1)[self._rows]
-        parts = [np.einsum("kqa,kqa->ka", gy, w @ gx) for w in (self._x_weights, self._y_weights)]
-        return np.asarray(np.concatenate(parts) * self._metres)
+        gx, gy = along_x[:, :, 0].reshape(n, p, -1), along_y[:, :, 0].reshape(n, p, -1)
+        out = np.zeros((2, self._rows.size, self.n_act))
+        for (down, right), block in self._weights.items():
+            here = gx[np.clip(self._columns + right, 0, n - 1)]
+            there = gy[np.clip(self._rows + down, 0, n - 1)]
+            for axis in range(2):
+                out[axis] += np.einsum("kqa,kqa->ka", there, block[axis] @ here)
+        return np.asarray(out.reshape(-1, self.n_act) * self._metres)
 
     def _influence(self, width: float) -> InfluenceFunctions:
         return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)
 
     def _slope_weights(
         self, config: SystemConfig, grid: SubApertureGrid
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Derivative of each slope by the optical path on its lenslet, ``(n_valid, p, p)`` twice.
+    ) -> dict[tuple[int, int], NDArray[np.float64]]:
+        """Derivative of each slope by the optical path on its lenslet and on the eight around it.
 
-        With ``E(u) = sum_p A_p exp(i phi_p) F(u, p)`` and ``s = sum u I / sum I`` over the window,
+        With ``E(u) = sum_p A_p exp(i phi_p) F(u, p)``, light of all lenslets added as intensity and
+        ``s = sum u I / sum I`` over the window,
         ``ds/dphi_p = -2 A_p Im sum_u (u - s) conj(E(u)) F(u, p) / sum I``.
+
+        Returns
+        -------
+        dict
+            For each (rows down, columns right) to the lenslet: ``(2, n_valid, p, p)``.
         """
-        p, spot = self._pupil.n_pix, config.sensor.spot_px
+        n, p = self._pupil.n_sub, self._pupil.n_pix
         width, height = config.devices.wfs.region[2:]
-        centres = grid.centres_px()
-        boxes = windows(centres, grid.pitch_px, (height, width))
+        boxes = windows(grid.centres_px(), grid.pitch_px, (height, width))
+        lenslets = _Lenslets(self._pupil, config.sensor.spot_px, grid)
         wave = 2 * np.pi / config.system.wavelength_m
-        blocks = self._pupil.amplitude.reshape(self._pupil.n_sub, p, self._pupil.n_sub, p)
-        amplitudes = blocks.transpose(0, 2, 1, 3)[self._rows, self._columns].astype(float)
-        out = np.empty((2, len(centres), p, p))
-        for k, (top, end, left, right) in enumerate(boxes):
-            fy, fx = (
-                lenslet_transform(np.array([c]), np.array([first]), p, int(size), spot)[0]
-                for c, first, size in ((centres[k, 1], top, end - top), (centres[k, 0], left, right - left))
-            )
-            amplitude = amplitudes[k]
-            e = fy.T @ amplitude @ fx
-            intensity = np.abs(e) ** 2
-            total = intensity.sum()
-            u, v = np.arange(left, right), np.arange(top, end)
-            sx, sy = (intensity.sum(0) @ u) / total, (intensity.sum(1) @ v) / total
-            for axis, lever in enumerate(((u - sx)[None, :], (v - sy)[:, None])):
-                out[axis, k] = -2 * amplitude * np.imag(fy @ (lever * e.conj()) @ fx.T) / total * wave
-        return out[0], out[1]
+        out = {
+            (down, right): np.zeros((2, len(boxes), p, p)) for down in (-1, 0, 1) for right in (-1, 0, 1)
+        }
+        for k, (i, j, box) in enumerate(zip(self._rows, self._columns, boxes, strict=True)):
+            seen = {
+                (down, right): lenslets.seen_in(box, i + down, j + right)
+                for down, right in out
+                if 0 <= i + down < n and 0 <= j + right < n
+            }
+            parts = [part for part in seen.values() if part is not None]
+            total = sum(float(q.intensity.sum()) for q in parts)
+            centre = [sum(float(q.intensity.sum(1 - a) @ q.at[a]) for q in parts) / total for a in (0, 1)]
+            for step, q in seen.items():
+                if q is not None:
+                    for axis, along in enumerate((1, 0)):
+                        lever = q.at[along] - centre[along]
+                        field = q.field.conj() * (lever[None, :] if along == 1 else lever[:, None])
+                        out[step][axis, k] = q.back_projected(field) * (wave / total)
+        return out
+
+
+class _Seen:
+    """The part of one lenslet's image that falls into a window."""
+
+    def __init__(
+        self,
+        amplitude: NDArray[np.float64],
+        along_y: NDArray[np.complex128],
+        along_x: NDArray[np.complex128],
+        rows: NDArray[np.intp],
+        columns: NDArray[np.intp],
+    ) -> None:
+        self._amplitude, self._y, self._x = amplitude, along_y, along_x
+        self.at = (rows, columns)
+        self.field = along_y.T @ amplitude @ along_x
+        self.intensity = np.abs(self.field) ** 2
+
+    def back_projected(self, weighted: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """``-2 A Im sum_u weighted(u) F(u, p)`` on the lenslet's samples ``(p, p)``."""
+        return np.asarray(-2 * self._amplitude * np.imag(self._y @ weighted @ self._x.T))
+
+
+class _Lenslets:
+    """Images of single lenslets at a flat wavefront, for any window."""
+
+    def __init__(self, pupil: PupilGeometry, spot_px: float, grid: SubApertureGrid) -> None:
+        n, p = pupil.n_sub, pupil.n_pix
+        self._amplitudes = pupil.amplitude.reshape(n, p, n, p).transpose(0, 2, 1, 3).astype(float)
+        size = field_pixels(p, spot_px)
+        line = np.arange(n) * grid.pitch_px
+        self._axes = []
+        for origin in grid.origin_px:
+            first = first_pixels(origin + line, size)
+            self._axes.append((first, lenslet_transform(origin + line, first, p, size, spot_px)))
+        self._size = size
+
+    def seen_in(self, box: NDArray[np.int32], row: int, column: int) -> _Seen | None:
+        """What the window ``box`` sees of lenslet ``(row, column)``; None when nothing."""
+        amplitude = self._amplitudes[row, column]
+        (x0, fx), (y0, fy) = self._axes
+        top, end = max(box[0] - y0[row], 0), min(box[1] - y0[row], self._size)
+        left, right = max(box[2] - x0[column], 0), min(box[3] - x0[column], self._size)
+        if not amplitude.any() or top >= end or left >= right:
+            return None
+        return _Seen(
+            amplitude, fy[row][:, top:end], fx[column][:, left:right],
+            np.arange(top, end) + y0[row], np.arange(left, right) + x0[column],
+        )  # fmt: skip

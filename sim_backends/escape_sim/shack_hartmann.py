@@ -47,6 +47,16 @@ def _collect(spots, lit, y0, x0, image):  # type: ignore[no-untyped-def]  # prag
                         image[row, left + u] += re * re + im * im
 
 
+def field_pixels(n_pix: int, spot_px: float) -> int:
+    """Pixels rendered per lenslet: one alias period of its samples, so that no light counts twice."""
+    return int(n_pix * spot_px)
+
+
+def first_pixels(centres_px: NDArray[np.float64], field: int) -> NDArray[np.intp]:
+    """First of the ``field`` pixels around each lenslet centre along one axis."""
+    return np.floor(centres_px - field / 2 + 1).astype(np.intp)
+
+
 def lenslet_transform(
     centres_px: NDArray[np.float64], first_px: NDArray[np.intp], n_pix: int, field: int, spot_px: float
 ) -> NDArray[np.complex128]:
@@ -117,12 +127,10 @@ class ShackHartmannOptics:
         n = n_sub * n_pix
         if amplitude.shape != (n, n):
             raise ValueError(f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})")
-        # One alias period of the sampled lenslet, so that no light is counted twice.
-        field = int(n_pix * spot_px)
+        field = field_pixels(n_pix, spot_px)
         line = np.arange(n_sub) * pitch_px
         x, y = origin_px[0] + line, origin_px[1] + line
-        x0 = np.floor(x - field / 2 + 1).astype(np.intp)
-        y0 = np.floor(y - field / 2 + 1).astype(np.intp)
+        x0, y0 = first_pixels(x, field), first_pixels(y, field)
         light = amplitude.reshape(n_sub, n_pix, n_sub, n_pix).any(axis=(1, 3))
         rows, cols = np.nonzero(light)
         inside = (
