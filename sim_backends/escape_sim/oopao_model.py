@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
 from escape_hw.errors import CalibrationError
-from escape_hw.pipeline.slopes import windows
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.model import nominal_grid
 from escape_sim.oopao_bridge import make_lenslets, make_light, mis_registration, oopao, quiet
-from escape_sim.oopao_optics import SAMPLING, read_off
+from escape_sim.oopao_readout import SAMPLING, window_levers
 
 if TYPE_CHECKING:
     from escape_hw.api.sensor import SubApertureGrid
@@ -42,10 +41,10 @@ def make_model(config: SystemConfig, grid: SubApertureGrid | None) -> OOPAOModel
 class OOPAOModel:
     """Small-signal slopes with mirror, registration, field and diffraction by OOPAO 1.0.
 
-    Slopes are push minus pull, the centre of gravity without threshold of OOPAO's spots over the
-    camera's own windows. OOPAO's centroid, whose relative threshold makes matrices depend on the
-    stroke, its ``SPRINT``, whose rounding loses shifts at the scale of a bench, and its modal
-    bases, whose signs change between runs, are not used.
+    Slopes are push minus pull, the centre of gravity without threshold over the camera's own windows
+    of OOPAO's spots, the neighbours' included. Three things of OOPAO's are not used: its centroid,
+    whose relative threshold makes matrices depend on the stroke; its ``SPRINT``, whose rounding
+    loses shifts at the scale of a bench; its modal bases, whose signs change between runs.
 
     Parameters
     ----------
@@ -76,9 +75,10 @@ class OOPAOModel:
                 f"{int((grid.valid & ~lit).sum())} valid sub-apertures of the grid lie outside the design's "
                 "pupil; check the grid and sensor.n_sub"
             )
-        #: Which of the lit lenslets are valid.
-        self._valid = grid.valid[lit]
-        self._levers = self._window_levers(config, grid)
+        self._n_slopes = grid.n_slopes
+        self._levers = window_levers(
+            grid, np.asarray(lit), config.devices.wfs.region[:1:-1], pupil.n_pix, config.sensor.spot_px
+        )
         self._mirrors: dict[float, Any] = {}
 
     @property
@@ -112,7 +112,7 @@ class OOPAOModel:
             mirror = self._mirror(width).apply_mis_registration(moved)
         # The mirror reflects: a surface of STEP_M changes the path by twice that.
         pokes = np.eye(self.n_act) * 2 * STEP_M
-        out = np.empty((2 * int(self._valid.sum()), self.n_act))
+        out = np.empty((self._n_slopes, self.n_act))
         for start in range(0, self.n_act, _BATCH):
             part = pokes[:, start : start + _BATCH]
             out[:, start : start + _BATCH] = self._slopes(mirror, part) - self._slopes(mirror, -part)
@@ -129,32 +129,15 @@ class OOPAOModel:
             mirror.coefs = paths_m
             # '**' starts a new propagation; '*' alone would add to the last one.
             light.source**light.telescope * mirror * self._lenslets
-            spots = np.asarray(self._lenslets.maps_intensity)[:n, self._valid]
-        (sum_x, first_x), (sum_y, first_y) = self._levers
-        # OOPAO lays the image of a lenslet down with x along its rows.
-        over_y = np.einsum("bkxy,kyl->bkxl", spots, np.stack([sum_y, first_y], axis=2))
-        total = np.einsum("bkx,kx->bk", over_y[..., 0], sum_x)
-        along_x = np.einsum("bkx,kx->bk", over_y[..., 0], first_x) / total
-        along_y = np.einsum("bkx,kx->bk", over_y[..., 1], sum_x) / total
-        return np.concatenate([along_x, along_y], axis=1).T
-
-    def _window_levers(
-        self, config: SystemConfig, grid: SubApertureGrid
-    ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        """Per axis, weights on OOPAO's samples of the sum and of the first moment over each window.
-
-        Two arrays ``(n_valid, samples)`` for x, two for y.
-        """
-        width, height = config.devices.wfs.region[2:]
-        centres = grid.centres_px()
-        top, end, left, right = windows(centres, grid.pitch_px, (height, width)).T
-        out = []
-        for axis, (low, high) in enumerate(((left, right), (top, end))):
-            offset = low[:, None] + np.arange(int((high - low).max())) - centres[:, axis, None]
-            read = read_off(offset, self._pupil.n_pix, config.sensor.spot_px)
-            read[np.arange(read.shape[1]) >= (high - low)[:, None]] = 0.0
-            out.append((read.sum(axis=1), (offset[..., None] * read).sum(axis=1)))
-        return out
+            spots = np.asarray(self._lenslets.maps_intensity)[:n]
+        total, along_x, along_y = np.zeros((3, n, len(self._levers[0].lenslet)))
+        for part in self._levers:
+            # OOPAO lays the image of a lenslet down with x along its rows.
+            over_y = np.einsum("bkxy,kyl->bkxl", spots[:, part.lenslet], part.along_y, optimize=True)
+            total += np.einsum("bkx,kx->bk", over_y[..., 0], part.along_x[..., 0])
+            along_x += np.einsum("bkx,kx->bk", over_y[..., 0], part.along_x[..., 1])
+            along_y += np.einsum("bkx,kx->bk", over_y[..., 1], part.along_x[..., 0])
+        return np.concatenate([along_x / total, along_y / total], axis=1).T
 
     def _mirror(self, width: float) -> Any:
         """OOPAO's mirror in nominal position; the few widths in use are kept."""

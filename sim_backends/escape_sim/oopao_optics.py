@@ -6,54 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_sim.oopao_bridge import make_lenslets, make_light, oopao, quiet
-
-#: OOPAO's pixels per lambda/d here: critical sampling of an intensity.
-SAMPLING = 2
-
-
-def trigonometric_reading(at: NDArray[np.float64], period: int) -> NDArray[np.float64]:
-    """Matrix that reads a band-limited periodic signal between its samples.
-
-    An image of ``period / 2`` pupil samples holds frequencies below ``period / 2`` only, so
-    ``period`` samples determine it everywhere and the reading is exact.
-
-    Parameters
-    ----------
-    at
-        Positions, in samples, any shape.
-    period
-        Number of samples, even.
-
-    Returns
-    -------
-    ndarray, ``(*at.shape, period)``
-    """
-    top = period // 2 - 1
-    turn = 2 * np.pi / period * (at[..., None] - np.arange(period))
-    harmonics = np.arange(1, top + 1)
-    return np.asarray((1 + 2 * np.cos(turn[..., None] * harmonics).sum(axis=-1)) / period)
-
-
-def read_off(offset_px: NDArray[np.float64], n_pix: int, spot_px: float) -> NDArray[np.float64]:
-    """Matrix from OOPAO's samples of a lenslet's image to camera pixels, along one axis.
-
-    Parameters
-    ----------
-    offset_px
-        Pixels relative to the lenslet's centre, any shape.
-    n_pix
-        Pupil samples across a lenslet.
-    spot_px
-        lambda/d in camera pixels.
-
-    Returns
-    -------
-    ndarray, ``(*offset_px.shape, SAMPLING * n_pix)``
-        Scaled so that a whole field holds the light of the lenslet.
-    """
-    period = SAMPLING * n_pix
-    at = (period - 1) / 2 + offset_px * SAMPLING / spot_px
-    return trigonometric_reading(at, period) * SAMPLING / spot_px
+from escape_sim.oopao_readout import SAMPLING, read_off
+from escape_sim.shack_hartmann import field_pixels, first_pixels
 
 
 class OOPAOShackHartmann:
@@ -102,14 +56,14 @@ class OOPAOShackHartmann:
         self._data = self._sensor.sh_data["src_0"]
         self._lit = np.argwhere(self._data.valid_subapertures)
 
-        field = int(n_pix * spot_px)
+        field = field_pixels(n_pix, spot_px)
         self._field = field
         line = np.arange(n_sub) * pitch_px
         self._first: list[NDArray[np.intp]] = []
         self._read: list[NDArray[np.float64]] = []
         for start, length in zip(origin_px, shape[::-1], strict=True):
-            centres = start + line
-            first = np.floor(centres - field / 2 + 1).astype(np.intp)
+            centres: NDArray[np.float64] = start + line
+            first = first_pixels(centres, field)
             pixels = first[:, None] + np.arange(field) - centres[:, None]
             self._first.append(first)
             self._read.append(read_off(pixels, n_pix, spot_px))

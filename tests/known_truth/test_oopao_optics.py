@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.pipeline.slopes import SlopeExtractor
 from escape_sim.oopao_bridge import make_lenslets, make_light, oopao, quiet
-from escape_sim.oopao_optics import OOPAOShackHartmann, trigonometric_reading
+from escape_sim.oopao_optics import OOPAOShackHartmann
+from escape_sim.oopao_readout import trigonometric_reading
 from escape_sim.shack_hartmann import ShackHartmannOptics
 
 WAVELENGTH = 635e-9
