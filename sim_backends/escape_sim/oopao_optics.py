@@ -62,7 +62,7 @@ class OOPAOShackHartmann:
         self._first: list[NDArray[np.intp]] = []
         self._read: list[NDArray[np.float64]] = []
         for start, length in zip(origin_px, shape[::-1], strict=True):
-            centres: NDArray[np.float64] = start + line
+            centres = np.asarray(start + line, dtype=np.float64)
             first = first_pixels(centres, field)
             pixels = first[:, None] + np.arange(field) - centres[:, None]
             self._first.append(first)

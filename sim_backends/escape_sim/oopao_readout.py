@@ -107,7 +107,7 @@ def window_levers(
     def along(
         origin: float, own: NDArray[np.intp], low: NDArray[np.int32], high: NDArray[np.int32], step: int
     ) -> NDArray[np.float64]:
-        centres: NDArray[np.float64] = origin + np.arange(n_sub) * grid.pitch_px
+        centres = np.asarray(origin + np.arange(n_sub) * grid.pitch_px, dtype=np.float64)
         other = np.clip(own + step, 0, n_sub - 1)
         size = field_pixels(n_pix, spot_px)
         first = first_pixels(centres, size)[other]
