@@ -26,7 +26,12 @@ class SubApertureGrid:
     references_px
         Reference spot positions ``(n_valid, 2)`` as (x, y) relative to the lenslet centres.
     flux
-        Flux of every sub-aperture relative to the brightest, ``(n_rows, n_columns)``.
+        Flux of every sub-aperture relative to a bright one, ``(n_rows, n_columns)``.
+    counts
+        Counts per frame of a bright sub-aperture (the 95th percentile of those lit); 0 if unknown.
+    motion_px
+        Rms motion of the spots along an axis, in pixels, during the measurement that a model of
+        this sensor is to match.
     """
 
     pitch_px: float
@@ -34,6 +39,8 @@ class SubApertureGrid:
     valid: NDArray[np.bool_]
     references_px: NDArray[np.float32]
     flux: NDArray[np.float32]
+    counts: float = 0.0
+    motion_px: float = 0.0
 
     @property
     def n_valid(self) -> int:

@@ -98,7 +98,7 @@ def find_grid(
     x, y = _centre_lattice(light, pitch, x, y, n_sub)
     grid = None
     for _ in range(3):
-        grid = _grid_at(light, n_sub, pitch, (x, y), min_flux)
+        grid = _grid_at(image, n_sub, pitch, (x, y), min_flux)
         extractor = SlopeExtractor(grid, image.shape, threshold=0.0)  # type: ignore[arg-type]
         offset = _measure(extractor, light)
         spots = grid.centres_px() + offset
@@ -110,11 +110,12 @@ def find_grid(
             f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal_pitch_px}; "
             "check sensor.pitch_px and the binning"
         )
-    grid = _grid_at(light, n_sub, pitch, (x, y), min_flux)
+    grid = _grid_at(image, n_sub, pitch, (x, y), min_flux)
     if references == "mean":
         extractor = SlopeExtractor(grid, image.shape, threshold=0.0)  # type: ignore[arg-type]
         grid = SubApertureGrid(
-            grid.pitch_px, grid.origin_px, grid.valid, _measure(extractor, light).astype(np.float32), grid.flux
+            grid.pitch_px, grid.origin_px, grid.valid, _measure(extractor, light).astype(np.float32), grid.flux,
+            grid.counts,
         )
     return grid
 
@@ -135,18 +136,19 @@ def _centre_lattice(
 
 
 def _grid_at(
-    light: NDArray[np.float64], n_sub: int, pitch: float, origin: tuple[float, float], min_flux: float
+    image: NDArray[np.float64], n_sub: int, pitch: float, origin: tuple[float, float], min_flux: float
 ) -> SubApertureGrid:
     line = np.arange(n_sub) * pitch
     centres = np.stack([a.ravel() for a in np.meshgrid(origin[0] + line, origin[1] + line)], axis=1)
-    boxes = windows(centres, pitch, light.shape)  # type: ignore[arg-type]
-    area = np.pad(light.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    boxes = windows(centres, pitch, image.shape)  # type: ignore[arg-type]
+    area = np.pad(image.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     top, end, left, right = boxes.T
     flux = area[end, right] - area[top, right] - area[end, left] + area[top, left]
     whole = (end - top >= int(pitch)) & (right - left >= int(pitch))
-    flux = np.where(whole, flux, 0.0).reshape(n_sub, n_sub)
+    flux = np.where(whole, np.maximum(flux, 0.0), 0.0).reshape(n_sub, n_sub)
     # Relative to the typical bright sub-aperture: one hot pixel must not darken all others.
-    flux = flux / max(float(np.percentile(flux[flux > 0], 95)), 1e-30)
+    counts = float(np.percentile(flux[flux > 0.02 * flux.max()], 95))
+    flux = flux / counts
     valid = flux >= min_flux
     if valid.sum() < 6:
         raise CalibrationError(
@@ -154,7 +156,7 @@ def _grid_at(
             "check the beam, the camera region and sensor.min_flux"
         )
     return SubApertureGrid(
-        pitch, origin, valid, np.zeros((int(valid.sum()), 2), np.float32), flux.astype(np.float32)
+        pitch, origin, valid, np.zeros((int(valid.sum()), 2), np.float32), flux.astype(np.float32), counts
     )
 
 

@@ -1,0 +1,126 @@
+"""Derivatives of Shack-Hartmann slopes by the optical path on the lenslets."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.pipeline.slopes import windows
+from escape_sim.geometry import PupilGeometry
+from escape_sim.shack_hartmann import field_pixels, first_pixels, lenslet_transform
+
+if TYPE_CHECKING:
+    from escape_hw.config.models import SystemConfig
+
+#: Steps (rows down, columns right) from a window to the lenslets whose light it sees.
+STEPS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
+#: Nodes per axis of the Gauss-Hermite average over spot motion.
+_NODES = 5
+
+
+def slope_weights(
+    config: SystemConfig, grid: SubApertureGrid, pupil: PupilGeometry
+) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Mean derivative of each slope by the optical path on its lenslet and on the eight around it.
+
+    With ``E(u) = sum_p A_p exp(i phi_p) F(u, p)``, the light of all lenslets added as intensity and
+    ``s = sum u I / sum I`` over the window,
+    ``ds/dphi_p = -2 A_p Im sum_u (u - s) conj(E(u)) F(u, p) / sum I``.
+    Pixels below the threshold drop out of both sums, and the threshold is subtracted from those
+    above. Which pixels these are changes as the spot moves, so the derivative is averaged over a
+    Gaussian motion of the spots of ``grid.motion_px`` rms along each axis; without the average the
+    response would depend on how each lenslet happens to fall on the pixels.
+
+    Parameters
+    ----------
+    config
+        Design of sensor, camera and beam.
+    grid
+        The grid found on the camera.
+    pupil
+        The sampled pupil.
+
+    Returns
+    -------
+    dict
+        For each step in :data:`STEPS`: ``(2, n_valid, p, p)`` in pixels per metre, x then y.
+    """
+    views = _Views(config, grid, pupil)
+    nodes, shares = np.polynomial.hermite_e.hermegauss(_NODES if grid.motion_px else 1)
+    shares = shares / shares.sum()
+    out = {step: np.zeros((2, grid.n_valid, pupil.n_pix, pupil.n_pix)) for step in STEPS}
+    for dy, wy in zip(nodes * grid.motion_px, shares, strict=True):
+        for dx, wx in zip(nodes * grid.motion_px, shares, strict=True):
+            views.accumulate(out, float(dx), float(dy), float(wx * wy))
+    wave = 2 * np.pi / config.system.wavelength_m
+    return {step: block * wave for step, block in out.items()}
+
+
+class _Views:
+    """Images of a window's nine lenslets on the window's pixels, for all windows at once."""
+
+    def __init__(self, config: SystemConfig, grid: SubApertureGrid, pupil: PupilGeometry) -> None:
+        n, p, spot = pupil.n_sub, pupil.n_pix, config.sensor.spot_px
+        width, height = config.devices.wfs.region[2:]
+        boxes = windows(grid.centres_px(), grid.pitch_px, (height, width)).astype(np.intp)
+        rows, columns = np.nonzero(grid.valid)
+        size = int((boxes[:, 1::2] - boxes[:, ::2]).max())
+        self._rows_at = boxes[:, 0, None] + np.arange(size)
+        self._columns_at = boxes[:, 2, None] + np.arange(size)
+        in_y, in_x = self._rows_at < boxes[:, 1, None], self._columns_at < boxes[:, 3, None]
+        self._inside = in_y[:, :, None] & in_x[:, None, :]
+        blocks = pupil.amplitude.reshape(n, p, n, p).transpose(0, 2, 1, 3).astype(float)
+        light = np.square(blocks).sum(axis=(2, 3))
+        counts = config.sensor.threshold * (2**config.devices.wfs.bit_depth - 1)
+        # The threshold in the units of the intensities here, by the light of a bright sub-aperture.
+        self._cut = counts / grid.counts * float(np.percentile(light[light > 0], 95)) if grid.counts else 0.0
+        self._samples = (np.arange(p) - (p - 1) / 2) / p
+        self._spot = spot
+        self._blocks, self._along = {}, {}
+        field = field_pixels(p, spot)
+        for step in STEPS:
+            i, j = rows + step[0], columns + step[1]
+            exists = (i >= 0) & (i < n) & (j >= 0) & (j < n)
+            i, j = np.clip(i, 0, n - 1), np.clip(j, 0, n - 1)
+            self._blocks[step] = blocks[i, j] * exists[:, None, None]
+            self._along[step] = tuple(
+                self._transform(grid.origin_px[axis] + number * grid.pitch_px, at, p, field)
+                for axis, number, at in ((1, i, self._rows_at), (0, j, self._columns_at))
+            )
+
+    def _transform(
+        self, centre: NDArray[np.float64], at: NDArray[np.intp], p: int, field: int
+    ) -> NDArray[np.complex128]:
+        """Fourier matrices ``(n_valid, p, size)``, zero where the lenslet's image does not reach."""
+        first = first_pixels(centre, field)
+        size = at.shape[1]
+        reach = (at >= first[:, None]) & (at < first[:, None] + field)
+        return lenslet_transform(centre, at[:, 0], p, size, self._spot) * reach[:, None, :]
+
+    def accumulate(
+        self, out: dict[tuple[int, int], NDArray[np.float64]], dx: float, dy: float, share: float
+    ) -> None:
+        """Add ``share`` times the derivatives with all spots moved by ``(dx, dy)`` pixels."""
+        tilt = [np.exp(2j * np.pi * d * self._samples / self._spot) for d in (dy, dx)]
+        fields = {}
+        image = np.zeros(self._inside.shape)
+        for step in STEPS:
+            fy, fx = self._along[step]
+            amplitude = self._blocks[step] * tilt[0].conj()[:, None] * tilt[1].conj()[None, :]
+            e = np.matmul(np.matmul(fy.transpose(0, 2, 1), amplitude), fx)
+            image += e.real**2 + e.imag**2
+            fields[step] = (amplitude, e)
+        counted = np.where(self._inside, np.maximum(image - self._cut, 0.0), 0.0)
+        total = np.maximum(counted.sum(axis=(1, 2)), 1e-30)
+        seen = self._inside & (image > self._cut)
+        x, y = self._columns_at[:, None, :], self._rows_at[:, :, None]
+        for axis, at in enumerate((x, y)):
+            middle = (counted * at).sum(axis=(1, 2)) / total
+            lever = (at - middle[:, None, None]) * seen * (share / total)[:, None, None]
+            for step, (amplitude, e) in fields.items():
+                fy, fx = self._along[step]
+                back = np.matmul(np.matmul(fy, lever * e.conj()), fx.transpose(0, 2, 1))
+                out[step][axis] += -2 * np.imag(amplitude * back)
