@@ -64,9 +64,9 @@ class BasisSection(Section):
     @model_validator(mode="after")
     def _rules(self) -> Self:
         if self.kind == "file" and not self.file:
-            enforce([Breach("file", "''", "kind = 'file' needs the name of a FITS file")])
+            enforce([Breach("file", "", "kind = 'file' needs the name of a FITS file")])
         if self.kind != "file" and self.file:
-            enforce([Breach("file", repr(self.file), f"is not read with kind = '{self.kind}'; remove it")])
+            enforce([Breach("file", self.file, f"is not read with kind = '{self.kind}'; remove it")])
         return self
 
 

@@ -1,0 +1,48 @@
+# Needs only make and Python 3.11 or newer; every target creates .venv and installs what it needs.
+# ARGS="..." is handed on to the command behind a target.
+
+VENV := .venv
+BIN := $(VENV)/bin
+FIND = for p in python3.13 python3.12 python3.11 python3; do \
+	if $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; \
+	then echo $$p; break; fi; done
+PYTHON ?= $(shell $(FIND))
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
+
+# One thread per process: two test processes whose linear algebra also starts threads slow each other down.
+ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_NUM_THREADS=1 MPLBACKEND=Agg
+
+.PHONY: help run test check perf clean
+
+help: ## List the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
+
+run: $(VENV)/run.stamp ## Calibrate the simulated RAZOR bench, close the loop, write a report
+	$(BIN)/escape reproduce shwfs $(ARGS)
+
+test: $(VENV)/test.stamp ## Run the tests
+	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
+
+check: $(VENV)/dev.stamp ## Check style, types and layers
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+perf: $(VENV)/bench.stamp ## Measure speed against OOPAO and pyRTC
+	$(BIN)/escape perf $(ARGS)
+
+clean: ## Remove the environment and caches
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with venv found; set PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/run.stamp: pyproject.toml | $(BIN)/python
+	$(PIP) --editable .
+	@touch $@
+
+$(VENV)/%.stamp: pyproject.toml | $(BIN)/python
+	$(PIP) --editable '.[$*]'
+	@touch $@

@@ -1,0 +1,208 @@
+"""The devices of one system, opened and closed together."""
+
+from __future__ import annotations
+
+import logging
+import zlib
+from types import TracebackType
+from typing import Self, TypeVar
+
+import numpy as np
+
+from escape_hw.api.camera import Camera
+from escape_hw.api.device import Device
+from escape_hw.api.mirror import DeformableMirror
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.screen import PhaseScreen
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.config.device_models import DeviceConfig
+from escape_hw.config.models import SystemConfig
+from escape_hw.config.registry import device_factory, model_factory
+from escape_hw.errors import ConfigError
+
+log = logging.getLogger(__name__)
+
+D = TypeVar("D", bound=Device)
+
+
+class Bench:
+    """The devices of a system and its configuration; usable as a context manager.
+
+    Nothing is connected before :meth:`open`. Devices open in the order mirror, sensor camera,
+    science camera, screen, and close in reverse, so that the mirror is flattened last.
+
+    Parameters
+    ----------
+    config
+        The whole configuration.
+    dm, wfs
+        Deformable mirror and camera of the wavefront sensor.
+    science, screen
+        Science camera and phase screens, or ``None`` on a system without.
+
+    Attributes
+    ----------
+    rng
+        Random generator of the procedures, seeded from ``system.seed`` and independent of every
+        stream that a twin derives from the same seed.
+    """
+
+    def __init__(
+        self,
+        config: SystemConfig,
+        dm: DeformableMirror,
+        wfs: Camera,
+        science: Camera | None = None,
+        screen: PhaseScreen | None = None,
+    ) -> None:
+        self.config = config
+        self.dm, self.wfs, self.science, self.screen = dm, wfs, science, screen
+        stream = zlib.crc32(b"escape_hw.bench")
+        self.rng = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(stream,)))
+
+    @classmethod
+    def from_config(cls, config: SystemConfig) -> Self:
+        """Build every device from the registry; opens nothing.
+
+        Raises
+        ------
+        ConfigError
+            A driver or twin is unknown, not installed, or of the wrong kind.
+        """
+        shared: dict[str, object] = {}
+        devices = config.devices
+        dm = _build("dm", devices.dm, config, shared, DeformableMirror)  # type: ignore[type-abstract]
+        wfs = _build("wfs", devices.wfs, config, shared, Camera)  # type: ignore[type-abstract]
+        science = _build("science", devices.science, config, shared, Camera)  # type: ignore[type-abstract]
+        screen = _build("screen", devices.screen, config, shared, PhaseScreen)  # type: ignore[type-abstract]
+        if dm is None or wfs is None:
+            name, mode = ("dm", devices.dm.mode) if dm is None else ("wfs", devices.wfs.mode)
+            key = "sim_driver" if (mode or config.system.mode) == "sim" else "driver"
+            raise ConfigError(f"devices.{name}.{key}: ''  names no driver, and no system works without one")
+        return cls(config, dm, wfs, science, screen)
+
+    @property
+    def devices(self) -> tuple[Device, ...]:
+        """The devices present, in the order of opening."""
+        return tuple(d for d in (self.dm, self.wfs, self.science, self.screen) if d is not None)
+
+    @property
+    def is_open(self) -> bool:
+        """True when every device is open."""
+        return all(device.is_open for device in self.devices)
+
+    @property
+    def simulated(self) -> bool:
+        """True when any device is a twin: by the configuration, or by its own word once open."""
+        sections = self.config.devices
+        chosen = {
+            mode_of(section, self.config)
+            for section, device in (
+                (sections.dm, self.dm),
+                (sections.wfs, self.wfs),
+                (sections.science, self.science),
+                (sections.screen, self.screen),
+            )
+            if section is not None and device is not None
+        }
+        told = [d.info.simulated for d in (self.dm, self.wfs, self.science) if d is not None and d.is_open]
+        return "sim" in chosen or any(told)
+
+    def open(self) -> Self:
+        """Open every device; does nothing to those already open.
+
+        Raises
+        ------
+        DeviceError
+            A device cannot be reached; those opened before it are closed again.
+        """
+        try:
+            for device in self.devices:
+                device.open()
+        except BaseException as error:
+            self._close_all(error)
+            raise
+        return self
+
+    def close(self) -> None:
+        """Close every device, the mirror last, whatever happens on the way.
+
+        Raises
+        ------
+        Exception
+            The first failure, once everything has been closed; later ones are noted on it.
+        """
+        first = self._close_all(None)
+        if first is not None:
+            raise first
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+        else:
+            self._close_all(error)
+
+    def model(self, grid: SubApertureGrid | None = None) -> SyntheticModel:
+        """The synthetic model that ``calibration.model`` names.
+
+        Parameters
+        ----------
+        grid
+            The sub-aperture grid found on the camera; ``None``: the nominal one.
+
+        Raises
+        ------
+        ConfigError
+            The model is unknown or not installed.
+        """
+        return model_factory(self.config.calibration.model)(self.config, grid)
+
+    def _close_all(self, cause: BaseException | None) -> BaseException | None:
+        """Close in reverse; failures become notes on the cause or on the first failure."""
+        first = cause
+        for device in reversed(self.devices):
+            try:
+                device.close()
+            except BaseException as error:
+                log.error("%s did not close cleanly: %s", device.name, error)
+                if first is None:
+                    first = error
+                else:
+                    first.add_note(f"while closing {device.name}: {error!r}")
+        return first
+
+
+def build_bench(config: SystemConfig) -> Bench:
+    """Build a bench from its configuration; see :meth:`Bench.from_config`."""
+    return Bench.from_config(config)
+
+
+def mode_of(section: DeviceConfig, config: SystemConfig) -> str:
+    """The mode of one device: its own, or else the system's."""
+    return section.mode or config.system.mode
+
+
+def _build(
+    name: str, section: DeviceConfig | None, config: SystemConfig, shared: dict[str, object], kind: type[D]
+) -> D | None:
+    """Build one device, or ``None`` when the system has none in this mode."""
+    if section is None:
+        return None
+    driver = section.sim_driver if mode_of(section, config) == "sim" else section.driver
+    if not driver:
+        return None
+    try:
+        factory = device_factory(driver)
+    except ConfigError as error:
+        raise ConfigError(f"devices.{name}: {error}") from error
+    device = factory(name, config, shared)
+    if not isinstance(device, kind):
+        raise ConfigError(
+            f"devices.{name}: driver '{driver}' makes a {type(device).__name__}, not a {kind.__name__}"
+        )
+    return device

@@ -1,0 +1,64 @@
+"""The bundled systems, and finding a system by name or by file."""
+
+from __future__ import annotations
+
+import importlib.resources
+import os
+from pathlib import Path
+
+from escape_hw.config.outline import nearest
+from escape_hw.errors import ConfigError
+
+_SUFFIX = ".toml"
+
+
+def bundled_systems() -> tuple[str, ...]:
+    """Names of the systems that come with the package, sorted."""
+    folder = importlib.resources.files("escape_hw.config") / "systems"
+    names = (entry.name for entry in folder.iterdir())
+    return tuple(sorted(name.removesuffix(_SUFFIX) for name in names if name.endswith(_SUFFIX)))
+
+
+def bundled_text(name: str) -> str:
+    """The TOML text of a bundled system, comments included.
+
+    Raises
+    ------
+    ConfigError
+        There is no such system; the nearest name is given.
+    """
+    known = bundled_systems()
+    if name not in known:
+        meant = nearest(name, known)
+        hint = f"did you mean '{meant}'? " if meant else ""
+        raise ConfigError(
+            f"unknown system '{name}' ({hint}bundled systems: {', '.join(known)}; "
+            "a file is given by its path, ending in .toml)"
+        )
+    file = importlib.resources.files("escape_hw.config") / "systems" / (name + _SUFFIX)
+    return file.read_text(encoding="utf-8")
+
+
+def find_system(system: str | os.PathLike[str]) -> tuple[str, str]:
+    """The text of a system and how to call its source in messages.
+
+    Parameters
+    ----------
+    system
+        Name of a bundled system, or the path of a TOML file (it ends in ``.toml`` or has a folder).
+
+    Raises
+    ------
+    ConfigError
+        Unknown name, or a file that cannot be read.
+    """
+    name = os.fspath(system)
+    path = Path(name).expanduser()
+    if isinstance(system, str) and path.suffix != _SUFFIX and len(path.parts) < 2:
+        return bundled_text(name), name + _SUFFIX
+    try:
+        return path.read_text(encoding="utf-8"), name
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{name}: is not UTF-8 text ({error.reason} at byte {error.start})") from error
+    except OSError as error:
+        raise ConfigError(f"{name}: cannot be read ({error.strerror})") from error

@@ -1,0 +1,107 @@
+"""Finds drivers, twins and models by name, through entry points, so that anybody may add one."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable
+from typing import Any, cast
+
+from escape_hw.api.device import Device
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.config.models import SystemConfig
+from escape_hw.config.outline import nearest
+from escape_hw.errors import ConfigError
+
+DEVICES = "escape.devices"
+MODELS = "escape.models"
+_KINDS = {DEVICES: "device driver", MODELS: "synthetic model"}
+
+#: ``factory(name, config, shared) -> device``: the key in ``[devices]``, the whole configuration and
+#: one dictionary per opened system, through which the twins of one bench find each other.
+DeviceFactory = Callable[[str, SystemConfig, dict[str, object]], Device]
+#: ``factory(config, grid) -> model``; without a grid the model takes the nominal one.
+ModelFactory = Callable[[SystemConfig, SubApertureGrid | None], SyntheticModel]
+
+
+def available(group: str) -> tuple[str, ...]:
+    """Names registered in a group (:data:`DEVICES` or :data:`MODELS`), sorted."""
+    return tuple(sorted({entry.name for entry in importlib.metadata.entry_points(group=group)}))
+
+
+def device_factory(name: str) -> DeviceFactory:
+    """The factory of a driver or twin.
+
+    Raises
+    ------
+    ConfigError
+        Unknown name (with the nearest one), or its package is not completely installed.
+    """
+    return cast(DeviceFactory, _load(DEVICES, name))
+
+
+def model_factory(name: str) -> ModelFactory:
+    """The factory of a synthetic model.
+
+    Raises
+    ------
+    ConfigError
+        Unknown name (with the nearest one), or its package is not completely installed.
+    """
+    return cast(ModelFactory, _load(MODELS, name))
+
+
+def _load(group: str, name: str) -> Any:
+    kind = _KINDS[group]
+    entries = {
+        entry.value: entry for entry in importlib.metadata.entry_points(group=group) if entry.name == name
+    }
+    if not entries:
+        raise ConfigError(_unknown(group, name))
+    if len(entries) > 1:
+        owners = " and ".join(f"{value} ({_package(entry)})" for value, entry in sorted(entries.items()))
+        raise ConfigError(f"{kind} '{name}' is offered twice: {owners}; uninstall one of the packages")
+    (entry,) = entries.values()
+    try:
+        factory = entry.load()
+    except ImportError as error:
+        raise ConfigError(_missing(kind, entry, error)) from error
+    except AttributeError as error:
+        raise ConfigError(
+            f"{kind} '{name}' of {_package(entry)} is broken: {entry.value} does not exist ({error})"
+        ) from error
+    if not callable(factory):
+        raise ConfigError(f"{kind} '{name}' of {_package(entry)} is broken: {entry.value} is not callable")
+    return factory
+
+
+def _unknown(group: str, name: str) -> str:
+    known = available(group)
+    meant = nearest(name, known)
+    hint = f"did you mean '{meant}'? " if meant else ""
+    listing = ", ".join(known) if known else "none: is escape-hw itself installed in this environment?"
+    return (
+        f"no {_KINDS[group]} '{name}' is installed ({hint}installed: {listing}); "
+        f"install the package that offers it as an entry point in '{group}'"
+    )
+
+
+def _missing(kind: str, entry: importlib.metadata.EntryPoint, error: ImportError) -> str:
+    package = _package(entry)
+    missing = (error.name or "").partition(".")[0]
+    if not missing:
+        return f"{kind} '{entry.name}' of {package} cannot be loaded: {error}"
+    if missing == entry.module.partition(".")[0]:
+        return (
+            f"{kind} '{entry.name}': its module {entry.module} is not installed ({error}); "
+            f"install it again with: pip install --force-reinstall {package}"
+        )
+    wanted = f"{package}[{','.join(entry.extras)}]" if entry.extras else missing
+    return (
+        f"{kind} '{entry.name}' of {package} needs the Python module '{missing}', which is not "
+        f"installed; install it with: pip install '{wanted}'"
+    )
+
+
+def _package(entry: importlib.metadata.EntryPoint) -> str:
+    return entry.dist.name if entry.dist is not None else entry.module.partition(".")[0]

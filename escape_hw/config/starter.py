@@ -1,0 +1,68 @@
+"""The commented file that a new system starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from escape_hw.config.load import load_system
+from escape_hw.config.outline import fields_of, is_free_table, range_text, section_of
+from escape_hw.config.toml_text import dump_toml, format_key, format_value
+
+
+def starter_text(name: str = "my-system", base: str = "razor-shwfs") -> str:
+    """A complete system as TOML with what every key means, its unit and its range.
+
+    Parameters
+    ----------
+    name
+        Name of the new system.
+    base
+        The bundled system whose values it starts with.
+
+    Raises
+    ------
+    ConfigError
+        The base does not exist, or the name is not a name for a system.
+    """
+    config = load_system(base, overrides=[f"system.name={format_value(name)}"])
+    lines = [
+        f"# Starts as a copy of {base}. Keys may be left out where a default suits;",
+        "# a key behind '#' is absent and switches its rule or device off.",
+        *_section(config, ()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _section(section: BaseModel, path: tuple[str, ...]) -> Iterator[str]:
+    tables = []
+    if path:
+        yield "[" + ".".join(map(format_key, path)) + "]"
+    for (key, field), attribute in zip(
+        fields_of(type(section)).items(), type(section).model_fields, strict=True
+    ):
+        value = getattr(section, attribute)
+        if isinstance(value, BaseModel) or (value is not None and is_free_table(field)):
+            tables.append((key, field, value))
+        elif value is not None:
+            yield f"# {_help(field)}"
+            yield f"{format_key(key)} = {format_value(value)}"
+        elif section_of(field.annotation) is None:
+            yield f"# {_help(field)}"
+            yield f"# {format_key(key)} ="
+    for key, field, value in tables:
+        yield ""
+        yield f"# {_help(field)}"
+        if isinstance(value, BaseModel):
+            yield from _section(value, (*path, key))
+        else:
+            yield "[" + ".".join(map(format_key, (*path, key))) + "]"
+            if value:
+                yield dump_toml(value).rstrip()
+
+
+def _help(field: FieldInfo) -> str:
+    allowed = range_text(field)
+    return f"{field.description}" + (f" ({allowed})" if allowed else "")

@@ -1,0 +1,47 @@
+"""What importing loads, and what it must not."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import escape_hw
+
+HEAVY = ["OOPAO", "PySide6", "astropy", "matplotlib", "numba", "numpy", "pyqtgraph", "scipy", "skimage"]
+VENDOR = ["serial", "usb", "ximea", "asdk", "Lib64", "pipython", "rotpy", "gi"]
+
+
+def loaded_by(statement: str) -> set[str]:
+    code = f"{statement}\nimport sys, json; print(json.dumps(sorted(sys.modules)))"
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
+    )
+    return {name.partition(".")[0] for name in json.loads(run.stdout)}
+
+
+def test_importing_the_package_is_cheap() -> None:
+    loaded = loaded_by("import escape_hw")
+    assert "escape_hw" in loaded
+    assert not loaded & {*HEAVY, *VENDOR, "pydantic", "rich", "typer"}
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import escape_hw.runtime.system, escape_hw.bench, escape_hw.config.registry",
+        "import escape_drivers",
+        "import escape_gui",
+    ],
+)
+def test_no_vendor_library_and_no_qt_before_something_opens(statement: str) -> None:
+    assert not loaded_by(statement) & {*VENDOR, "PySide6", "pyqtgraph", "matplotlib", "OOPAO"}
+
+
+def test_public_names_are_listed_and_load() -> None:
+    assert set(escape_hw.__all__) <= set(dir(escape_hw))
+    assert set(escape_hw._HOME) == set(escape_hw.__all__) - {"__version__"}
+    for name in escape_hw.__all__:
+        assert getattr(escape_hw, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'opne_system'"):
+        escape_hw.opne_system  # noqa: B018

@@ -1,0 +1,93 @@
+"""Overrides from the command line."""
+
+import pytest
+
+from escape_hw.config.load import load_system
+from escape_hw.config.overrides import parse_override
+from escape_hw.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("a.b=-16.0", -16.0),
+        ("a.b = 3", 3),
+        ("a.b=true", True),
+        ("a.b=[1, 2]", [1, 2]),
+        ('a.b="x = y"', "x = y"),
+        ("a.b=hardware", "hardware"),
+        ("a.b=/data/my modes.fits", "/data/my modes.fits"),
+        ("a.b=inf", float("inf")),
+    ],
+)
+def test_value_is_toml_or_a_bare_word(text: str, value: object) -> None:
+    override = parse_override(text)
+    assert override.path == ("a", "b")
+    assert override.value == value
+    assert type(override.value) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("loop.gain", "--set  'loop.gain' is not of the form section.key=value"),
+        ("=3", "--set  '=3' is not of the form section.key=value"),
+        ("loop..gain=3", "--set  'loop..gain=3' is not of the form section.key=value"),
+        ("loop.gain=0.4x", "--set  loop.gain: 0.4x  is not a TOML value"),
+        ("loop.gain=", "--set  loop.gain:   is not a TOML value"),
+        ("loop.gain=1\nleak=2", "--set  loop.gain: '1\\nleak=2'  must be one value on one line"),
+    ],
+)
+def test_unreadable_override(text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_override(text)
+    assert str(caught.value).startswith(message)
+
+
+def test_overrides_apply_in_order_and_reach_keys_the_file_leaves_out() -> None:
+    config = load_system(
+        "razor-shwfs",
+        overrides=[
+            "loop.gain=0.1",
+            "loop.gain=0.2",
+            "devices.dm.limits.max_neighbour=0.4",
+            "devices.wfs.options.buffers=8",
+            "devices.wfs.mode=hardware",
+            "twin.registration={shift_x = 5}",
+        ],
+        seed=11,
+        mode="sim",
+    )
+    assert config.loop.gain == 0.2
+    assert config.devices.dm.limits.max_neighbour == 0.4
+    assert config.devices.wfs.options == {"buffers": 8}
+    assert (config.devices.wfs.mode, config.system.mode, config.system.seed) == ("hardware", "sim", 11)
+    assert config.twin.registration.to_registration().to_array().tolist() == [5, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("loop.gian=0.3", "--set  loop.gian: 0.3  unknown key (did you mean 'loop.gain'?)"),
+        ("gain=0.3", "--set  gain: 0.3  unknown key (did you mean 'loop.gain'?)"),
+        ("twin.shift_x=3", "--set  twin.shift_x: 3  unknown key (did you mean 'twin.registration.shift_x'?)"),
+        ("loop.gain.x=3", "--set  loop.gain.x: 3  unknown key (did you mean 'loop.gain'?)"),
+        ("loop.gain=high", '--set  loop.gain: "high"  must be a number (allowed range 0 < x <= 2)'),
+        ("loop=3", "--set  loop: 3  must be a table"),
+        (
+            "system.optics=oopoa",
+            "--set  system.optics: \"oopoa\"  must be 'fast' or 'oopao' (did you mean 'oopao'?)",
+        ),
+    ],
+)
+def test_wrong_override_names_the_key_and_the_nearest(text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_system("razor-shwfs", overrides=[text])
+    assert str(caught.value) == message
+
+
+def test_mode_from_the_command_line_is_checked() -> None:
+    with pytest.raises(
+        ConfigError, match=r"^--mode  system\.mode: \"simulated\"  must be 'sim' or 'hardware'"
+    ):
+        load_system("razor-shwfs", mode="simulated")

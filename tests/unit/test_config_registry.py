@@ -1,0 +1,99 @@
+"""Drivers and models by name."""
+
+import importlib.metadata
+import sys
+from importlib.metadata import EntryPoint, EntryPoints
+from pathlib import Path
+
+import pytest
+
+from escape_hw.config import registry
+from escape_hw.config.load import load_system
+from escape_hw.errors import ConfigError
+
+FACTORY_SOURCE = """
+def make(name, config, shared):
+    return name
+
+LIMIT = 3
+"""
+
+
+@pytest.fixture
+def plug(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package on disk, as somebody else would ship it, and its entry points."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "plug_mirror.py").write_text(FACTORY_SOURCE)
+    (tmp_path / "plug_needy.py").write_text("import a_vendor_library_nobody_has\n")
+    folder = tmp_path / "plug-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: plug\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text(
+        "[escape.devices]\n"
+        "plug-mirror = plug_mirror:make\n"
+        "plug-number = plug_mirror:LIMIT\n"
+        "plug-typo = plug_mirror:mkae\n"
+        "plug-gone = plug_gone.devices:make\n"
+        "plug-needy = plug_needy:make\n"
+        "plug-extra = plug_needy:make [vendor]\n"
+    )
+    for module in ("plug_mirror", "plug_needy"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+
+
+@pytest.mark.usefixtures("plug")
+def test_a_third_party_driver_is_found_by_its_entry_point() -> None:
+    assert "plug-mirror" in registry.available(registry.DEVICES)
+    assert "plug-mirror" not in registry.available(registry.MODELS)
+    factory = registry.device_factory("plug-mirror")
+    assert str(factory("dm", load_system("razor-shwfs"), {})) == "dm"
+
+
+@pytest.mark.usefixtures("plug")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("plug-miror", r"no device driver 'plug-miror' is installed \(did you mean 'plug-mirror'\?"),
+        ("plug-number", r"device driver 'plug-number' of plug is broken: plug_mirror:LIMIT is not callable"),
+        ("plug-typo", r"device driver 'plug-typo' of plug is broken: plug_mirror:mkae does not exist"),
+        ("plug-gone", r"module plug_gone\.devices is not installed .* pip install --force-reinstall plug$"),
+        ("plug-needy", r"needs the Python module 'a_vendor_library_nobody_has'.* pip install 'a_vendor_"),
+        (
+            "plug-extra",
+            r"needs the Python module 'a_vendor_library_nobody_has'.* pip install 'plug\[vendor\]'",
+        ),
+    ],
+)
+def test_what_cannot_be_loaded_says_what_to_do(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        registry.device_factory(name)
+
+
+def test_unknown_model() -> None:
+    with pytest.raises(ConfigError, match="no synthetic model 'slow' is installed"):
+        registry.model_factory("slow")
+
+
+def entries(*found: EntryPoint) -> object:
+    return lambda *, group: EntryPoints(e for e in found if e.group == group)
+
+
+def test_a_name_offered_by_two_packages_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = EntryPoint("twin", "package_one.devices:make", registry.DEVICES)
+    two = EntryPoint("twin", "package_two:make", registry.DEVICES)
+    monkeypatch.setattr(importlib.metadata, "entry_points", entries(one, two))
+    with pytest.raises(ConfigError, match=r"'twin' is offered twice: .*package_one.* and .*package_two"):
+        registry.device_factory("twin")
+
+
+def test_the_same_entry_seen_twice_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = EntryPoint("twin", "math:hypot", registry.DEVICES)
+    monkeypatch.setattr(importlib.metadata, "entry_points", entries(entry, entry))
+    assert registry.device_factory("twin").__name__ == "hypot"
+    assert registry.available(registry.DEVICES) == ("twin",)
+
+
+def test_nothing_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.metadata, "entry_points", entries())
+    with pytest.raises(ConfigError, match="is escape-hw itself installed in this environment"):
+        registry.device_factory("sim-alpao")
