@@ -1,0 +1,1 @@
+"""The calibration engine: pure numerics, and the procedures that move hardware."""

@@ -1,0 +1,186 @@
+"""DO-CRIME: the interaction matrix from random pokes under turbulence (Lai et al. 2020).
+
+The paper's estimator, ``D = <s c^T> <c c^T>^-1``, is the special case of a filter of length one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.results import TemporalResponse
+from escape_hw.calibration.lagged_sums import LaggedSums
+from escape_hw.calibration.telemetry import Telemetry
+from escape_hw.calibration.whitening import prediction_error_filter
+from escape_hw.errors import CalibrationError, TooFewFrames
+
+#: Frames kept to fit the whitening filter before the sums start.
+BURN_IN = 1000
+#: Frames gathered before the sums are updated: large enough for matrix products to be efficient.
+BLOCK = 256
+#: Degrees of freedom without which no standard error is worth stating.
+MIN_FREEDOM = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DocrimeSolution:
+    """A solved DO-CRIME run.
+
+    Parameters
+    ----------
+    matrix, sigma
+        ``(n_slopes, n_modes)``: slopes per unit mode, and standard errors.
+    covariance
+        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``.
+    whitener
+        The filter used, ``[1]`` for the plain estimator.
+    """
+
+    matrix: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    response: TemporalResponse
+    covariance: NDArray[np.float64]
+    whitener: NDArray[np.float64]
+    frames: int
+    lost_frames: int
+
+
+class DocrimeEstimator:
+    """Streaming DO-CRIME estimator with bounded memory.
+
+    Parameters
+    ----------
+    n_slopes, n_modes
+        Sizes.
+    order
+        Past frames that predict the turbulence; 0 is the paper's plain estimator.
+    lags
+        Frames over which the temporal response is estimated.
+    """
+
+    def __init__(self, n_slopes: int, n_modes: int, *, order: int = 6, lags: int = 5) -> None:
+        if order < 0 or lags < 1:
+            raise ValueError(f"order is {order} and lags {lags}; they must be at least 0 and 1")
+        self.n_slopes, self.n_modes, self.order, self.lags = n_slopes, n_modes, order, lags
+        self._index: list[int] = []
+        self._slopes: list[NDArray[np.float32]] = []
+        self._pokes: list[NDArray[np.float64]] = []
+        self._data: Telemetry | None = None
+        self._last_index: int | None = None
+        self._whitener: NDArray[np.float64] | None = None
+        self._sums = LaggedSums.zeros(n_slopes, n_modes, lags)
+        self.frames = self.lost_frames = 0
+
+    def partial_fit(
+        self, index: int, slopes: NDArray[np.float32], poke: NDArray[np.float64]
+    ) -> DocrimeEstimator:
+        """Take one frame and the poke that was sent when it had arrived.
+
+        Parameters
+        ----------
+        index
+            Frame index; it must rise. A gap loses the pairs that it touches and shifts none.
+        slopes
+            ``(n_slopes,)``.
+        poke
+            ``(n_modes,)``, as it really was sent.
+
+        Raises
+        ------
+        ValueError
+            Wrong shape, not finite, or an index that does not rise.
+        """
+        if slopes.shape != (self.n_slopes,) or poke.shape != (self.n_modes,):
+            raise ValueError(
+                f"slopes {slopes.shape} and poke {poke.shape} do not fit ({self.n_slopes},) and ({self.n_modes},)"
+            )
+        if not (np.isfinite(slopes).all() and np.isfinite(poke).all()):
+            raise ValueError(f"frame {index}: slopes or poke are not finite")
+        previous = self._index[-1] if self._index else self._last_index
+        if previous is not None and index <= previous:
+            raise ValueError(f"frame index went from {previous} to {index}; it must rise")
+        self._index.append(index)
+        self._slopes.append(slopes)
+        self._pokes.append(poke)
+        if len(self._index) >= (BURN_IN if self._whitener is None else BLOCK):
+            self._absorb()
+        return self
+
+    def solve(self) -> DocrimeSolution:
+        """The matrix, its standard errors and the temporal response so far.
+
+        Raises
+        ------
+        TooFewFrames
+            Fewer complete frames than modes plus a margin; says how many are needed.
+        CalibrationError
+            The mirror does not respond, or the pokes do not span the modes.
+        """
+        self._absorb()
+        needed = self.n_modes + self.lags + MIN_FREEDOM
+        if self._whitener is None or self._sums.count < needed:
+            raise TooFewFrames(
+                f"{self._sums.count} complete frames cannot constrain {self.n_modes} modes; "
+                f"at least {needed + self.order + self.lags} frames are needed"
+            )
+        sums = self._sums.centred()
+        if np.linalg.cond(sums.gram[0, :, 0, :]) > 1e12:
+            raise CalibrationError(
+                "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
+            )
+        response = sums.fit_response()
+        matrix, gram = sums.solve(response.weights)
+        freedom = sums.count - self.n_modes - self.lags
+        covariance = sums.residual_power(matrix, response.weights) / freedom
+        variance = np.maximum(np.diag(covariance), 0.0)
+        sigma = np.sqrt(np.outer(variance, np.diag(np.linalg.inv(gram))))
+        return DocrimeSolution(
+            matrix, sigma, response, covariance, self._whitener, self.frames, self.lost_frames
+        )
+
+    def _absorb(self) -> None:
+        """Move the gathered frames into the sums; fit the filter first if there is none yet."""
+        if not self._index:
+            return
+        fresh = Telemetry.from_frames(
+            np.array(self._index, dtype=np.int64), np.stack(self._slopes), np.stack(self._pokes)
+        )
+        self.frames += len(self._index)
+        self.lost_frames += fresh.n_lost
+        start, gap = 0, 0
+        if self._data is not None and self._last_index is not None:
+            gap = self._index[0] - self._last_index - 1
+            self.lost_frames += gap
+            start = self._data.present.size
+            # A gap longer than the memory of filter and response separates the stretches for good.
+            fresh = self._data.followed_by(fresh, min(gap, 2 * (self.order + self.lags)))
+        self._last_index = self._index[-1]
+        self._index, self._slopes, self._pokes = [], [], []
+        if self._whitener is None:
+            self._whitener = self._fit_whitener(fresh)
+        self._sums.add(fresh, self._whitener, start)
+        self._data = fresh.tail(2 * self.order + self.lags)
+
+    def _fit_whitener(self, data: Telemetry) -> NDArray[np.float64]:
+        """Filter from the residuals of two rounds of regression, frame differences first."""
+        if self.order == 0:
+            return np.ones(1)
+        whitener = np.array([1.0, -1.0])
+        for _ in range(2):
+            sums = LaggedSums.zeros(self.n_slopes, self.n_modes, self.lags)
+            sums.add(data, whitener)
+            if sums.count < self.n_modes + self.lags + MIN_FREEDOM:
+                return np.array([1.0, -1.0])
+            sums = sums.centred()
+            weights = sums.fit_response().weights
+            matrix = sums.solve(weights)[0]
+            at = data.complete(0, self.lags)
+            seen = sum(w * data.pokes[at - lag] for lag, w in enumerate(weights))
+            residuals = np.zeros_like(data.slopes)
+            residuals[at] = data.slopes[at] - seen @ matrix.T
+            usable = np.zeros_like(data.present)
+            usable[at] = True
+            whitener = prediction_error_filter(residuals, usable, self.order)
+        return whitener
