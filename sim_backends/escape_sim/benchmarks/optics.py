@@ -96,7 +96,9 @@ def oopao_frame(config: SystemConfig) -> Callable[[], object]:
     telescope, source = light.telescope, light.source
     with quiet():
         # As many photons per frame as the twin has.
-        telescope.pupilReflectivity = telescope.pupilReflectivity * (config.twin.wfs.photons_per_frame / power)
+        telescope.pupilReflectivity = telescope.pupilReflectivity * (
+            config.twin.wfs.photons_per_frame / power
+        )
         telescope.samplingTime = 1 / config.devices.wfs.frame_rate_hz
         telescope.pupilReflectivity *= config.devices.wfs.frame_rate_hz
         screen = config.devices.screen
