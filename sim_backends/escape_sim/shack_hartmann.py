@@ -82,7 +82,8 @@ def lenslet_transform(
     """
     pixels = first_px[:, None] + np.arange(field)[None, :] - centres_px[:, None]
     samples = (np.arange(n_pix) - (n_pix - 1) / 2) / n_pix
-    phase = 2j * np.pi * samples[None, :, None] * pixels[:, None, :] / spot_px
+    # The minus sign makes a positive slope of the path move the spot to higher pixels, as in OOPAO.
+    phase = -2j * np.pi * samples[None, :, None] * pixels[:, None, :] / spot_px
     return np.exp(phase) / np.sqrt(n_pix * spot_px)
 
 

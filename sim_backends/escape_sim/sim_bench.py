@@ -242,16 +242,17 @@ class SimBench:
             (width - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[0],
             (height - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[1],
         )
+        amplitude = self.pupil.amplitude / np.sqrt(np.sum(np.square(self.pupil.amplitude, dtype=float)))
+        geometry = (
+            n_sub, self.pupil.n_pix, c.system.wavelength_m, pitch, c.sensor.spot_px, origin, (height, width),
+            amplitude.astype(np.float32),
+        )  # fmt: skip
         if c.system.optics == "oopao":
             # Imported here: OOPAO loads for two seconds and 1,600 modules.
             from escape_sim.oopao_optics import OOPAOShackHartmann
 
-            return OOPAOShackHartmann(c, self.pupil, origin)
-        amplitude = self.pupil.amplitude / np.sqrt(np.sum(np.square(self.pupil.amplitude, dtype=float)))
-        return ShackHartmannOptics(
-            n_sub, self.pupil.n_pix, c.system.wavelength_m, pitch, c.sensor.spot_px, origin, (height, width),
-            amplitude.astype(np.float32),
-        )  # fmt: skip
+            return OOPAOShackHartmann(*geometry)
+        return ShackHartmannOptics(*geometry)
 
     def _plate(self) -> RotatingScreen:
         number = self.screen_number
