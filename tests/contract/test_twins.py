@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import cache, partial
 from typing import Any
 
-from escape_hw.config.models import SystemConfig
 from escape_hw.config.load import load_system
+from escape_hw.config.models import SystemConfig
 from escape_hw.testing import Check, Factory, parametrize_device_checks
 from escape_sim import devices
 
