@@ -34,7 +34,7 @@ app.command("report")(products.report)
 @app.command("perf", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def perf(
     context: typer.Context,
-    stages: Annotated[list[str] | None, typer.Argument(help="Stages to measure [default: all].")] = None,
+    stages: Annotated[list[str] | None, typer.Argument(help="Stages to measure (default: all).")] = None,
 ) -> None:
     """Measure speed against OOPAO and pyRTC; one row per measurement."""
     # The benchmarks bring their own options and heavy imports.

@@ -181,7 +181,13 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
     product = load_matrix(im, expect_system=config.system.name, expect_actuators=config.devices.dm.n_act)
     measured = product.result.measured or product.matrix
     model = model_factory(config.calibration.model)(config, product.grid)
-    estimate = sprint(measured, model, learning_rate=config.calibration.learning_rate)
+    settings = config.calibration
+    estimate = sprint(
+        measured,
+        model,
+        modes=min(settings.sprint_modes, measured.n_modes),
+        learning_rate=settings.learning_rate,
+    )
     result = replace(product.result, matrix=measured, measured=None, registration=estimate)
     origin = replace(config_record(config), parents={im.name: product.sha256})
     folder.add("im", save_matrix(folder.file("im.fits"), result, origin))
