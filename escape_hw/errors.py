@@ -24,8 +24,12 @@ class DeviceError(EscapeError):
     exit_code = 3
 
     def __init__(self, device: str, message: str) -> None:
-        super().__init__(f"{device}: {message}")
+        # Both stay in ``args``: that is what lets the error cross to another process.
+        super().__init__(device, message)
         self.device = device
+
+    def __str__(self) -> str:
+        return f"{self.args[0]}: {self.args[1]}"
 
 
 class NotOpen(DeviceError):

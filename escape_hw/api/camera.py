@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import abc
+import math
+from dataclasses import astuple
 from typing import final
+
+import numpy as np
 
 from escape_hw.api.device import Device
 from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, FrameStatus
@@ -50,6 +54,8 @@ class Camera(Device):
         self.require_open()
         rows, columns = self.info.sensor_shape
         region = want.region
+        if not all(isinstance(v, int | np.integer) for v in astuple(region)):
+            raise SettingRejected(self.name, f"region {region} must be in whole pixels")
         if (
             min(region.x, region.y) < 0
             or min(region.width, region.height) < 1
@@ -60,8 +66,12 @@ class Camera(Device):
                 self.name, f"region {region} does not lie on the sensor of {columns} x {rows} pixels"
             )
         for name in ("exposure_s", "frame_rate_hz"):
-            if not getattr(want, name) > 0:
-                raise SettingRejected(self.name, f"{name} is {getattr(want, name)}; it must be positive")
+            if not 0 < getattr(want, name) < math.inf:
+                raise SettingRejected(
+                    self.name, f"{name} is {getattr(want, name)}; it must be positive and finite"
+                )
+        if not math.isfinite(want.gain_db):
+            raise SettingRejected(self.name, f"gain_db is {want.gain_db}; it must be finite")
         return self._check(want)
 
     @final
@@ -72,6 +82,13 @@ class Camera(Device):
         -------
         CameraSettings
             What the hardware really does, never what was asked.
+
+        Raises
+        ------
+        SettingRejected
+            See :meth:`check`; the camera goes on as it was.
+        DeviceError
+            The device failed on the way; acquisition is stopped.
         """
         achievable = self.check(want)
         running = self._running
@@ -100,7 +117,7 @@ class Camera(Device):
 
     @final
     def next_frame(self, timeout_s: float = 1.0) -> Frame:
-        """Wait for the next frame.
+        """Wait for the next frame; starts acquisition when needed.
 
         Parameters
         ----------
@@ -113,16 +130,42 @@ class Camera(Device):
             No frame in time.
         DeviceLost
             The camera has gone.
+        DeviceError
+            The frame counter did not rise.
         """
         self.require_open()
-        if not timeout_s > 0:
-            raise SettingRejected(self.name, f"timeout_s is {timeout_s}; it must be positive")
+        if not 0 < timeout_s < math.inf:
+            raise SettingRejected(self.name, f"timeout_s is {timeout_s}; it must be positive and finite")
         self.start()
         try:
             frame = self._next_frame(timeout_s)
         except FrameTimeout:
             self._timeouts += 1
             raise
+        return self._accept(frame)
+
+    @final
+    def poll(self) -> Frame | None:
+        """The next frame if one has arrived already, else ``None``; starts acquisition when needed.
+
+        This is how a loop reads a slower camera on its way without waiting for it. An empty poll
+        counts as no time-out.
+
+        Raises
+        ------
+        DeviceLost
+            The camera has gone.
+        """
+        self.require_open()
+        self.start()
+        frame = self._poll()
+        return None if frame is None else self._accept(frame)
+
+    def _accept(self, frame: Frame) -> Frame:
+        if not isinstance(frame, Frame):
+            raise DeviceError(
+                self.name, f"delivered {type(frame).__name__} for a frame; this is a defect of its driver"
+            )
         if self._last_index is not None:
             if frame.index <= self._last_index:
                 raise DeviceError(
@@ -160,4 +203,15 @@ class Camera(Device):
 
     @abc.abstractmethod
     def _next_frame(self, timeout_s: float) -> Frame:
-        """Deliver the next frame or raise :class:`FrameTimeout`."""
+        """Deliver the next frame or raise :class:`FrameTimeout`.
+
+        The frame's array is never written to again: a buffer that the driver will reuse must be
+        copied first.
+        """
+
+    def _poll(self) -> Frame | None:
+        """Deliver a frame that has already arrived, or ``None``; by default a very short wait."""
+        try:
+            return self._next_frame(1e-6)
+        except FrameTimeout:
+            return None

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import abc
+import logging
+import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self, final
 
 from escape_hw.errors import NotOpen
 
+log = logging.getLogger(__name__)
+
 
 class Device(abc.ABC):
     """A device that is opened, used and closed; usable as a context manager.
 
-    ``open`` and ``close`` may be called any number of times. Nothing happens on garbage
-    collection, and no vendor library is loaded before ``open``. Drivers fill in ``_open`` and
-    ``_close``.
+    ``open`` and ``close`` may be called any number of times, from any thread. Nothing happens on
+    garbage collection, and no vendor library is loaded before ``open``. Drivers fill in ``_open``
+    and ``_close``.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
         self._is_open = False
+        #: Held while the connection changes, and by the kinds that must not be closed mid-transfer.
+        self._lock = threading.RLock()
 
     @property
     def is_open(self) -> bool:
@@ -36,25 +43,46 @@ class Device(abc.ABC):
         DeviceError
             The device cannot be reached; nothing is left half open.
         """
-        if not self._is_open:
+        with self._lock:
+            if self._is_open:
+                return self
             try:
                 self._open()
-            except BaseException:
-                self._abandon()
+            except BaseException as cause:
+                self._tidy(self._abandon, cause)
                 raise
             self._is_open = True
-            self._after_open()
+            try:
+                self._after_open()
+            except BaseException as cause:
+                self._is_open = False
+                self._tidy(self._close, cause)
+                raise
         return self
 
     @final
     def close(self) -> None:
-        """Leave the device safe and disconnect; does nothing when already closed."""
-        if self._is_open:
+        """Leave the device safe and disconnect; does nothing when already closed.
+
+        The connection is closed even when the device cannot be left safe any more.
+
+        Raises
+        ------
+        DeviceError
+            The device could not be left safe (a mirror that was lost is not flat), or did not
+            disconnect. It counts as closed all the same.
+        """
+        with self._lock:
+            if not self._is_open:
+                return
             try:
                 self._before_close()
-            finally:
+            except BaseException as cause:
                 self._is_open = False
-                self._close()
+                self._tidy(self._close, cause)
+                raise
+            self._is_open = False
+            self._close()
 
     def __enter__(self) -> Self:
         return self.open()
@@ -62,7 +90,10 @@ class Device(abc.ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+        else:
+            self._tidy(self.close, error)
 
     def require_open(self) -> None:
         """Raise :class:`NotOpen` unless the device is open."""
@@ -72,6 +103,14 @@ class Device(abc.ABC):
     def now_ns(self) -> int:
         """The device's monotonic clock in nanoseconds (a twin's clock is simulated)."""
         return time.monotonic_ns()
+
+    def _tidy(self, step: Callable[[], None], cause: BaseException) -> None:
+        """Take a last step after a failure; if it fails too, the first cause stays the news."""
+        try:
+            step()
+        except Exception as second:
+            log.warning("further failure while clearing up: %s: %s", type(second).__name__, second)
+            cause.add_note(f"and then, while clearing up: {type(second).__name__}: {second}")
 
     @abc.abstractmethod
     def _open(self) -> None:

@@ -15,7 +15,7 @@ class Frame:
     Parameters
     ----------
     data
-        Counts ``(rows, columns)``, uint16, read-only.
+        Counts ``(rows, columns)``, uint16, read-only, and not overwritten by later frames.
     index
         The device's own frame counter; a step larger than one is a lost frame.
     exposed_ns, arrived_ns

@@ -44,6 +44,8 @@ class InteractionMatrix:
     slope_unit: str = "pixel"
 
     def __post_init__(self) -> None:
+        if self.data.ndim != 2:
+            raise ValueError(f"the matrix has shape {self.data.shape}; it must be (n_slopes, n_modes)")
         n_slopes, n_modes = self.data.shape
         if self.sigma.shape != self.data.shape:
             raise ValueError(f"sigma has shape {self.sigma.shape}, the matrix {self.data.shape}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 from dataclasses import dataclass
 from typing import final
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from escape_hw.api.device import Device
-from escape_hw.errors import CommandRejected
+from escape_hw.errors import CommandRejected, DeviceError, SettingRejected
 from escape_hw.safety.guard import CommandGuard, GuardReport
 from escape_hw.safety.limits import MirrorLimits, neighbour_pairs
 
@@ -25,7 +26,8 @@ class DMInfo:
         Boolean map ``(rows, columns)``, true where an actuator stands (numbered row by row), or
         ``None`` when the actuators do not stand on a grid.
     positions_m
-        Actuator positions ``(n_act, 2)`` as (x, y) in metres on the mirror, from its centre.
+        Actuator positions ``(n_act, 2)`` as (x, y) in metres on the mirror, from its centre; x
+        rises along the columns of the layout, y along its rows.
     stroke_m
         Metres of surface at the actuator for a command of 1.
     """
@@ -41,7 +43,7 @@ class DMInfo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SendReport:
-    """What became of one command: the shape sent, when, and what the guard did to it."""
+    """What became of one command: the shape sent (read-only), when, and what the guard did to it."""
 
     sent: NDArray[np.float64]
     sent_ns: int
@@ -52,7 +54,8 @@ class DeformableMirror(Device):
     """A deformable mirror. Commands are float64 ``(n_act,)``, fractions of full stroke.
 
     ``send`` is final: every command passes the :class:`~escape_hw.safety.guard.CommandGuard`.
-    Drivers fill in ``_open``, ``_close``, ``_send`` and set ``info`` in ``_open``.
+    Drivers fill in ``_open``, ``_close``, ``_send`` and set ``info`` in ``_open``. Closing ramps
+    to the flat shape first. The counters count from ``open``.
     """
 
     #: Largest step of the ramp that ``flatten`` uses, fraction of full stroke.
@@ -66,6 +69,7 @@ class DeformableMirror(Device):
         self.rejected_count = 0
         self._flat: NDArray[np.float64] | None = None
         self._guard: CommandGuard | None = None
+        self._shape_known = False
 
     @property
     @abc.abstractmethod
@@ -79,13 +83,13 @@ class DeformableMirror(Device):
 
     @property
     def flat(self) -> NDArray[np.float64]:
-        """The command that ``flatten`` ends at, ``(n_act,)``; zeros unless set."""
-        n_act = self.info.n_act
+        """The command that ``flatten`` ends at, ``(n_act,)`` (a copy); zeros unless set."""
+        n_act = self._checked().n_act
         return np.zeros(n_act) if self._flat is None else self._flat.copy()
 
     @final
     def set_flat(self, command: ArrayLike) -> None:
-        """Choose the command that stands for a flat mirror.
+        """Choose the command that stands for a flat mirror; nothing moves before ``flatten``.
 
         Raises
         ------
@@ -94,8 +98,9 @@ class DeformableMirror(Device):
         """
         guard = self._checked()
         wanted = guard.validate(command)
-        if np.abs(wanted).max(initial=0.0) > self.limits.max_stroke:
-            raise CommandRejected(self.name, f"flat exceeds max_stroke = {self.limits.max_stroke}")
+        breach = guard.breach(wanted)
+        if breach is not None:
+            raise CommandRejected(self.name, f"flat refused: {breach}")
         self._flat = wanted
 
     @final
@@ -110,60 +115,88 @@ class DeformableMirror(Device):
         Returns
         -------
         SendReport
-            The shape that was really sent and what the guard changed.
+            The shape that was really sent (read-only) and what the guard changed.
 
         Raises
         ------
         CommandRejected
             Malformed or not finite: nothing is sent and the last shape stays.
         NotOpen, DeviceError
-            The mirror is not connected or the transfer failed.
+            The mirror is not connected or the transfer failed; the last shape stays.
         """
-        guard = self._checked()
-        previous = guard.last
-        try:
-            safe, report = guard(command)
-        except CommandRejected:
-            self.rejected_count += 1
-            raise
-        try:
+        # The slew rule holds between what reached the mirror, so no other command may slip in.
+        with self._lock:
+            guard = self._checked()
+            try:
+                safe, report = guard.limit(command)
+            except CommandRejected:
+                self.rejected_count += 1
+                raise
             self._send(safe)
-        except BaseException:
-            guard.last = previous
-            raise
-        self.sent_count += 1
-        self.clipped_count += report.clipped
-        return SendReport(safe, self.now_ns(), report)
+            guard.accept(safe)
+            self._shape_known = True
+            self.sent_count += 1
+            self.clipped_count += report.clipped
+            return SendReport(safe, self.now_ns(), report)
 
     @final
     def flatten(self) -> None:
-        """Ramp to the flat shape in steps of at most :data:`RAMP_STEP`; legal whenever open."""
-        guard = self._checked()
-        target = self.flat
-        step = min(self.RAMP_STEP, self.limits.max_slew or 1.0)
-        for _ in range(1 + int(np.ceil(4.0 / step))):
-            move = target - guard.last
-            largest = float(np.abs(move).max(initial=0.0))
-            if largest == 0.0:
-                break
-            self.send(target if largest <= step else guard.last + move * (step / largest))
-        if not guard.last.any() and self.sent_count == 0:
-            self.send(target)
+        """Ramp to the flat shape in steps of at most :data:`RAMP_STEP`; legal whenever open.
+
+        Raises
+        ------
+        NotOpen, DeviceError
+            The mirror is not connected, or did not arrive.
+        """
+        with self._lock:
+            guard = self._checked()
+            target = self.flat
+            step = min(self.RAMP_STEP, self.limits.max_slew or self.RAMP_STEP)
+            distance = float(np.abs(target - guard.last).max(initial=0.0))
+            # Twice the straight way: a mirror found in an illegal shape takes detours.
+            for _ in range(2 + 2 * math.ceil(distance / step)):
+                move = target - guard.last
+                largest = float(np.abs(move).max(initial=0.0))
+                if largest == 0.0 and self._shape_known:
+                    return
+                self.send(target if largest <= step else guard.last + move * (step / largest))
+            if not np.array_equal(target, guard.last):
+                raise DeviceError(
+                    self.name, "did not reach its flat shape; check max_slew against the flat and the limits"
+                )
 
     def _checked(self) -> CommandGuard:
         self.require_open()
         if self._guard is None:
-            raise CommandRejected(self.name, "has no guard; this is a defect of its driver")
+            raise DeviceError(self.name, "has no guard; its driver must not override _after_open")
         return self._guard
 
     def _after_open(self) -> None:
         info = self.info
+        if info.layout is not None and int(info.layout.sum()) != info.n_act:
+            raise DeviceError(
+                self.name, f"its layout has {int(info.layout.sum())} places for {info.n_act} actuators"
+            )
         pairs = None if info.layout is None else neighbour_pairs(info.layout)
-        self._guard = CommandGuard(self.name, info.n_act, self.limits, pairs)
+        try:
+            guard = CommandGuard(self.name, info.n_act, self.limits, pairs)
+        except ValueError as error:
+            raise SettingRejected(self.name, f"its limits do not fit it: {error}") from error
+        present = self._present_shape()
+        guard.reset(present)
+        self._guard, self._shape_known = guard, present is not None
+        self.sent_count = self.clipped_count = self.rejected_count = 0
 
     def _before_close(self) -> None:
         self.flatten()
 
+    def _present_shape(self) -> NDArray[np.float64] | None:
+        """The shape ``(n_act,)`` that the mirror has when opened, if it can tell.
+
+        ``None`` means unknown: it is taken for zeros, and ``flatten`` always sends.
+        """
+        return None
+
     @abc.abstractmethod
     def _send(self, command: NDArray[np.float64]) -> None:
-        """Transfer a guarded, C-contiguous float64 command ``(n_act,)``."""
+        """Transfer a guarded, C-contiguous, read-only float64 command ``(n_act,)``."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import abc
+import math
 from dataclasses import dataclass
 from typing import final
 
 from escape_hw.api.device import Device
-from escape_hw.errors import SettingRejected
+from escape_hw.errors import DeviceError, SettingRejected
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,26 +21,61 @@ class Modulation:
 
 
 class TipTiltModulator(Device):
-    """A tip-tilt stage that turns the beam in a circle; parks at its centre when stopped."""
+    """A tip-tilt stage that turns the beam in a circle; parks at its centre when stopped.
+
+    Drivers fill in ``_open``, ``_close``, ``_check``, ``_modulate``, ``_park`` and
+    ``modulation``. Closing parks first.
+    """
+
+    @property
+    @abc.abstractmethod
+    def modulation(self) -> Modulation | None:
+        """The modulation in force, as read back from the stage; ``None`` when parked."""
 
     @final
     def check(self, want: Modulation) -> Modulation:
-        """The nearest modulation the stage can do (its clock quantises the frequency)."""
+        """The nearest modulation the stage can do (its clock quantises the frequency); changes nothing.
+
+        Raises
+        ------
+        SettingRejected
+            Nothing near ``want`` is possible; the message gives the allowed range.
+        """
         self.require_open()
-        if want.radius_rad < 0 or not want.frequency_hz > 0:
-            raise SettingRejected(self.name, f"{want}: radius must be >= 0 and frequency positive")
+        if not (0 <= want.radius_rad < math.inf and 0 < want.frequency_hz < math.inf):
+            raise SettingRejected(
+                self.name, f"{want}: radius must be >= 0 and frequency positive, both finite"
+            )
+        if not all(map(math.isfinite, want.centre_rad)):
+            raise SettingRejected(self.name, f"{want}: the centre must be finite")
         return self._check(want)
 
     @final
     def modulate(self, want: Modulation) -> Modulation:
-        """Start modulating; returns what the stage really does."""
+        """Start modulating, or change the modulation.
+
+        Returns
+        -------
+        Modulation
+            What the stage really does, never what was asked.
+
+        Raises
+        ------
+        SettingRejected
+            See :meth:`check`; the stage goes on as it was.
+        DeviceError
+            The stage did not start.
+        """
         achievable = self.check(want)
         self._modulate(achievable)
-        return achievable
+        reached = self.modulation
+        if reached is None:
+            raise DeviceError(self.name, f"does not move although it was told to do {achievable}")
+        return reached
 
     @final
     def park(self) -> None:
-        """Stop modulating and go to the centre."""
+        """Stop modulating and go to the centre; may be repeated."""
         self.require_open()
         self._park()
 

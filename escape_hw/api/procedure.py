@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import FrameType
 from typing import TypeVar
 
 import numpy as np
@@ -17,6 +20,9 @@ from escape_hw.errors import Aborted
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+
+#: How long a procedure may clear up after it was aborted, in wall-clock seconds.
+GRACE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,8 +58,10 @@ class Progress:
 
     @property
     def remaining_s(self) -> float:
-        """Estimated wall-clock seconds left in this stage."""
-        return self.elapsed_s * (self.total - self.done) / self.done if self.done else float("nan")
+        """Estimated wall-clock seconds left in this stage; NaN before the first step."""
+        if not self.done:
+            return float("nan")
+        return self.elapsed_s * max(0, self.total - self.done) / self.done
 
 
 Procedure = Generator[Progress, None, T]
@@ -93,7 +101,13 @@ def run(
     """Drive a procedure to its end and return its result.
 
     The procedure is responsible for leaving the mirror flat (``finally``); the runner makes sure
-    that it gets the chance: an abort or Ctrl-C is thrown into it as :class:`Aborted`.
+    that it gets the chance. To stop it, :class:`Aborted` is thrown into it **once**, between two
+    steps, so that no transfer to a device is cut in half. It may return what it has, raise, or
+    yield a little longer while it clears up; after :data:`GRACE_S` it is closed whether it likes
+    it or not, its ``finally`` clauses included.
+
+    Ctrl-C stops it in the same way when this is the main thread and nobody has installed another
+    handler. A second Ctrl-C interrupts at once, for a procedure that hangs inside a step.
 
     Parameters
     ----------
@@ -109,26 +123,85 @@ def run(
     Aborted
         Stopped by ``abort`` or Ctrl-C; carries the partial result when the procedure made one.
     """
-    watching = list(observers)
-    stop = False
+    interrupted = threading.Event()
+    try:
+        with _ctrl_c_sets(interrupted):
+            return _drive(procedure, list(observers), abort or threading.Event(), interrupted)
+    except KeyboardInterrupt:
+        raise Aborted("interrupted by Ctrl-C") from None
+    finally:
+        _close(procedure)
+
+
+def _drive(
+    procedure: Procedure[T],
+    watching: list[Observer],
+    abort: threading.Event,
+    interrupted: threading.Event,
+) -> T:
+    deadline = None
     while True:
+        throw = deadline is None and (abort.is_set() or interrupted.is_set())
         try:
-            progress = procedure.throw(Aborted()) if stop else next(procedure)
+            if throw:
+                deadline = time.monotonic() + GRACE_S
+                progress = procedure.throw(_aborted(interrupted))
+            else:
+                progress = next(procedure)
         except StopIteration as done:
             result: T = done.value
-            if stop:
-                raise Aborted(partial=result) from None
+            if deadline is not None:
+                raise _aborted(interrupted, partial=result) from None
             return result
-        except KeyboardInterrupt:
-            # Raised inside the generator: its finally clauses have already run.
-            raise Aborted("interrupted by Ctrl-C") from None
+        if deadline is not None and time.monotonic() > deadline:
+            log.error("the procedure went on for %g s after it was aborted; it is closed", GRACE_S)
+            raise _aborted(interrupted)
         try:
-            for observer in tuple(watching):
-                try:
-                    observer(progress)
-                except Exception:
-                    log.exception("observer %r failed and is dropped", observer)
-                    watching.remove(observer)
+            _tell(watching, progress)
         except KeyboardInterrupt:
-            stop = True
-        stop = stop or (abort is not None and abort.is_set())
+            interrupted.set()
+
+
+def _tell(watching: list[Observer], progress: Progress) -> None:
+    for observer in tuple(watching):
+        try:
+            observer(progress)
+        except Exception:
+            log.exception("observer %r failed and is dropped", observer)
+            watching.remove(observer)
+
+
+def _aborted(interrupted: threading.Event, partial: object = None) -> Aborted:
+    if interrupted.is_set():
+        return Aborted("interrupted by Ctrl-C", partial)
+    return Aborted(partial=partial)
+
+
+def _close(procedure: Procedure[T]) -> None:
+    """Run what is left of the procedure's clean-up; does nothing when it has ended."""
+    try:
+        procedure.close()
+    except RuntimeError:
+        log.exception("the procedure refuses to be closed; is the mirror flat?")
+
+
+@contextmanager
+def _ctrl_c_sets(event: threading.Event) -> Iterator[None]:
+    """Let the first Ctrl-C set ``event``, and the next one interrupt as usual.
+
+    Leaves alone what another thread or the application has arranged.
+    """
+    ours = threading.current_thread() is threading.main_thread()
+    if not ours or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def first(signum: int, frame: FrameType | None) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    signal.signal(signal.SIGINT, first)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

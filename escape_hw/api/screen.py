@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import abc
+import math
 from dataclasses import dataclass
 from typing import final
+
+import numpy as np
 
 from escape_hw.api.device import Device
 from escape_hw.errors import SettingRejected
@@ -14,8 +17,8 @@ from escape_hw.errors import SettingRejected
 class ScreenState:
     """State of the phase screen: number of the screen, in or out of the beam, speed.
 
-    ``speed_m_s`` is the speed of the screen across the pupil in metres per second. ``blocked`` is
-    true while a beam stop is in place, for dark frames.
+    Screens are counted from 0. ``speed_m_s`` is the speed of the screen across the pupil in metres
+    per second. ``blocked`` is true while a beam stop is in place, for dark frames.
     """
 
     screen: int
@@ -51,7 +54,29 @@ class PhaseScreen(Device):
         speed_m_s: float | None = None,
         blocked: bool | None = None,
     ) -> ScreenState:
-        """Change what is given, keep the rest; returns the state reached."""
+        """Change what is given, keep the rest.
+
+        Parameters
+        ----------
+        screen
+            Number of the screen, counted from 0.
+        inserted
+            Into the beam, or out of it.
+        speed_m_s
+            Speed across the pupil in metres per second, 0 to stop it.
+        blocked
+            Put the beam stop in, or take it out.
+
+        Returns
+        -------
+        ScreenState
+            The state reached.
+
+        Raises
+        ------
+        SettingRejected
+            No such screen, or a value out of range; nothing is changed.
+        """
         self.require_open()
         now = self.state
         want = ScreenState(
@@ -60,10 +85,18 @@ class PhaseScreen(Device):
             now.speed_m_s if speed_m_s is None else speed_m_s,
             now.blocked if blocked is None else blocked,
         )
+        if isinstance(want.screen, bool) or not isinstance(want.screen, int | np.integer):
+            raise SettingRejected(self.name, f"screen is {want.screen!r}; it must be a whole number")
+        if not isinstance(want.inserted, bool | np.bool_):
+            raise SettingRejected(self.name, f"inserted is {want.inserted!r}; it must be true or false")
+        if not isinstance(want.blocked, bool | np.bool_):
+            raise SettingRejected(self.name, f"blocked is {want.blocked!r}; it must be true or false")
         if not 0 <= want.screen < self.n_screens:
             raise SettingRejected(self.name, f"screen {want.screen} is not one of 0..{self.n_screens - 1}")
-        if not want.speed_m_s >= 0:
-            raise SettingRejected(self.name, f"speed_m_s is {want.speed_m_s}; it must not be negative")
+        if not 0 <= want.speed_m_s < math.inf:
+            raise SettingRejected(
+                self.name, f"speed_m_s is {want.speed_m_s}; it must be finite and not negative"
+            )
         self._set(want)
         return self.state
 

@@ -22,6 +22,7 @@ BURN_IN = 1000
 BLOCK = 256
 #: Degrees of freedom without which no standard error is worth stating.
 MIN_FREEDOM = 20
+_ONE = np.ones(1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +71,8 @@ class DocrimeEstimator:
         self._data: Telemetry | None = None
         self._last_index: int | None = None
         self._whitener: NDArray[np.float64] | None = None
-        self._sums = LaggedSums.zeros(n_slopes, n_modes, lags)
+        self._response: TemporalResponse | None = None
+        self._sums = LaggedSums.zeros(n_slopes, n_modes, 1)
         self.frames = self.lost_frames = 0
 
     def partial_fit(
@@ -104,7 +106,7 @@ class DocrimeEstimator:
         self._index.append(index)
         self._slopes.append(slopes)
         self._pokes.append(poke)
-        if len(self._index) >= (BURN_IN if self._whitener is None else BLOCK):
+        if len(self._index) >= (BURN_IN if self._response is None else BLOCK):
             self._absorb()
         return self
 
@@ -126,18 +128,17 @@ class DocrimeEstimator:
                 f"at least {needed + self.order + self.lags} frames are needed"
             )
         sums = self._sums.centred()
-        if np.linalg.cond(sums.gram[0, :, 0, :]) > 1e12:
+        if self._response is None or np.linalg.cond(sums.gram[0, :, 0, :]) > 1e12:
             raise CalibrationError(
                 "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
             )
-        response = sums.fit_response()
-        matrix, gram = sums.solve(response.weights)
+        matrix, gram = sums.solve(_ONE)
         freedom = sums.count - self.n_modes - self.lags
-        covariance = sums.residual_power(matrix, response.weights) / freedom
+        covariance = sums.residual_power(matrix, _ONE) / freedom
         variance = np.maximum(np.diag(covariance), 0.0)
         sigma = np.sqrt(np.outer(variance, np.diag(np.linalg.inv(gram))))
         return DocrimeSolution(
-            matrix, sigma, response, covariance, self._whitener, self.frames, self.lost_frames
+            matrix, sigma, self._response, covariance, self._whitener, self.frames, self.lost_frames
         )
 
     def _absorb(self) -> None:
@@ -153,34 +154,40 @@ class DocrimeEstimator:
         if self._data is not None and self._last_index is not None:
             gap = self._index[0] - self._last_index - 1
             self.lost_frames += gap
-            start = self._data.present.size
+            start = 0 if self._response is None else self._data.present.size
             # A gap longer than the memory of filter and response separates the stretches for good.
             fresh = self._data.followed_by(fresh, min(gap, 2 * (self.order + self.lags)))
         self._last_index = self._index[-1]
         self._index, self._slopes, self._pokes = [], [], []
-        if self._whitener is None:
-            self._whitener = self._fit_whitener(fresh)
-        self._sums.add(fresh, self._whitener, start)
-        self._data = fresh.tail(2 * self.order + self.lags)
+        if self._whitener is None or self._response is None:
+            self._fit(fresh)
+        if self._whitener is not None and self._response is not None:
+            self._sums.add(fresh, self._whitener, start, self._response.weights)
+            fresh = fresh.tail(2 * self.order + self.lags)
+        self._data = fresh
 
-    def _fit_whitener(self, data: Telemetry) -> NDArray[np.float64]:
-        """Filter from the residuals of two rounds of regression, frame differences first."""
-        if self.order == 0:
-            return np.ones(1)
+    def _fit(self, data: Telemetry) -> None:
+        """Filter and temporal response from the first frames: frame differences, then two rounds.
+
+        Too few frames leave both unset; the next call sees these frames again.
+        """
+        # Differences tell the response well even where the plain estimator is asked for.
         whitener = np.array([1.0, -1.0])
-        for _ in range(2):
+        for last in (False, False, True) if self.order else (True,):
             sums = LaggedSums.zeros(self.n_slopes, self.n_modes, self.lags)
             sums.add(data, whitener)
             if sums.count < self.n_modes + self.lags + MIN_FREEDOM:
-                return np.array([1.0, -1.0])
+                return
             sums = sums.centred()
-            weights = sums.fit_response().weights
-            matrix = sums.solve(weights)[0]
+            response = sums.fit_response()
+            if last:
+                break
+            matrix = sums.solve(response.weights)[0]
             at = data.complete(0, self.lags)
-            seen = sum(w * data.pokes[at - lag] for lag, w in enumerate(weights))
+            seen = sum(w * data.pokes[at - lag] for lag, w in enumerate(response.weights))
             residuals = np.zeros_like(data.slopes)
             residuals[at] = data.slopes[at] - seen @ matrix.T
             usable = np.zeros_like(data.present)
             usable[at] = True
             whitener = prediction_error_filter(residuals, usable, self.order)
-        return whitener
+        self._whitener, self._response = whitener if self.order else np.ones(1), response

@@ -44,24 +44,44 @@ class LaggedSums:
         """Number of lags."""
         return int(self.cross.shape[0])
 
-    def add(self, data: Telemetry, whitener: NDArray[np.float64], start: int = 0) -> None:
+    def add(
+        self,
+        data: Telemetry,
+        whitener: NDArray[np.float64],
+        start: int = 0,
+        response: NDArray[np.float64] | None = None,
+    ) -> None:
         """Add every complete row from ``start`` on.
 
         Single precision carries the products within a block (as the slopes themselves do), double
         precision the sums over blocks.
+
+        Parameters
+        ----------
+        data
+            Filter and response look back into its first rows.
+        whitener
+            Filter over time, applied to slopes and pokes alike.
+        response
+            A known temporal response; the sums then have one lag, of pokes seen through it.
         """
-        lags, n_modes = self.lags, self.cross.shape[2]
-        at = data.complete(whitener.size - 1, lags + whitener.size - 1)
+        reach = self.lags if response is None else response.size
+        at = data.complete(whitener.size - 1, reach + whitener.size - 1)
         at = at[at >= start]
         if not at.size:
             return
-        y = apply_filter(data.slopes, whitener, at).astype(np.float32)
-        x = np.concatenate([apply_filter(data.pokes, whitener, at - lag) for lag in range(lags)], axis=1)
-        self.gram += (x.T @ x).reshape(lags, n_modes, lags, n_modes)
-        self.cross += (y.T @ x.astype(np.float32)).reshape(-1, lags, n_modes).transpose(1, 0, 2)
+        if response is None:
+            kernels = [np.concatenate([np.zeros(lag), whitener]) for lag in range(self.lags)]
+        else:
+            kernels = [np.convolve(whitener, response)]
+        y = apply_filter(data.slopes, whitener, at)
+        x = np.concatenate([apply_filter(data.pokes, kernel, at) for kernel in kernels], axis=1)
+        shape = (self.lags, self.cross.shape[2])
+        self.gram += (x.T @ x).reshape(*shape, *shape)
+        self.cross += (y.T @ x).reshape(-1, *shape).transpose(1, 0, 2)
         self.power += y.T @ y
         self.slopes += y.sum(axis=0)
-        self.pokes += x.sum(axis=0).reshape(lags, n_modes)
+        self.pokes += x.sum(axis=0).reshape(shape)
         self.count += at.size
 
     def centred(self) -> LaggedSums:
@@ -76,9 +96,7 @@ class LaggedSums:
             self.count,
         )
 
-    def solve(
-        self, weights: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def solve(self, weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Least-squares matrix for a given temporal response.
 
         Parameters

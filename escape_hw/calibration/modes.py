@@ -36,7 +36,11 @@ def fix_signs(m2c: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def karhunen_loeve(
-    surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], pixel_m: float, n_modes: int, outer_scale_m: float
+    surfaces: NDArray[np.float64],
+    pupil: NDArray[np.bool_],
+    pixel_m: float,
+    n_modes: int,
+    outer_scale_m: float,
 ) -> NDArray[np.float64]:
     """Karhunen-Loeve modes of von Karman turbulence within the span of the influence functions.
 
@@ -95,9 +99,7 @@ def karhunen_loeve(
     return fix_signs(unit_rms(m2c, surfaces, pupil))
 
 
-def zonal(
-    surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int
-) -> NDArray[np.float64]:
+def zonal(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:
     """Single actuators as modes ``(n_act, n_modes)``, the first ``n_modes`` of them."""
     n_act = surfaces.shape[0]
     if n_modes > n_act:

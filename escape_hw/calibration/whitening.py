@@ -9,6 +9,7 @@ case.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 
@@ -54,9 +55,27 @@ def prediction_error_filter(
 
 def apply_filter(
     values: NDArray[np.floating], weights: NDArray[np.float64], at: NDArray[np.intp]
-) -> NDArray[np.float64]:
-    """Filtered rows ``sum_k weights[k] values[at - k]``, ``(at.size, ...)``."""
-    out = weights[0] * values[at].astype(np.float64)
-    for lag, weight in enumerate(weights[1:], start=1):
-        out += weight * values[at - lag]
+) -> NDArray[np.float32]:
+    """Filtered rows ``sum_k weights[k] values[at - k]``, ``(at.size, n)`` in single precision.
+
+    ``at`` rises; its unbroken stretches are filtered as slices, without index gathering.
+    """
+    source = np.ascontiguousarray(values, dtype=np.float32)
+    out = np.empty((at.size, source.shape[1]), np.float32)
+    breaks = np.flatnonzero(np.diff(at) != 1) + 1
+    for start, end in zip([0, *breaks], [*breaks, at.size], strict=True):
+        if end > start:
+            _filter(source, weights.astype(np.float32), int(at[start]), out[start:end])
     return out
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _filter(values, weights, first, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for t in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[t, j] = weights[0] * values[first + t, j]
+        for k in range(1, weights.size):
+            w = weights[k]
+            if w != 0:
+                for j in range(out.shape[1]):
+                    out[t, j] += w * values[first + t - k, j]

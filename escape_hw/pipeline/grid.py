@@ -45,7 +45,9 @@ def _lattice_fit(
     design[:n, 0], design[n:, 0] = columns, rows
     design[:n, 1] = design[n:, 2] = 1.0
     w = np.sqrt(np.tile(weight, 2))
-    answer = np.linalg.lstsq(design * w[:, None], np.concatenate([spots[:, 0], spots[:, 1]]) * w, rcond=None)[0]
+    answer = np.linalg.lstsq(design * w[:, None], np.concatenate([spots[:, 0], spots[:, 1]]) * w, rcond=None)[
+        0
+    ]
     return float(answer[0]), float(answer[1]), float(answer[2])
 
 
@@ -93,7 +95,9 @@ def find_grid(
     image = np.asarray(mean_frame, dtype=np.float64)
     light = np.maximum(image - threshold, 0.0)
     if not light.any():
-        raise CalibrationError("no light above the threshold on the wavefront sensor; check source and exposure")
+        raise CalibrationError(
+            "no light above the threshold on the wavefront sensor; check source and exposure"
+        )
     pitch, x, y = _pitch_and_phase(light, nominal_pitch_px)
     x, y = _centre_lattice(light, pitch, x, y, n_sub)
     grid = None
@@ -114,7 +118,11 @@ def find_grid(
     if references == "mean":
         extractor = SlopeExtractor(grid, image.shape, threshold=0.0)  # type: ignore[arg-type]
         grid = SubApertureGrid(
-            grid.pitch_px, grid.origin_px, grid.valid, _measure(extractor, light).astype(np.float32), grid.flux,
+            grid.pitch_px,
+            grid.origin_px,
+            grid.valid,
+            _measure(extractor, light).astype(np.float32),
+            grid.flux,
             grid.counts,
         )
     return grid

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from escape_hw.api.sensor import SubApertureGrid
 
+#: Single-precision numbers in one vector register of common processors.
+_VECTOR = 8
+
 
 def windows(centres_px: NDArray[np.float64], pitch_px: float, shape: tuple[int, int]) -> NDArray[np.int32]:
     """Whole-pixel windows of the sub-apertures.
@@ -43,37 +46,76 @@ def windows(centres_px: NDArray[np.float64], pitch_px: float, shape: tuple[int, 
     )
 
 
+@njit(inline="always")
+def _counted(frame, gain, offset, at):  # type: ignore[no-untyped-def]  # pragma: no cover
+    value = np.float32(frame[at]) * gain[at] - offset[at]
+    return value if value > np.float32(0) else np.float32(0)
+
+
 @njit(cache=True, fastmath=True, nogil=True)
-def centres_of_gravity(frame, dark, gain, boxes, centres, references, threshold, slopes, flux):  # type: ignore[no-untyped-def]  # pragma: no cover
+def centres_of_gravity(frame, gain, offset, places, weights, zero_points, slopes, flux):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Thresholded centre of gravity of every window, minus centre and reference.
 
-    Each pixel counts as ``max((frame - dark) * gain - threshold, 0)``. A window without light above
-    the threshold yields slope 0 and flux 0. Fills ``slopes (2 n,)`` (all x, then all y) and
-    ``flux (n,)``.
+    Each pixel counts as ``max(frame * gain - offset, 0)``. A window without light above the
+    threshold yields slope 0 and flux 0. ``places (n, 3)`` holds each window's first row, number of
+    rows and first column, ``weights (n, 2, width)`` its mask and its lever along x, ``zero_points
+    (2 n,)`` what to subtract. Fills ``slopes (2 n,)`` (all x, then all y) and ``flux (n,)``.
+
+    Three things make it fast. All windows are read equally wide, a whole number of vectors, and
+    their weights are zero where they end. Four rows go through the inner loop together, for its
+    sums across a vector cost more than what they add up. Positions are unsigned, or numba would
+    look for negative ones at each pixel and not vectorise.
     """
-    n = boxes.shape[0]
+    zero, two, three = np.float32(0), np.float32(2), np.float32(3)
+    pixels, scale, cut = frame.ravel(), gain.ravel(), offset.ravel()
+    weight = weights.ravel()
+    width, stride = np.uint64(weights.shape[2]), np.uint64(frame.shape[1])
+    n = weights.shape[0]
     for k in range(n):
-        left = boxes[k, 2]
-        width = boxes[k, 3] - left
-        total = np.float32(0)
-        first = np.float32(0)
-        down = np.float32(0)
-        for i in range(boxes[k, 0], boxes[k, 1]):
-            line = np.float32(0)
+        total = zero
+        first = zero
+        down = zero
+        keep = np.uint64(2 * k) * width
+        lever = keep + width
+        at = np.uint64(places[k, 0]) * stride + np.uint64(places[k, 2])
+        rows = places[k, 1]
+        i = 0
+        while i + 4 <= rows:
+            at1 = at + stride
+            at2 = at1 + stride
+            at3 = at2 + stride
+            block = zero
+            turn = zero
             for j in range(width):
-                value = (np.float32(frame[i, left + j]) - dark[i, left + j]) * gain[i, left + j] - threshold
-                value = max(value, np.float32(0))
-                line += value
-                first += value * np.float32(j)
+                v0 = _counted(pixels, scale, cut, at + j)
+                v1 = _counted(pixels, scale, cut, at1 + j)
+                v2 = _counted(pixels, scale, cut, at2 + j)
+                v3 = _counted(pixels, scale, cut, at3 + j)
+                column = v0 + v1 + v2 + v3
+                block += column * weight[keep + j]
+                first += column * weight[lever + j]
+                turn += (v1 + two * v2 + three * v3) * weight[keep + j]
+            total += block
+            down += block * np.float32(i) + turn
+            i += 4
+            at = at3 + stride
+        while i < rows:
+            line = zero
+            for j in range(width):
+                value = _counted(pixels, scale, cut, at + j)
+                line += value * weight[keep + j]
+                first += value * weight[lever + j]
             total += line
-            down += line * np.float32(i - boxes[k, 0])
+            down += line * np.float32(i)
+            i += 1
+            at += stride
         flux[k] = total
-        if total > np.float32(0):
-            slopes[k] = np.float32(left - centres[k, 0]) + first / total - references[k, 0]
-            slopes[n + k] = np.float32(boxes[k, 0] - centres[k, 1]) + down / total - references[k, 1]
+        if total > zero:
+            slopes[k] = first / total - zero_points[k]
+            slopes[n + k] = down / total - zero_points[n + k]
         else:
-            slopes[k] = np.float32(0)
-            slopes[n + k] = np.float32(0)
+            slopes[k] = zero
+            slopes[n + k] = zero
 
 
 class SlopeExtractor:
@@ -111,25 +153,45 @@ class SlopeExtractor:
         self.dark = np.zeros(shape, np.float32) if dark is None else np.ascontiguousarray(dark, np.float32)
         response = np.ones(shape, np.float32) if flat is None else np.asarray(flat, np.float32)
         if self.dark.shape != shape or response.shape != shape:
-            raise ValueError(f"dark {self.dark.shape} and flat {response.shape} must have the region's {shape}")
+            raise ValueError(
+                f"dark {self.dark.shape} and flat {response.shape} must have the region's {shape}"
+            )
         if not (response > 0).all():
             raise ValueError("the flat has pixels that are not positive")
         self._gain = np.ascontiguousarray(1 / response)
         self.threshold = float(threshold)
-        self._centres = grid.centres_px()
-        self._boxes = windows(self._centres, grid.pitch_px, shape)
-        self._references = np.ascontiguousarray(grid.references_px, np.float32)
+        self._offset = np.ascontiguousarray(self.dark * self._gain + np.float32(threshold))
+        self._light = np.empty(grid.n_valid, np.float32)
+        self._place_windows()
+
+    def _place_windows(self) -> None:
+        """Windows in the form that :func:`centres_of_gravity` wants."""
+        centres = self.grid.centres_px()
+        boxes = windows(centres, self.grid.pitch_px, self.shape).astype(np.int64)
+        top, end, left, right = boxes.T
+        widest = int((right - left).max(initial=1))
+        width = min(-(-widest // _VECTOR) * _VECTOR, self.shape[1])
+        start = np.minimum(left, self.shape[1] - width)
+        self._places = np.ascontiguousarray(np.stack([top, end - top, start], axis=1))
+        at = start[:, None] + np.arange(width)
+        inside = (at >= left[:, None]) & (at < right[:, None])
+        lever = np.where(inside, at - centres[:, :1], 0.0)
+        self._weights = np.ascontiguousarray(np.stack([inside, lever], axis=1), np.float32)
+        x, y = self.grid.references_px.T.astype(float)
+        self._zero_points = np.concatenate([x, y + centres[:, 1] - top]).astype(np.float32)
 
     def __call__(
-        self, frame: NDArray[np.uint16], flux: NDArray[np.float32] | None = None
+        self,
+        frame: NDArray[np.uint16],
+        flux: NDArray[np.float32] | None = None,
+        out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Slopes ``(n_slopes,)`` in pixels; ``flux (n_valid,)`` is filled when given."""
+        """Slopes ``(n_slopes,)`` in pixels, in ``out`` if given; ``flux (n_valid,)`` is filled when given."""
         if frame.shape != self.shape:
             raise ValueError(f"frame has shape {frame.shape}; the slopes were set up for {self.shape}")
-        slopes = np.empty(self.grid.n_slopes, np.float32)
-        light = np.empty(self.grid.n_valid, np.float32) if flux is None else flux
+        slopes = np.empty(self.grid.n_slopes, np.float32) if out is None else out
+        light = self._light if flux is None else flux
         centres_of_gravity(
-            frame, self.dark, self._gain, self._boxes, self._centres, self._references,
-            np.float32(self.threshold), slopes, light,
-        )  # fmt: skip
+            frame, self._gain, self._offset, self._places, self._weights, self._zero_points, slopes, light
+        )
         return slopes

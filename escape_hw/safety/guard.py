@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,30 +11,56 @@ from numpy.typing import ArrayLike, NDArray
 from escape_hw.errors import CommandRejected
 from escape_hw.safety.limits import MirrorLimits
 
-#: Rounds of clip and scale before the guard falls back to a pure scaling, which always obeys.
-_ROUNDS = 4
 #: Head-room for rounding, so that a command at a limit is not touched again.
 _ULP = 1e-12
+#: Nothing this far beyond full stroke means anything; bounding it keeps sums and products finite.
+_ABSURD = 1e3
 
 
 @dataclass(frozen=True, slots=True)
 class GuardReport:
-    """What the guard did to one command (counts of actuators, and scale factors)."""
+    """What the guard did to one command.
+
+    Parameters
+    ----------
+    clipped
+        Actuators asked to go beyond ``max_stroke``.
+    slewed
+        Actuators that could not go all the way in one command.
+    disabled
+        Disabled actuators that were asked to move.
+    scale
+        Factor that brought the shape within ``max_neighbour`` and ``max_mean``, 1 if not needed.
+    mean_removed
+        Mean taken off to respect ``max_mean``, fraction of full stroke.
+    """
 
     clipped: int = 0
     slewed: int = 0
     disabled: int = 0
-    neighbour_scale: float = 1.0
+    scale: float = 1.0
     mean_removed: float = 0.0
 
     @property
     def untouched(self) -> bool:
         """True when the mirror gets exactly what was asked for."""
-        return self == GuardReport()
+        return self == _UNTOUCHED
+
+
+_UNTOUCHED = GuardReport()
 
 
 class CommandGuard:
     """Checks and limits commands for one mirror; remembers the last shape sent.
+
+    Every rule is convex, and the last shape obeys them all. A command that breaks a rule is first
+    made legal by itself (mean, stroke, then a scaling, which needs no iteration because zero obeys
+    every rule); the slew rule then decides how far towards it this command may go. So the result
+    always obeys, and repeating a command always arrives.
+
+    When a mirror is found in a shape that breaks a rule (see :meth:`reset`), no single command
+    can obey both the slew rule and the broken one. Slew wins, and each command breaks the other
+    rule by less than the one before.
 
     Parameters
     ----------
@@ -45,6 +72,11 @@ class CommandGuard:
         The limits to enforce.
     pairs
         Neighbour pairs ``(n_pairs, 2)``, see :func:`~escape_hw.safety.limits.neighbour_pairs`.
+
+    Raises
+    ------
+    ValueError
+        A disabled actuator or a neighbour pair does not exist on this mirror.
     """
 
     def __init__(
@@ -55,10 +87,16 @@ class CommandGuard:
                 f"{device}: disabled actuators {limits.disabled} do not all lie in 0..{n_act - 1}"
             )
         self.device, self.n_act, self.limits = device, n_act, limits
-        self.pairs = np.empty((0, 2), dtype=np.intp) if pairs is None else pairs
-        self.last = np.zeros(n_act)
+        pairs = np.empty((0, 2), dtype=np.intp) if pairs is None else pairs
+        if len(pairs) and not (pairs.min() >= 0 and pairs.max() < n_act):
+            raise ValueError(f"{device}: neighbour pairs name actuators outside 0..{n_act - 1}")
+        self._one, self._other = (np.ascontiguousarray(pairs[:, k]) for k in (0, 1))
+        self._disabled = np.array(sorted(set(limits.disabled)), dtype=np.intp)
         self._enabled = np.ones(n_act, dtype=bool)
-        self._enabled[list(limits.disabled)] = False
+        self._enabled[self._disabled] = False
+        n_enabled = int(self._enabled.sum())
+        self._averaging = self._enabled / n_enabled if n_enabled else np.zeros(n_act)
+        self.last = _frozen(np.zeros(n_act))
 
     def validate(self, command: ArrayLike) -> NDArray[np.float64]:
         """Check type, shape and finiteness.
@@ -73,7 +111,82 @@ class CommandGuard:
         CommandRejected
             Wrong type or shape, or any value that is not finite (its index is named).
         """
-        asked = np.asarray(command)
+        # A caller that has numpy raise on overflow must still get CommandRejected.
+        with np.errstate(all="ignore"):
+            return self._validated(command)
+
+    def limit(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
+        """Limit a command; the result obeys every rule at once. Remembers nothing.
+
+        Returns
+        -------
+        safe : ndarray of float64, ``(n_act,)``
+            Read-only. Bit for bit what was asked for when that obeys every rule; otherwise every
+            rule is obeyed to within rounding (1e-12), stroke exactly.
+        report : GuardReport
+
+        Raises
+        ------
+        CommandRejected
+            See :meth:`validate`.
+        """
+        with np.errstate(all="ignore"):
+            wanted = self._validated(command)
+            if self.obeys(wanted):
+                return _frozen(wanted), _UNTOUCHED
+            legal, clipped, disabled, scale, removed = self._legalise(wanted)
+            safe, slewed = self._approach(legal)
+            return _frozen(safe), GuardReport(clipped, slewed, disabled, scale, removed)
+
+    def accept(self, shape: NDArray[np.float64]) -> None:
+        """Remember a shape from :meth:`limit` as the one that the mirror has now."""
+        self.last = shape
+
+    def __call__(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
+        """:meth:`limit`, then :meth:`accept`."""
+        safe, report = self.limit(command)
+        self.accept(safe)
+        return safe, report
+
+    def reset(self, shape: ArrayLike | None = None) -> None:
+        """Tell the guard which shape the mirror really has; zeros when not given.
+
+        Raises
+        ------
+        CommandRejected
+            The shape is malformed, see :meth:`validate`.
+        """
+        self.last = _frozen(np.zeros(self.n_act) if shape is None else self.validate(shape))
+
+    def obeys(self, shape: NDArray[np.float64]) -> bool:
+        """True when ``shape`` obeys every rule, counted from the last shape sent."""
+        if self.breach(shape) is not None:
+            return False
+        slew = self.limits.max_slew
+        return slew is None or _peak(shape - self.last) <= slew + _ULP
+
+    def breach(self, shape: NDArray[np.float64]) -> str | None:
+        """The first rule that ``shape`` breaks by itself (slew apart), in words, or ``None``."""
+        lim = self.limits
+        peak = _peak(shape)
+        if peak > lim.max_stroke:
+            worst = int(np.abs(shape).argmax())
+            return f"actuator {worst} exceeds max_stroke = {lim.max_stroke} ({peak:.6g})"
+        if self._disabled.size and shape[self._disabled].any():
+            culprit = int(self._disabled[np.flatnonzero(shape[self._disabled])[0]])
+            return f"actuator {culprit} is disabled and must stay at zero"
+        if lim.max_mean is not None:
+            mean = float(shape.dot(self._averaging))
+            if abs(mean) > lim.max_mean + _ULP:
+                return f"the mean exceeds max_mean = {lim.max_mean} ({mean:.6g})"
+        if lim.max_neighbour is not None and self._one.size:
+            step = self._worst_step(shape)
+            if step > lim.max_neighbour + _ULP:
+                return f"two neighbours exceed max_neighbour = {lim.max_neighbour} ({step:.6g})"
+        return None
+
+    def _validated(self, command: ArrayLike) -> NDArray[np.float64]:
+        asked = self._as_array(command)
         if asked.dtype.kind not in "fiu":
             raise CommandRejected(
                 self.device, f"command has type {asked.dtype}; give real numbers, fractions of full stroke"
@@ -83,6 +196,25 @@ class CommandGuard:
                 self.device, f"command has shape {asked.shape}; this mirror takes ({self.n_act},)"
             )
         wanted = np.array(asked, dtype=np.float64, order="C")
+        # The sum of squares is the cheapest test that one NaN or infinity cannot pass.
+        if not math.isfinite(wanted.dot(wanted)):
+            self._require_finite(wanted)
+        return wanted
+
+    def _as_array(self, command: ArrayLike) -> NDArray[np.generic]:
+        """Make an array of it, and whatever goes wrong on the way a :class:`CommandRejected`."""
+        try:
+            if np.ma.is_masked(command):
+                raise CommandRejected(self.device, "command has masked elements; fill them first")
+            return np.asarray(command)
+        except CommandRejected:
+            raise
+        except Exception as error:
+            raise CommandRejected(
+                self.device, f"command is not an array of numbers ({type(command).__name__}: {error})"
+            ) from error
+
+    def _require_finite(self, wanted: NDArray[np.float64]) -> None:
         bad = np.flatnonzero(~np.isfinite(wanted))
         if bad.size:
             raise CommandRejected(
@@ -90,101 +222,79 @@ class CommandGuard:
                 f"actuator {bad[0]} is {wanted[bad[0]]} ({bad.size} of {self.n_act} not finite); "
                 "the whole command is refused and the last shape kept",
             )
-        return wanted
-
-    def __call__(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
-        """Limit a command; the result obeys every rule at once.
-
-        Raises
-        ------
-        CommandRejected
-            See :meth:`validate`.
-        """
-        wanted = self.validate(command)
-        lim = self.limits
-        off = int(np.count_nonzero(wanted[~self._enabled]))
-        wanted[~self._enabled] = 0.0
-        clipped = slewed = 0
-        scale, removed = 1.0, 0.0
-        safe = wanted
-        for _ in range(_ROUNDS):
-            before = safe
-            safe, shift = self._limit_mean(safe)
-            removed += shift
-            safe, n = self._clip(safe, -lim.max_stroke, lim.max_stroke)
-            clipped = max(clipped, n)
-            safe, factor = self._limit_neighbours(safe)
-            scale *= factor
-            safe, n = self._limit_slew(safe)
-            slewed = max(slewed, n)
-            if safe is before or np.array_equal(safe, before):
-                break
-        if not self.obeys(safe):
-            safe, scale = self._towards(safe), 0.0
-        self.last = safe
-        return safe, GuardReport(clipped, slewed, off, scale, removed)
-
-    def reset(self, shape: NDArray[np.float64] | None = None) -> None:
-        """Tell the guard which shape the mirror really has (zeros after a device reset)."""
-        self.last = np.zeros(self.n_act) if shape is None else np.array(shape, dtype=np.float64)
-
-    def obeys(self, shape: NDArray[np.float64]) -> bool:
-        """True when ``shape`` obeys every rule, counted from the last shape sent."""
-        lim = self.limits
-        ok = bool(np.abs(shape).max(initial=0.0) <= lim.max_stroke + _ULP)
-        ok = ok and not shape[~self._enabled].any()
-        if lim.max_slew is not None:
-            ok = ok and bool(np.abs(shape - self.last).max() <= lim.max_slew + _ULP)
-        if lim.max_mean is not None and self._enabled.any():
-            ok = ok and abs(float(shape[self._enabled].mean())) <= lim.max_mean + _ULP
-        if lim.max_neighbour is not None and len(self.pairs):
-            ok = ok and self._worst_step(shape) <= lim.max_neighbour + _ULP
-        return ok
 
     def _worst_step(self, shape: NDArray[np.float64]) -> float:
-        return float(np.abs(shape[self.pairs[:, 0]] - shape[self.pairs[:, 1]]).max())
+        return _peak(shape.take(self._one) - shape.take(self._other))
 
-    def _limit_mean(self, shape: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-        limit = self.limits.max_mean
-        if limit is None or not self._enabled.any():
-            return shape, 0.0
-        mean = float(shape[self._enabled].mean())
-        excess = mean - float(np.clip(mean, -limit, limit))
-        if abs(excess) <= _ULP:
-            return shape, 0.0
-        return np.where(self._enabled, shape - excess, 0.0), excess
+    def _legalise(self, wanted: NDArray[np.float64]) -> tuple[NDArray[np.float64], int, int, float, float]:
+        """Make a shape obey every rule but slew.
 
-    @staticmethod
-    def _clip(shape: NDArray[np.float64], low: float, high: float) -> tuple[NDArray[np.float64], int]:
-        n = int(np.count_nonzero((shape < low) | (shape > high)))
-        return (np.clip(shape, low, high), n) if n else (shape, 0)
-
-    def _limit_neighbours(self, shape: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-        limit = self.limits.max_neighbour
-        if limit is None or not len(self.pairs):
-            return shape, 1.0
-        worst = self._worst_step(shape)
-        return (shape * (limit / worst), limit / worst) if worst > limit + _ULP else (shape, 1.0)
-
-    def _limit_slew(self, shape: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-        limit = self.limits.max_slew
-        if limit is None:
-            return shape, 0
-        step = shape - self.last
-        n = int(np.count_nonzero(np.abs(step) > limit + _ULP))
-        return (self.last + np.clip(step, -limit, limit), n) if n else (shape, 0)
-
-    def _towards(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Go as far from the last shape towards ``shape`` as every rule allows.
-
-        The rules are convex and the last shape obeys them, so any point of the straight line up
-        to the first breach obeys them too.
+        Returns
+        -------
+        legal, clipped, disabled, scale, mean_removed
         """
-        low, high = 0.0, 1.0
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            if self.obeys(self.last + middle * (shape - self.last)):
-                low = middle
-            else:
-                high = middle
-        return np.asarray(self.last + low * (shape - self.last))
+        lim = self.limits
+        disabled = int(np.count_nonzero(wanted[self._disabled]))
+        shape = _clamp(wanted, _ABSURD)
+        shape[self._disabled] = 0.0
+        removed = 0.0
+        if lim.max_mean is not None:
+            mean = float(shape.dot(self._averaging))
+            if abs(mean) > lim.max_mean + _ULP:
+                removed = mean - math.copysign(lim.max_mean, mean)
+                shape[self._enabled] -= removed
+        clipped = int(np.count_nonzero(np.abs(shape) > lim.max_stroke))
+        shape = _clamp(shape, lim.max_stroke)
+        scale = self._scale(shape)
+        return (shape if scale == 1.0 else shape * scale), clipped, disabled, scale, removed
+
+    def _scale(self, shape: NDArray[np.float64]) -> float:
+        """Largest factor up to 1 that makes ``shape`` obey the neighbour and the mean rule."""
+        lim, scale = self.limits, 1.0
+        if lim.max_mean is not None:
+            mean = abs(float(shape.dot(self._averaging)))
+            scale = lim.max_mean / mean if mean > lim.max_mean + _ULP else scale
+        if lim.max_neighbour is not None and self._one.size:
+            step = self._worst_step(shape)
+            scale = min(scale, lim.max_neighbour / step) if step > lim.max_neighbour + _ULP else scale
+        return scale
+
+    def _approach(self, legal: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+        """Go from the last shape towards a legal one as far as the slew rule allows.
+
+        Each actuator goes as far as it may, so that one far away does not hold the others back.
+        Where that breaks a rule (the mean may, as the far ones lag), all move in proportion: a
+        point on the straight line between two legal shapes is legal.
+        """
+        slew = self.limits.max_slew
+        if slew is None:
+            return legal, 0
+        move = legal - self.last
+        far = np.abs(move)
+        slewed = int(np.count_nonzero(far > slew + _ULP))
+        if not slewed:
+            return legal, 0
+        each = self._within_stroke(self.last + _clamp(move, slew))
+        if self.obeys(each):
+            return each, slewed
+        return self._within_stroke(self.last + move * (slew / far.max())), slewed
+
+    def _within_stroke(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Take off what rounding added beyond the stroke (or beyond the last shape, if that is)."""
+        bound = max(self.limits.max_stroke, _peak(self.last))
+        return _clamp(shape, bound)
+
+
+def _peak(values: NDArray[np.float64]) -> float:
+    return float(np.abs(values).max(initial=0.0))
+
+
+def _clamp(values: NDArray[np.float64], bound: float) -> NDArray[np.float64]:
+    """Clip to ``-bound .. bound`` (several times faster than ``np.clip`` on so few values)."""
+    return np.minimum(np.maximum(values, -bound), bound)
+
+
+def _frozen(shape: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Make an array read-only: caller, driver and guard share it, and none may change it."""
+    shape.setflags(write=False)
+    return shape

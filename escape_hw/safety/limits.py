@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,12 @@ class MirrorLimits:
     max_mean
         Largest magnitude of the mean over the enabled actuators (piston drift).
     disabled
-        Indices of actuators that must stay at zero.
+        Indices of actuators that must stay at zero, counted from 0.
+
+    Raises
+    ------
+    ValueError
+        A limit is not a positive number, or ``disabled`` holds anything but indices.
     """
 
     max_stroke: float = 1.0
@@ -39,6 +45,13 @@ class MirrorLimits:
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name} is {value}; it must be positive, or None to switch it off")
+        try:
+            disabled = tuple(operator.index(i) for i in self.disabled)
+        except TypeError as error:
+            raise ValueError(f"disabled is {self.disabled!r}; it must hold whole numbers") from error
+        if any(i < 0 for i in disabled):
+            raise ValueError(f"disabled is {disabled}; actuators are counted from 0")
+        object.__setattr__(self, "disabled", disabled)
 
 
 def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -54,7 +67,15 @@ def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:
     -------
     ndarray of int, ``(n_pairs, 2)``
         Every horizontal and vertical neighbour pair once.
+
+    Raises
+    ------
+    ValueError
+        The layout is not a map of two dimensions.
     """
+    if layout.ndim != 2:
+        raise ValueError(f"layout has shape {layout.shape}; it must be a map (rows, columns)")
+    layout = np.asarray(layout, dtype=bool)
     number = np.full(layout.shape, -1, dtype=np.intp)
     number[layout] = np.arange(int(layout.sum()))
     pairs = [

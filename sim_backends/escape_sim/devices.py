@@ -244,7 +244,9 @@ class SimScienceCamera(_SimCamera):
         self._next = k + 1
         image = bench.integrated(k, end)
         assert self._detector is not None  # noqa: S101 - made by start, which next_frame calls
-        scale = s.exposure_s / (bench.config.devices.science.exposure_s if bench.config.devices.science else 1)
+        scale = s.exposure_s / (
+            bench.config.devices.science.exposure_s if bench.config.devices.science else 1
+        )
         electrons = 0.0 if bench.beam_blocked else bench.config.twin.science.photons_per_frame * scale
         data, saturated = self._detector.expose(image, electrons)
         data.flags.writeable = False

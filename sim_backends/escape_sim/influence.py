@@ -63,7 +63,11 @@ class InfluenceFunctions:
         return np.asarray(self.positions_m @ matrix.T + offset)
 
     def factors(
-        self, registration: Registration, sub_aperture_m: float, x_m: NDArray[np.float64], y_m: NDArray[np.float64]
+        self,
+        registration: Registration,
+        sub_aperture_m: float,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Separable factors of the surfaces.
 
@@ -90,11 +94,17 @@ class InfluenceFunctions:
         x, y = [], []
         for share, scale in terms:
             x.append(np.exp(-0.5 * ((x_m[:, None] - at[:, 0]) / (sigma * scale * stretch[0])) ** 2))
-            y.append(share * gain * np.exp(-0.5 * ((y_m[:, None] - at[:, 1]) / (sigma * scale * stretch[1])) ** 2))
+            y.append(
+                share * gain * np.exp(-0.5 * ((y_m[:, None] - at[:, 1]) / (sigma * scale * stretch[1])) ** 2)
+            )
         return np.stack(x, axis=2), np.stack(y, axis=2)
 
     def surfaces(
-        self, registration: Registration, sub_aperture_m: float, x_m: NDArray[np.float64], y_m: NDArray[np.float64]
+        self,
+        registration: Registration,
+        sub_aperture_m: float,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
         along_x, along_y = self.factors(registration, sub_aperture_m, x_m, y_m)

@@ -42,7 +42,9 @@ class FocalPlane:
         # Parseval: one alias period of the sampled pupil spans diameter_px * psf_px pixels.
         norm = 1 / (diameter_px * psf_px) ** 0.5
         self._left, self._right = (
-            np.asarray(np.exp(2j * np.pi * np.outer(np.arange(m) - m // 2, samples) / psf_px) * norm, np.complex64)
+            np.asarray(
+                np.exp(2j * np.pi * np.outer(np.arange(m) - m // 2, samples) / psf_px) * norm, np.complex64
+            )
             for m in shape
         )
 

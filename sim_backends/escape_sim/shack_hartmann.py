@@ -82,7 +82,8 @@ def lenslet_transform(
     """
     pixels = first_px[:, None] + np.arange(field)[None, :] - centres_px[:, None]
     samples = (np.arange(n_pix) - (n_pix - 1) / 2) / n_pix
-    phase = 2j * np.pi * samples[None, :, None] * pixels[:, None, :] / spot_px
+    # The minus sign makes a positive slope of the path move the spot to higher pixels, as in OOPAO.
+    phase = -2j * np.pi * samples[None, :, None] * pixels[:, None, :] / spot_px
     return np.exp(phase) / np.sqrt(n_pix * spot_px)
 
 
@@ -125,7 +126,9 @@ class ShackHartmannOptics:
     ) -> None:
         n = n_sub * n_pix
         if amplitude.shape != (n, n):
-            raise ValueError(f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})")
+            raise ValueError(
+                f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})"
+            )
         field = field_pixels(n_pix, spot_px)
         line = np.arange(n_sub) * pitch_px
         x, y = origin_px[0] + line, origin_px[1] + line
@@ -133,7 +136,10 @@ class ShackHartmannOptics:
         light = amplitude.reshape(n_sub, n_pix, n_sub, n_pix).any(axis=(1, 3))
         rows, cols = np.nonzero(light)
         inside = (
-            (y0[rows] >= 0) & (x0[cols] >= 0) & (y0[rows] + field <= shape[0]) & (x0[cols] + field <= shape[1])
+            (y0[rows] >= 0)
+            & (x0[cols] >= 0)
+            & (y0[rows] + field <= shape[0])
+            & (x0[cols] + field <= shape[1])
         )
         if not inside.all():
             raise ValueError(
@@ -152,7 +158,9 @@ class ShackHartmannOptics:
         self._spots = np.empty((n_sub, field, n_sub * field), np.complex64)
         self._n_sub, self._n_pix, self._size = n_sub, n_pix, field
 
-    def frame(self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    def frame(
+        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
         """Intensity on the camera.
 
         Parameters
@@ -177,7 +185,5 @@ class ShackHartmannOptics:
         columns = self._field.reshape(n, k, p).transpose(1, 0, 2)
         np.matmul(columns, self._along_x, out=self._half.transpose(1, 0, 2))
         np.matmul(self._along_y, self._half.reshape(k, p, k * f), out=self._spots)
-        _collect(
-            self._spots.view(np.float32).reshape(k, f, k, f, 2), self._lit, self._y0, self._x0, out
-        )
+        _collect(self._spots.view(np.float32).reshape(k, f, k, f, 2), self._lit, self._y0, self._x0, out)
         return out

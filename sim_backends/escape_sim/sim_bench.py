@@ -191,7 +191,9 @@ class SimBench:
         if not exposures.has(number):
             # Nobody read the wavefront sensor meanwhile: look at a few moments of our own.
             for start in end_s - exposures.exposure_s * np.arange(4, 0, -1) / 4:
-                exposures.add(number, self.optical_path(float(start), float(start + exposures.exposure_s / 4)))
+                exposures.add(
+                    number, self.optical_path(float(start), float(start + exposures.exposure_s / 4))
+                )
         return exposures.take(number)
 
     # ------------------------------------------------------------------ construction
@@ -227,7 +229,9 @@ class SimBench:
         """Tip and tilt of the beam in radians."""
         vib = self.config.twin.vibration
         f = np.asarray(vib.frequency_hz)
-        tip, tilt = (np.asarray(vib.amplitude_rad) * np.sin(2 * np.pi * f * time_s + self._vibration_phase)).sum(1)
+        tip, tilt = (
+            np.asarray(vib.amplitude_rad) * np.sin(2 * np.pi * f * time_s + self._vibration_phase)
+        ).sum(1)
         return float(tip), float(tilt)
 
     def _make_sensor(self) -> SensorOptics:
@@ -238,16 +242,17 @@ class SimBench:
             (width - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[0],
             (height - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[1],
         )
+        amplitude = self.pupil.amplitude / np.sqrt(np.sum(np.square(self.pupil.amplitude, dtype=float)))
+        geometry = (
+            n_sub, self.pupil.n_pix, c.system.wavelength_m, pitch, c.sensor.spot_px, origin, (height, width),
+            amplitude.astype(np.float32),
+        )  # fmt: skip
         if c.system.optics == "oopao":
             # Imported here: OOPAO loads for two seconds and 1,600 modules.
             from escape_sim.oopao_optics import OOPAOShackHartmann
 
-            return OOPAOShackHartmann(c, self.pupil, origin)
-        amplitude = self.pupil.amplitude / np.sqrt(np.sum(np.square(self.pupil.amplitude, dtype=float)))
-        return ShackHartmannOptics(
-            n_sub, self.pupil.n_pix, c.system.wavelength_m, pitch, c.sensor.spot_px, origin, (height, width),
-            amplitude.astype(np.float32),
-        )  # fmt: skip
+            return OOPAOShackHartmann(*geometry)
+        return ShackHartmannOptics(*geometry)
 
     def _plate(self) -> RotatingScreen:
         number = self.screen_number

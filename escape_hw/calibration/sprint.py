@@ -1,0 +1,330 @@
+"""SPRINT: the registration of mirror and sensor from a measured interaction matrix.
+
+Solves the paper's Eq. (argmin_simple), ``min over g, alpha of |D - g (D_0 + alpha Lambda)|``, by
+damped Gauss-Newton with the learning rate of its update rule, the model linearised anew in every
+iteration (Heritier et al. 2021). Beyond the paper it weights by the measured standard errors, and
+fits what the synthetic model does not know as random effects (see :mod:`~.misfit`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.results import Measured, RegistrationEstimate, SprintIteration
+from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
+from escape_hw.errors import CalibrationError, IncompatibleProduct
+
+#: Half steps of the central differences, in the units of the parameters.
+_STEPS = np.array([2.0, 2.0, 0.05, 0.2, 0.2])
+#: Largest move in one iteration: the model is only locally linear.
+_LARGEST = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
+#: A step below this many standard errors, or below the last column of the table, ends the descent.
+_SMALL = np.array([5e-3, 5e-3, 2e-4, 2e-3, 2e-3])
+_WIDTH_STEP = 0.05
+#: Width of the broad pedestal that influence functions may stand on, relative to their own.
+_PEDESTAL = 1.7
+_GAIN, _WIDTH, _SHAPE = 0, 6, 7
+
+
+@dataclass(slots=True, eq=False)
+class _State:
+    """Present values: common parameters and random effects."""
+
+    gain: float
+    alpha: NDArray[np.float64]
+    width: float
+    shape: float
+    actuator_gain: NDArray[np.float64]
+    actuator_width: NDArray[np.float64]
+    slope_gain: NDArray[np.float64]
+
+    def offset(self) -> NDArray[np.float64]:
+        """Distance from the priors' means, in the order of the unknowns."""
+        head = np.concatenate([[0.0], np.zeros(5), [self.width, self.shape]])
+        return np.concatenate([head, self.actuator_gain, self.actuator_width, self.slope_gain])
+
+
+class _Problem:
+    """One matrix, one model, and the weights between them."""
+
+    def __init__(
+        self, matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], priors: Priors
+    ) -> None:
+        data = matrix.data[:, columns].astype(float)
+        sigma = matrix.sigma[:, columns].astype(float)
+        self.model, self.priors = model, priors
+        self.m2c = matrix.m2c[:, columns]
+        self.measured_errors = bool((sigma > 0).all())
+        if self.measured_errors:
+            # Standard errors factor into slopes' noise and modes' excitation: both estimators say so.
+            power = np.log(sigma)
+            self.by_slope = np.exp(power.mean(axis=1) - power.mean())
+            self.by_mode = np.exp(power.mean(axis=0))
+        else:
+            self.by_slope = np.ones(data.shape[0])
+            self.by_mode = np.full(data.shape[1], max(float(data.std()), 1e-30))
+        self.data = data / self.by_slope[:, None] / self.by_mode
+        self.modes = self.m2c / self.by_mode
+        self.precision = np.concatenate(
+            [
+                np.zeros(6),
+                [priors.width**-2, priors.shape**-2],
+                np.full(model.n_act, priors.actuator_gain**-2),
+                np.full(model.n_act, priors.actuator_width**-2),
+                np.full(data.shape[0], priors.slope_gain**-2),
+            ]
+        )
+
+    def start(self, registration: Registration) -> _State:
+        n_act, n_slopes = self.model.n_act, self.data.shape[0]
+        zeros = np.zeros(n_act)
+        model = self._weighted(self.model.zonal_matrix(registration)) @ self.modes
+        gain = float(np.vdot(model, self.data) / np.vdot(model, model))
+        return _State(gain, registration.to_array(), 0.0, 0.0, zeros, zeros.copy(), np.zeros(n_slopes))
+
+    def _weighted(self, zonal: NDArray[np.float64]) -> NDArray[np.float64]:
+        return zonal / self.by_slope[:, None]
+
+    def linearise(self, state: _State) -> NormalEquations:
+        """Model and derivatives about a state."""
+        here, w = Registration.from_array(state.alpha), 1.0 + state.width
+        zonal = {0: self._weighted(self.model.zonal_matrix(here, w))}
+        for side in (-1, 1):
+            zonal[side] = self._weighted(self.model.zonal_matrix(here, w * (1 + side * _WIDTH_STEP)))
+        by_width = (zonal[1] - zonal[-1]) / (2 * _WIDTH_STEP)
+        by_shape = self._weighted(self.model.zonal_matrix(here, w * _PEDESTAL)) - zonal[0]
+        moved = []
+        for k, step in enumerate(_STEPS):
+            d = np.eye(5)[k] * step
+            plus, minus = (
+                self._weighted(self.model.zonal_matrix(Registration.from_array(state.alpha + s * d), w))
+                for s in (1, -1)
+            )
+            moved.append((plus - minus) / (2 * step))
+        rows = (1 + state.slope_gain)[:, None]
+        acting = 1 + state.actuator_gain
+        shaped = zonal[0] + state.shape * by_shape + state.actuator_width * by_width
+
+        def modal(z: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(rows * (z * acting) @ self.modes)
+
+        unit = modal(shaped)
+        common = np.stack([unit, *(state.gain * modal(z) for z in (*moved, by_width, by_shape))])
+        model = state.gain * unit
+        return normal_equations(
+            common,
+            state.gain * rows * shaped,
+            state.gain * rows * by_width * acting,
+            self.modes,
+            state.gain * (shaped * acting) @ self.modes,
+            self.data - model,
+            self.precision,
+            state.offset(),
+        )
+
+    def move(self, state: _State, step: NDArray[np.float64]) -> _State:
+        n_act = self.model.n_act
+        gains, widths, slopes = np.split(step[8:], [n_act, 2 * n_act])
+        return _State(
+            state.gain + step[_GAIN],
+            state.alpha + step[1:6],
+            float(np.clip(state.width + step[_WIDTH], -0.5, 1.0)),
+            float(np.clip(state.shape + step[_SHAPE], -0.5, 0.5)),
+            state.actuator_gain + gains,
+            state.actuator_width + widths,
+            state.slope_gain + slopes,
+        )
+
+
+def choose_modes(matrix: InteractionMatrix, n_modes: int) -> NDArray[np.intp]:
+    """The ``n_modes`` modes with the highest signal-to-noise ratio, in their own order.
+
+    On open-loop data these are not the first ones, which carry the turbulence.
+    """
+    snr = matrix.snr()
+    best = np.argsort(np.where(np.isfinite(snr), -snr, -np.inf), kind="stable")[:n_modes]
+    return np.sort(best)
+
+
+def sprint(
+    matrix: InteractionMatrix,
+    model: SyntheticModel,
+    *,
+    modes: NDArray[np.intp] | int | None = None,
+    learning_rate: float = 1.0,
+    start: Registration | None = None,
+    max_iterations: int = 25,
+    covariance: NDArray[np.float64] | None = None,
+    priors: Priors | None = None,
+) -> RegistrationEstimate:
+    """Registration, gain and their standard errors from an interaction matrix.
+
+    Parameters
+    ----------
+    matrix
+        The measured matrix; its standard errors are the weights.
+    model
+        The synthetic model, built on the same sub-apertures.
+    modes
+        Which columns to use, or how many of the best; all by default.
+    learning_rate
+        Share of each step that is taken, in (0, 1] (paper: gamma).
+    start
+        Where to start; zero by default.
+    max_iterations
+        Iterations before giving up.
+    covariance
+        Covariance of the slopes' noise ``(n_slopes, n_slopes)`` up to a factor, where it is known:
+        turbulence moves neighbouring slopes together, and the error bars must know.
+    priors
+        Scatter of what the model does not know.
+
+    Returns
+    -------
+    RegistrationEstimate
+        ``converged`` is false when the steps did not shrink or when the model does not explain the
+        matrix; ``warnings`` then says why.
+
+    Raises
+    ------
+    IncompatibleProduct
+        Matrix and model have different actuators or sub-apertures.
+    CalibrationError
+        The matrix holds no signal.
+    ValueError
+        A learning rate outside (0, 1].
+    """
+    if not 0 < learning_rate <= 1:
+        raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
+    columns = _columns(matrix, modes)
+    _check_fit(matrix, model)
+    problem = _Problem(matrix, model, columns, priors or Priors())
+    if not np.isfinite(problem.data).all():
+        raise CalibrationError(
+            "the interaction matrix or its standard errors are not finite; measure it again"
+        )
+    if problem.measured_errors and float(matrix.snr()[columns].max()) < 0.1:
+        raise CalibrationError(
+            "the interaction matrix holds nothing but noise; use more frames or larger pokes"
+        )
+    state = problem.start(start or Registration())
+    history: list[SprintIteration] = []
+    settled = False
+    for _ in range(max_iterations):
+        system = problem.linearise(state)
+        step = np.linalg.solve(system.matrix, system.right)
+        spread = np.sqrt(np.abs(np.diag(np.linalg.inv(_reduced(system)))))[1:6]
+        relative = np.abs(step[1:6]) / np.maximum(_SMALL, 0.02 * spread)
+        history.append(_record(state, system, float(np.linalg.norm(step[1:6] / _LARGEST))))
+        if relative.max() < 1.0:
+            settled = True
+            break
+        damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / _LARGEST)))
+        state = problem.move(state, step * damping * learning_rate)
+    system = problem.linearise(state)
+    return _estimate(problem, matrix, state, system, history, settled, covariance)
+
+
+def _columns(matrix: InteractionMatrix, modes: NDArray[np.intp] | int | None) -> NDArray[np.intp]:
+    if modes is None:
+        return np.arange(matrix.n_modes)
+    if isinstance(modes, int):
+        return choose_modes(matrix, min(modes, matrix.n_modes))
+    columns = np.asarray(modes, dtype=np.intp)
+    if columns.size == 0 or columns.min() < 0 or columns.max() >= matrix.n_modes:
+        raise ValueError(f"modes {modes!r} are not all in 0..{matrix.n_modes - 1}")
+    return columns
+
+
+def _check_fit(matrix: InteractionMatrix, model: SyntheticModel) -> None:
+    if matrix.m2c.shape[0] != model.n_act:
+        raise IncompatibleProduct(
+            f"the matrix is for {matrix.m2c.shape[0]} actuators, the model has {model.n_act}"
+        )
+    rows = model.zonal_matrix(Registration()).shape[0]
+    if rows != matrix.n_slopes:
+        raise IncompatibleProduct(
+            f"the matrix has {matrix.n_slopes} slopes, the model {rows}; build the model on the matrix's grid"
+        )
+
+
+def _reduced(system: NormalEquations) -> NDArray[np.float64]:
+    """Information on the common parameters, the random effects integrated out."""
+    k = system.n_common
+    a, b, c = system.matrix[:k, :k], system.matrix[:k, k:], system.matrix[k:, k:]
+    return np.asarray(a - b @ np.linalg.solve(c, b.T))
+
+
+def _record(state: _State, system: NormalEquations, norm: float) -> SprintIteration:
+    chi2 = float(np.mean(np.square(system.residual)))
+    return SprintIteration(Registration.from_array(state.alpha), state.gain, norm, chi2)
+
+
+def _covariance(
+    problem: _Problem, system: NormalEquations, noise: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Sandwich covariance of the common parameters, in units of their own.
+
+    The middle holds the scatter of the scores from slope to slope as it is found, which includes
+    whatever the model still misses, and the known correlation of the noise between slopes.
+    """
+    bread = np.linalg.inv(_reduced(system))
+    scores = system.efficient()
+    by_slope = np.einsum("psm,sm->ps", scores, system.residual)
+    meat = by_slope @ by_slope.T
+    if noise is not None:
+        whole = noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
+        whole[np.diag_indices_from(whole)] = 0.0
+        meat += np.einsum("psm,st,qtm->pq", scores, whole, scores, optimize=True)
+    # Never better than the noise alone allows.
+    floor = np.maximum(np.diag(bread) / np.diag(bread @ meat @ bread), 1.0)
+    scale = np.sqrt(floor)
+    return np.asarray(bread @ meat @ bread * np.outer(scale, scale))
+
+
+def _estimate(
+    problem: _Problem,
+    matrix: InteractionMatrix,
+    state: _State,
+    system: NormalEquations,
+    history: list[SprintIteration],
+    settled: bool,
+    noise: NDArray[np.float64] | None,
+) -> RegistrationEstimate:
+    chi2 = float(np.mean(np.square(system.residual)))
+    covariance = _covariance(problem, system, noise)
+    if not problem.measured_errors:
+        covariance = covariance * chi2
+    warnings = []
+    if not settled:
+        warnings.append(f"the steps did not shrink within {len(history)} iterations")
+    model = problem.data - system.residual
+    explained = 1 - float(np.square(system.residual).sum() / np.square(problem.data).sum())
+    expected = (
+        1 - problem.data.size / float(np.square(problem.data).sum()) if problem.measured_errors else 1.0
+    )
+    if explained < 0.5 * max(expected, 0.0) or np.vdot(model, problem.data) <= 0:
+        warnings.append(
+            f"the model explains {explained:.0%} of the matrix where noise leaves {max(expected, 0.0):.0%} "
+            "to explain; wrong layout, flip or basis, or a registration beyond capture"
+        )
+    sigma = np.sqrt(np.diag(covariance))
+    worst = int(np.argmax(sigma[1:6] / _LARGEST))
+    if sigma[1 + worst] > _LARGEST[worst]:
+        warnings.append(f"the data do not constrain {PARAMETERS[worst]}; use more frames or more modes")
+    return RegistrationEstimate(
+        Registration.from_array(state.alpha),
+        covariance[1:6, 1:6],
+        Measured(state.gain, float(sigma[_GAIN])),
+        Measured(1 + state.width, float(sigma[_WIDTH])),
+        settled and len(warnings) == 0,
+        tuple(history),
+        chi2,
+        tuple(warnings),
+    )

@@ -1,0 +1,1 @@
+"""Benchmark stages of the core, found through the entry-point group ``escape.benchmarks``."""

@@ -1,0 +1,75 @@
+"""Slopes and integrator against the kernels of pyRTC, on the same arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.benchmark import BenchmarkRow, alternate
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.cli.benchmarks.peer import ABSENT, name, pyrtc
+from escape_hw.pipeline.slopes import SlopeExtractor
+
+
+def run() -> list[BenchmarkRow]:
+    """All rows of the stage."""
+    # RAZOR's grid with whole pixels (the peer knows no others), and a large one.
+    return [_slopes(n_sub, pitch) for n_sub, pitch in ((10, 8), (24, 16), (40, 8))]
+
+
+def spots(n_sub: int, pitch: int, seed: int = 0) -> NDArray[np.uint16]:
+    """A frame with one spot per lenslet, moved by up to a pixel, on a background of zero."""
+    rng = np.random.default_rng(seed)
+    line = np.arange(pitch) - (pitch - 1) / 2
+    move = rng.uniform(-1, 1, (2, n_sub, n_sub, 1))
+    x, y = np.exp(-((line - move) ** 2) / (2 * 1.2**2))
+    image = 900 * y[:, :, :, None] * x[:, :, None, :]
+    return np.asarray(image.transpose(0, 2, 1, 3).reshape(n_sub * pitch, -1).round(), dtype=np.uint16)
+
+
+def _slopes(n_sub: int, pitch: int) -> BenchmarkRow:
+    frame = spots(n_sub, pitch)
+    valid = np.ones((n_sub, n_sub), np.bool_)
+    half = (pitch - 1) / 2
+    grid = SubApertureGrid(
+        float(pitch), (half, half), valid, np.zeros((n_sub**2, 2), np.float32), valid.astype(np.float32)
+    )
+    extractor = SlopeExtractor(grid, (frame.shape[0], frame.shape[1]))
+    peer = _peer_slopes(frame, n_sub, pitch)
+    note = ABSENT
+    if peer is not None:
+        worst = float(np.abs(extractor(frame) - peer().ravel()).max())
+        note = f"largest difference {worst:.1e} px" if worst < 1e-4 else f"DISAGREES by {worst:.1e} px"
+    out = np.empty(grid.n_slopes, np.float32)
+    ours_s, peer_s = alternate(lambda: extractor(frame, None, out), peer)
+    return BenchmarkRow(
+        f"pipeline: slopes {n_sub} x {n_sub}, {pitch} px",
+        ours_s * 1e6,
+        None if peer_s is None else peer_s * 1e6,
+        name("compute_slopes_shwfs_optim_numba"),
+        "us",
+        "lower",
+        note,
+    )
+
+
+def _peer_slopes(
+    frame: NDArray[np.uint16], n_sub: int, pitch: int
+) -> Callable[[], NDArray[np.float32]] | None:
+    module = pyrtc("slopes_process")
+    if module is None:
+        return None
+    image = frame.astype(np.int32)  # what its wavefront sensor publishes
+    kernel = module.compute_slopes_shwfs_optim_numba
+    line = module.shwfs_subaperture_coords(pitch)
+    weights = np.meshgrid(line, line)[0].astype(np.float32)
+    reference = np.zeros((2 * n_sub, n_sub), np.float32)
+    out = np.zeros_like(reference)
+
+    def call() -> NDArray[np.float32]:
+        kernel(image, out, reference, np.float32(0), np.float32(pitch), weights, 0, 0, pitch)
+        return out
+
+    return call

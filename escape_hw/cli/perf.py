@@ -1,0 +1,100 @@
+"""``escape perf``: our speed and accuracy beside other packages', measured in one run."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+
+from escape_hw.errors import ConfigError
+
+if TYPE_CHECKING:
+    from escape_hw.api.benchmark import Benchmark, BenchmarkRow
+
+GROUP = "escape.benchmarks"
+
+
+def available() -> dict[str, EntryPoint]:
+    """Benchmark stages by name, in alphabetical order."""
+    return dict(sorted((point.name, point) for point in entry_points(group=GROUP)))
+
+
+def measure(stages: Sequence[str] = ()) -> list[BenchmarkRow]:
+    """Run benchmark stages.
+
+    Parameters
+    ----------
+    stages
+        Names; all of them by default.
+
+    Raises
+    ------
+    ConfigError
+        A stage does not exist.
+    """
+    from escape_hw.api.benchmark import one_thread
+
+    known = available()
+    unknown = [name for name in stages if name not in known]
+    if unknown:
+        raise ConfigError(f"unknown stage {unknown[0]!r}; there are: {', '.join(known) or 'none'}")
+    rows: list[BenchmarkRow] = []
+    with one_thread():
+        for name in stages or known:
+            benchmark = cast("Benchmark", known[name].load())
+            rows += benchmark()
+    return rows
+
+
+def document(rows: Sequence[BenchmarkRow]) -> dict[str, Any]:
+    """The JSON document."""
+    return {
+        "schema": 1,
+        "system": "razor-shwfs",
+        "simulated": True,
+        "seed": 1,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "rows": [row.to_dict() for row in rows],
+    }
+
+
+def perf(
+    stages: Annotated[
+        list[str] | None, typer.Argument(metavar="[STAGE]...", help="Stages to measure; all by default.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+) -> None:
+    """Measure our speed and accuracy beside OOPAO's and pyRTC's, on one thread each."""
+    rows = measure(stages or ())
+    if as_json:
+        json.dump(document(rows), sys.stdout, indent=1)
+        sys.stdout.write("\n")
+    else:
+        _print_table(rows)
+
+
+def _print_table(rows: Sequence[BenchmarkRow]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("stage", "ours", "peer", "unit", "times better", "peer is", "note")
+    for column in table.columns[1:3]:
+        column.justify = "right"
+    table.columns[4].justify = "right"
+    for row in rows:
+        table.add_row(
+            row.stage,
+            f"{row.ours:.4g}",
+            "-" if row.peer is None else f"{row.peer:.4g}",
+            row.unit,
+            "-" if row.ratio is None else f"{row.ratio:.2f}",
+            row.peer_name,
+            row.note,
+        )
+    Console().print(table)

@@ -1,0 +1,118 @@
+"""What a tip-tilt modulator promises."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from escape_hw.api.modulator import Modulation, TipTiltModulator
+from escape_hw.errors import SettingRejected
+from escape_hw.testing.checks import READS, TINY, Check, Factory, check, opened, refused, replaced, up_to
+from escape_hw.testing.common import COMMON
+
+#: A tilt that any stage for a pyramid sensor can do, in radians.
+_SMALL_RAD = 1e-6
+
+
+def _wish(modulator: TipTiltModulator) -> Modulation:
+    """A small circle at a rate the stage can do, unlikely to be exactly achievable."""
+    for rate in (97.3, 9.73, 0.973, 973.0):
+        want = Modulation(_SMALL_RAD, rate)
+        try:
+            modulator.check(want)
+        except SettingRejected:
+            continue
+        return want
+    raise AssertionError(f"{modulator.name}: refuses {_SMALL_RAD} rad at every rate from 1 Hz to 1 kHz")
+
+
+@check(READS)
+def check_modulator_check_changes_nothing(factory: Factory) -> None:
+    """``check`` moves nothing, and its own answer is achievable."""
+    with opened(factory) as modulator:
+        before, want = modulator.modulation, _wish(modulator)
+        answer = modulator.check(want)
+        assert isinstance(answer, Modulation), f"check() gave {type(answer).__name__}"
+        again = modulator.check(answer)
+        assert again == answer, f"check() made {answer} of {want}, and then {again} of its own answer"
+        after = modulator.modulation
+        assert after == before, f"check() changed the modulation from {before} to {after}"
+
+
+@check(READS)
+def check_modulator_refuses_meaningless(factory: Factory) -> None:
+    """Radius, frequency and centre that mean nothing are refused and move nothing."""
+    with opened(factory) as modulator:
+        before, good = modulator.modulation, _wish(modulator)
+        wrong = [replace(good, radius_rad=r) for r in (-1e-6, math.nan, math.inf)]
+        wrong += [replace(good, frequency_hz=f) for f in (0.0, -1.0, math.nan, math.inf)]
+        wrong += [replace(good, centre_rad=c) for c in ((math.nan, 0.0), (0.0, math.inf))]
+        for want in wrong:
+            for verb in (modulator.check, modulator.modulate):
+                refused(modulator, SettingRejected, f"{verb.__name__}({want})", verb, want)
+            assert modulator.modulation == before, f"{want} was refused, but the modulation changed"
+
+
+@check(TINY)
+def check_modulator_tells_the_truth(factory: Factory) -> None:
+    """``modulate`` answers with what the stage says it does, which ``check`` had foreseen."""
+    with opened(factory) as modulator:
+        want = _wish(modulator)
+        foreseen = modulator.check(want)
+        answer, now = modulator.modulate(want), modulator.modulation
+        assert answer == now, f"modulate() answered {answer}, but modulation says {now}"
+        off = abs(answer.frequency_hz / foreseen.frequency_hz - 1)
+        assert off < 0.01, (
+            f"check() foresaw {foreseen.frequency_hz} Hz, the stage does {answer.frequency_hz} Hz"
+        )
+        still = modulator.modulate(replace(want, radius_rad=0.0))
+        assert still.radius_rad == 0.0, f"asked for no radius, got {still.radius_rad} rad"
+
+
+@check(TINY)
+def check_modulator_parks(factory: Factory) -> None:
+    """``park`` stops the modulation, may be repeated, and is where the stage is on opening."""
+    with opened(factory) as modulator:
+        assert modulator.modulation is None, f"modulating on opening: {modulator.modulation}"
+        modulator.park()
+        modulator.modulate(_wish(modulator))
+        for _ in range(2):
+            modulator.park()
+            assert modulator.modulation is None, f"after park(): {modulator.modulation}"
+
+
+@check(TINY)
+def check_modulator_is_parked_when_closed(factory: Factory) -> None:
+    """``close`` parks before it disconnects."""
+    with opened(factory) as modulator:
+        modulator.modulate(_wish(modulator))
+        disconnect, at_the_end = modulator._close, []  # noqa: SLF001 - see the state by then
+
+        def closing() -> None:
+            at_the_end.append(modulator.modulation)
+            disconnect()
+
+        with replaced(modulator, "_close", closing):
+            modulator.close()
+        assert at_the_end == [None], f"the stage was left at {at_the_end} when it was disconnected"
+
+
+MODULATOR: tuple[Check, ...] = (
+    *COMMON,
+    check_modulator_check_changes_nothing,
+    check_modulator_refuses_meaningless,
+    check_modulator_tells_the_truth,
+    check_modulator_parks,
+    check_modulator_is_parked_when_closed,
+)
+
+
+def modulator_checks(max_level: int = 3) -> list[Check]:
+    """Checks for a :class:`~escape_hw.api.modulator.TipTiltModulator`.
+
+    Parameters
+    ----------
+    max_level
+        Leave out what moves the stage more: 0 rests, 1 modulates by a microradian.
+    """
+    return up_to(MODULATOR, max_level)

@@ -1,0 +1,91 @@
+"""What a phase-screen changer promises."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+from escape_hw.api.screen import ScreenState
+from escape_hw.errors import SettingRejected
+from escape_hw.testing.checks import FULL, NORMAL, READS, Check, Factory, check, opened, refused, up_to
+from escape_hw.testing.common import COMMON
+
+
+@check(READS)
+def check_screen_state_makes_sense(factory: Factory) -> None:
+    """The state names a screen that exists, in or out, at a speed."""
+    with opened(factory) as screen:
+        state = screen.state
+        assert isinstance(state, ScreenState), f"state is {type(state).__name__}, not ScreenState"
+        assert screen.n_screens >= 1, f"n_screens is {screen.n_screens}"
+        assert 0 <= state.screen < screen.n_screens, f"{state}, but there are {screen.n_screens} screens"
+        assert isinstance(state.inserted, bool), f"inserted is {state.inserted!r}, not a bool"
+        assert 0 <= state.speed_m_s < math.inf, f"speed_m_s is {state.speed_m_s}"
+
+
+@check(READS)
+def check_screen_refuses_meaningless(factory: Factory) -> None:
+    """Screens that do not exist and speeds that mean nothing are refused and change nothing."""
+    with opened(factory) as screen:
+        before = screen.state
+        wrong: list[dict[str, Any]] = [{"screen": k} for k in (-1, screen.n_screens, 0.5, True)]
+        wrong += [{"speed_m_s": v} for v in (-1.0, math.nan, math.inf)]
+        wrong += [{"inserted": "yes"}, {"screen": screen.n_screens, "inserted": not before.inserted}]
+        for change in wrong:
+            refused(screen, SettingRejected, f"set({change})", partial(screen.set, **change))
+            assert screen.state == before, f"set({change}) was refused, but the state changed"
+
+
+@check(NORMAL)
+def check_screen_set_keeps_the_rest(factory: Factory) -> None:
+    """``set`` changes what is given, keeps the rest, and answers with the state reached."""
+    with opened(factory) as screen:
+        before = screen.state
+        try:
+            assert screen.set() == before, "set() without arguments changed the state"
+            for inserted in (False, True):
+                answer = screen.set(inserted=inserted)
+                assert answer == screen.state, f"set() answered {answer}, but state says {screen.state}"
+                assert answer.inserted is inserted, f"set(inserted={inserted}) led to {answer}"
+                assert answer.screen == before.screen, "set(inserted=...) changed the screen"
+                assert answer.speed_m_s == before.speed_m_s, "set(inserted=...) changed the speed"
+            still = screen.set(speed_m_s=0.0)
+            assert still.speed_m_s == 0.0, f"set(speed_m_s=0) led to {still}"
+            assert still.screen == before.screen, "set(speed_m_s=...) changed the screen"
+        finally:
+            screen.set(screen=before.screen, inserted=before.inserted, speed_m_s=before.speed_m_s)
+
+
+@check(FULL)
+def check_screen_reaches_every_screen(factory: Factory) -> None:
+    """Every screen of the changer can be chosen."""
+    with opened(factory) as screen:
+        before = screen.state
+        try:
+            for k in range(screen.n_screens):
+                reached = screen.set(screen=k)
+                assert reached.screen == k, f"set(screen={k}) led to {reached}"
+                assert screen.state == reached, f"set() answered {reached}, but state says {screen.state}"
+        finally:
+            screen.set(screen=before.screen)
+
+
+SCREEN: tuple[Check, ...] = (
+    *COMMON,
+    check_screen_state_makes_sense,
+    check_screen_refuses_meaningless,
+    check_screen_set_keeps_the_rest,
+    check_screen_reaches_every_screen,
+)
+
+
+def screen_checks(max_level: int = 3) -> list[Check]:
+    """Checks for a :class:`~escape_hw.api.screen.PhaseScreen`.
+
+    Parameters
+    ----------
+    max_level
+        Leave out what moves the changer more: 0 rests, 2 moves the screen in and out, 3 uses all.
+    """
+    return up_to(SCREEN, max_level)

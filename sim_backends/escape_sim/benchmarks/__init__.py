@@ -1,0 +1,1 @@
+"""Benchmark stages of the twin, found through the entry-point group ``escape.benchmarks``."""

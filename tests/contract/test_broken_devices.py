@@ -1,0 +1,81 @@
+"""Every general check fails on a device that breaks just what it checks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from escape_hw.api.device import Device
+from escape_hw.errors import DeviceError, NotOpen
+from escape_hw.testing.common import COMMON
+from escape_hw.testing.reference import RecordingMirror, SteadyScreen
+
+Broken = tuple[str, type[Device], str, dict[str, Any]]
+Catches = Callable[[Callable[[], Device], str], None]
+
+
+def opens_itself(self: Any) -> None:
+    SteadyScreen.__init__(self)
+    self._is_open = True
+
+
+def refuses_to_reopen(self: Any) -> None:
+    self.opened = getattr(self, "opened", 0) + 1
+    if self.opened > 1:
+        raise DeviceError(self.name, "only once")
+
+
+def swallows(self: Any, *error: Any) -> bool:
+    self.close()
+    return True
+
+
+def sets_anyway(self: Any, **change: Any) -> Any:
+    return self._state if not self.is_open else SteadyScreen.set(self, **change)
+
+
+def unnamed_not_open(self: Any) -> None:
+    if not self._is_open:
+        raise NotOpen("device", "not open")
+
+
+def falling_clock(self: Any) -> int:
+    return -time.monotonic_ns()
+
+
+BROKEN: list[Broken] = [
+    ("opens itself", SteadyScreen, "construction_is_passive", {"__init__": opens_itself}),
+    ("finaliser", SteadyScreen, "construction_is_passive", {"__del__": lambda self: None}),
+    (
+        "no name",
+        SteadyScreen,
+        "construction_is_passive",
+        {"__init__": lambda self: SteadyScreen.__init__(self, "")},
+    ),
+    ("overrides send", RecordingMirror, "final_methods_are_kept", {"send": lambda self, c: self._send(c)}),
+    ("opens once", SteadyScreen, "open_and_close_repeat", {"_open": refuses_to_reopen}),
+    ("swallows errors", SteadyScreen, "context_manager", {"__exit__": swallows}),
+    ("works while closed", SteadyScreen, "refuses_use_unless_open", {"set": sets_anyway}),
+    ("does not say who", SteadyScreen, "refuses_use_unless_open", {"require_open": unnamed_not_open}),
+    ("clock runs backwards", SteadyScreen, "clock_never_runs_backwards", {"now_ns": falling_clock}),
+    (
+        "clock in seconds",
+        SteadyScreen,
+        "clock_never_runs_backwards",
+        {"now_ns": lambda self: time.monotonic()},
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("base", "expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN]
+)
+def test_check_catches(catches: Catches, base: type[Device], expected: str, defects: dict[str, Any]) -> None:
+    catches(type("Broken", (base,), defects), expected)
+
+
+def test_every_check_is_tested() -> None:
+    assert {check.__name__ for check in COMMON} == {f"check_{case[2]}" for case in BROKEN}

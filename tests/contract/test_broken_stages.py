@@ -1,0 +1,85 @@
+"""Every check on modulators and screens fails on one that breaks just what it checks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from escape_hw.api.device import Device
+from escape_hw.errors import SettingRejected
+from escape_hw.testing import modulator_checks, screen_checks
+from escape_hw.testing.common import COMMON
+from escape_hw.testing.reference import QuantisedModulator, SteadyScreen
+
+Broken = tuple[str, type[Device], str, dict[str, Any]]
+Catches = Callable[[Callable[[], Device], str], None]
+
+
+def checks_by_moving(self: Any, want: Any) -> Any:
+    self._modulation = QuantisedModulator._check(self, want)
+    return self._modulation
+
+
+def takes_all(self: Any, want: Any) -> Any:
+    self.require_open()
+    return want
+
+
+def modulates_as_asked(self: Any, want: Any) -> Any:
+    QuantisedModulator.modulate(self, want)
+    return want
+
+
+def forgets_the_rest(self: Any, **change: Any) -> Any:
+    self.require_open()
+    return SteadyScreen.set(self, **{"screen": 0, **change})
+
+
+def answers_blindly(self: Any, **change: Any) -> Any:
+    return replace(SteadyScreen.set(self, **change), speed_m_s=1.0)
+
+
+def sticks(self: Any, want: Any) -> None:
+    self._state = replace(want, screen=min(want.screen, 2))
+
+
+def repairs_screen(self: Any, **change: Any) -> Any:
+    try:
+        return SteadyScreen.set(self, **change)
+    except SettingRejected:
+        return self._state
+
+
+BROKEN: list[Broken] = [
+    ("check moves", QuantisedModulator, "modulator_check_changes_nothing", {"_check": checks_by_moving}),
+    ("any modulation", QuantisedModulator, "modulator_refuses_meaningless", {"check": takes_all}),
+    ("modulate lies", QuantisedModulator, "modulator_tells_the_truth", {"modulate": modulates_as_asked}),
+    ("does not park", QuantisedModulator, "modulator_parks", {"_park": lambda self: None}),
+    (
+        "closes moving",
+        QuantisedModulator,
+        "modulator_is_parked_when_closed",
+        {"_before_close": lambda self: None},
+    ),
+    ("counts from one", SteadyScreen, "screen_state_makes_sense", {"n_screens": property(lambda self: 1)}),
+    ("takes anything", SteadyScreen, "screen_refuses_meaningless", {"set": repairs_screen}),
+    ("forgets the rest", SteadyScreen, "screen_set_keeps_the_rest", {"set": forgets_the_rest}),
+    ("answers blindly", SteadyScreen, "screen_set_keeps_the_rest", {"set": answers_blindly}),
+    ("sticks", SteadyScreen, "screen_reaches_every_screen", {"_set": sticks}),
+]
+
+
+@pytest.mark.parametrize(
+    ("base", "expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN]
+)
+def test_check_catches(catches: Catches, base: type[Device], expected: str, defects: dict[str, Any]) -> None:
+    catches(type("Broken", (base,), defects), expected)
+
+
+def test_every_check_is_tested() -> None:
+    assert {check.__name__ for check in {*modulator_checks(), *screen_checks()} - set(COMMON)} == {
+        f"check_{case[2]}" for case in BROKEN
+    }

@@ -1,0 +1,60 @@
+"""Registration: order, units and the direction of every parameter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from escape_hw.api.registration import PARAMETERS, UNITS, Registration
+
+EAST, SOUTH = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+
+
+def placed(point: np.ndarray, **parameters: float) -> np.ndarray:
+    """Where an actuator at ``point`` metres stands; sub-apertures of 0.5 m."""
+    matrix, offset = Registration(**parameters).affine(0.5)
+    return np.asarray(matrix @ point + offset)
+
+
+def test_the_nominal_registration_moves_nothing() -> None:
+    np.testing.assert_array_equal(placed(np.array([0.3, -0.7])), [0.3, -0.7])
+
+
+def test_shifts_are_percents_of_a_sub_aperture() -> None:
+    np.testing.assert_allclose(placed(np.zeros(2), shift_x=100.0), [0.5, 0.0])
+    np.testing.assert_allclose(placed(np.zeros(2), shift_y=-20.0), [0.0, -0.1])
+
+
+def test_a_positive_rotation_turns_x_towards_y() -> None:
+    np.testing.assert_allclose(placed(EAST, rotation=90.0), SOUTH, atol=1e-15)
+    np.testing.assert_allclose(placed(SOUTH, rotation=90.0), -EAST, atol=1e-15)
+
+
+def test_scalings_stretch_along_x_and_along_y() -> None:
+    np.testing.assert_allclose(placed(EAST + SOUTH, radial_scaling=3.0), [1.03, 1.0])
+    np.testing.assert_allclose(placed(EAST + SOUTH, tangential_scaling=-2.0), [1.0, 0.98])
+
+
+def test_scaling_comes_before_rotation_and_rotation_before_shift() -> None:
+    where = placed(EAST, radial_scaling=10.0, rotation=90.0, shift_x=100.0)
+    np.testing.assert_allclose(where, [0.5, 1.1], atol=1e-15)
+
+
+@given(st.lists(st.floats(-100, 100), min_size=5, max_size=5))
+def test_arrays_and_dictionaries_keep_the_order(values: list[float]) -> None:
+    registration = Registration.from_array(values)
+    assert registration.to_array().tolist() == values
+    assert list(registration.to_dict()) == list(PARAMETERS)
+    assert Registration(**registration.to_dict()) == registration
+
+
+def test_every_parameter_has_a_unit() -> None:
+    assert set(UNITS) == set(PARAMETERS)
+
+
+@pytest.mark.parametrize("size", [4, 6])
+def test_five_numbers_are_needed(size: int) -> None:
+    with pytest.raises(ValueError, match="reshape"):
+        Registration.from_array(np.zeros(size))
