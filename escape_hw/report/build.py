@@ -122,7 +122,7 @@ def _registration(run: RunContent) -> str:
 def _loops(run: RunContent) -> str:
     if not run.loops:
         return ""
-    parts = [html.table(tables.strehl_table(run.loops))]
+    parts = [html.table(tables.strehl_table(run.loops), "rms: residual wavefront seen by the sensor.")]
     if any(loop.psf is not None for loop in run.loops.values()):
         parts.append(
             html.figure(
