@@ -95,7 +95,7 @@ def strehl_table(loops: Mapping[str, LoopResult]) -> Table:
         "Strehl, OTF [%]",
         "Strehl, encircled [%]",
         "gain",
-        "residual, rms",
+        "rms [nm]",
         "loop",
     )
     rows = []
