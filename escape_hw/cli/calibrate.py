@@ -31,7 +31,7 @@ def calibrate(
     modes: Annotated[int | None, typer.Option("--modes", min=1, help="Number of modes.")] = None,
     accuracy: Annotated[
         float | None,
-        typer.Option("--accuracy", help="Wanted standard error of the shifts, % of a sub-aperture (escape)."),
+        typer.Option("--accuracy", help="Exit 1 unless the shifts are known to this % of a sub-aperture."),
     ] = None,
     plain: Annotated[
         bool, typer.Option("--plain", help="The paper's estimator, turbulence not whitened (docrime).")
@@ -92,7 +92,7 @@ def _procedure(
     def escape(bench: Bench) -> Procedure[CalibrationResult]:
         from escape_hw.calibration.escape import escape
 
-        return (yield from escape(bench, frames=frames, poke=poke, accuracy=accuracy))
+        return (yield from escape(bench, frames=frames, poke=poke))
 
     return {"push-pull": push_pull, "docrime": docrime, "escape": escape}[method]
 

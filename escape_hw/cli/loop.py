@@ -111,7 +111,7 @@ def _procedure(
         with without_turbulence(bench):
             model = yield from measure_model_psf(bench)
     if best:
-        gain, runs = yield from best_gain(bench, matrix, grid)
+        gain, runs = yield from best_gain(bench, matrix, grid, model_psf=model)
         stopped = [run for run in runs if run.partial]
         if stopped:
             return stopped[-1]

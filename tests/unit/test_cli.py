@@ -79,16 +79,8 @@ def test_help_is_quick_and_light():
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     for command in (
-        "systems",
-        "config",
-        "calibrate",
-        "sprint",
-        "loop",
-        "reproduce",
-        "show",
-        "compare",
-        "report",
-    ):
+        "systems", "config", "calibrate", "sprint", "loop", "reproduce", "show", "compare", "report", "perf",
+    ):  # fmt: skip
         assert command in done.stdout
 
 
@@ -231,6 +223,7 @@ def test_unstable_loop_and_lost_convergence_exit_1(document, bench, im, tmp_path
         ("loop", "razor-shwfs", "--im", "absent.fits"),
         ("show", "absent.fits"),
         ("report", "absent"),
+        ("perf", "no-such-stage"),
         ("nonsense",),
     ],
 )
