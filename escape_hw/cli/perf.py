@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import platform
-import sys
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from escape_hw.cli.session import session
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from escape_hw.api.benchmark import Benchmark, BenchmarkRow
 
 GROUP = "escape.benchmarks"
@@ -71,16 +72,13 @@ def perf(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
 ) -> None:
     """Measure our speed and accuracy beside OOPAO's and pyRTC's, on one thread each."""
-    rows = measure(stages or ())
-    if as_json:
-        json.dump(document(rows), sys.stdout, indent=1)
-        sys.stdout.write("\n")
-    else:
-        _print_table(rows)
+    with session("perf", json=as_json) as one:
+        rows = measure(stages or ())
+        one.show(_table(rows))
+        one.result(document(rows))
 
 
-def _print_table(rows: Sequence[BenchmarkRow]) -> None:
-    from rich.console import Console
+def _table(rows: Sequence[BenchmarkRow]) -> Table:
     from rich.table import Table
 
     table = Table("stage", "ours", "peer", "unit", "times better", "peer is", "note")
@@ -97,4 +95,4 @@ def _print_table(rows: Sequence[BenchmarkRow]) -> None:
             row.peer_name,
             row.note,
         )
-    Console().print(table)
+    return table
