@@ -77,9 +77,10 @@ def alternate(
     both = [f for f in (ours, peer) if f is not None]
     repeats = []
     for call in both:
-        call()
-        once = max(_elapsed(call, 1), 1e-7)
-        repeats.append(max(1, round(seconds / rounds / once)))
+        once = _elapsed(call, 1)
+        if once < seconds:
+            once = _elapsed(call, 1)
+        repeats.append(max(1, round(seconds / rounds / max(once, 1e-7))))
     times: list[list[float]] = [[] for _ in both]
     for _ in range(rounds):
         for k, call in enumerate(both):

@@ -55,7 +55,9 @@ def _compare(
     size = f"{_N_MODES} modes, {_N_SLOPES} slopes, {_N_FRAMES} frames"
     error = None if peer is None else data.error(peer())
     rows = [
-        BenchmarkRow(f"docrime: IM error, {label}", data.error(ours(data)), error, who, "1", "lower", note or size)
+        BenchmarkRow(
+            f"docrime: IM error, {label}", data.error(ours(data)), error, who, "1", "lower", note or size
+        )
     ]
     if timed:
         ours_s, peer_s = alternate(lambda: ours(data), peer, seconds=1.0, rounds=3)

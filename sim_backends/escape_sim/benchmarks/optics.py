@@ -96,11 +96,11 @@ def oopao_frame(config: SystemConfig) -> Callable[[], object]:
     telescope, source = light.telescope, light.source
     with quiet():
         # As many photons per frame as the twin has.
+        rate = config.devices.wfs.frame_rate_hz
+        telescope.samplingTime = 1 / rate
         telescope.pupilReflectivity = telescope.pupilReflectivity * (
-            config.twin.wfs.photons_per_frame / power
+            config.twin.wfs.photons_per_frame * rate / power
         )
-        telescope.samplingTime = 1 / config.devices.wfs.frame_rate_hz
-        telescope.pupilReflectivity *= config.devices.wfs.frame_rate_hz
         screen = config.devices.screen
         r0 = screen.screens_r0_m[screen.screen] if screen else 1.0
         atmosphere = import_module("OOPAO.Atmosphere").Atmosphere(
