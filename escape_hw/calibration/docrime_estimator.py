@@ -5,6 +5,7 @@ The paper's estimator, ``D = <s c^T> <c c^T>^-1``, is the special case of a filt
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.lagged_sums import LaggedSums
+from escape_hw.calibration.response import fit_response, usable_rows
 from escape_hw.calibration.telemetry import Telemetry
-from escape_hw.calibration.whitening import prediction_error_filter
+from escape_hw.calibration.whitening import apply_filter, prediction_error_filter
 from escape_hw.errors import CalibrationError, TooFewFrames
 
 #: Frames kept to fit the whitening filter before the sums start.
@@ -65,11 +67,14 @@ class DocrimeEstimator:
         if order < 0 or lags < 1:
             raise ValueError(f"order is {order} and lags {lags}; they must be at least 0 and 1")
         self.n_slopes, self.n_modes, self.order, self.lags = n_slopes, n_modes, order, lags
-        self._index: list[int] = []
-        self._slopes: list[NDArray[np.float32]] = []
-        self._pokes: list[NDArray[np.float64]] = []
+        rows = max(BURN_IN, BLOCK)
+        self._index = np.empty(rows, np.int64)
+        self._slopes = np.empty((rows, n_slopes), np.float32)
+        self._pokes = np.empty((rows, n_modes), np.float32)
+        self._filled = 0
         self._data: Telemetry | None = None
         self._last_index: int | None = None
+        self._absorbed = 0
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
         self._sums = LaggedSums.zeros(n_slopes, n_modes, 1)
@@ -98,15 +103,15 @@ class DocrimeEstimator:
             raise ValueError(
                 f"slopes {slopes.shape} and poke {poke.shape} do not fit ({self.n_slopes},) and ({self.n_modes},)"
             )
-        if not (np.isfinite(slopes).all() and np.isfinite(poke).all()):
+        # A sum of squares is finite when all numbers are, and takes a tenth of the time to ask.
+        if not math.isfinite(slopes.dot(slopes) + poke.dot(poke)):
             raise ValueError(f"frame {index}: slopes or poke are not finite")
-        previous = self._index[-1] if self._index else self._last_index
-        if previous is not None and index <= previous:
-            raise ValueError(f"frame index went from {previous} to {index}; it must rise")
-        self._index.append(index)
-        self._slopes.append(slopes)
-        self._pokes.append(poke)
-        if len(self._index) >= (BURN_IN if self._response is None else BLOCK):
+        if self._last_index is not None and index <= self._last_index:
+            raise ValueError(f"frame index went from {self._last_index} to {index}; it must rise")
+        k = self._filled
+        self._index[k], self._slopes[k], self._pokes[k] = index, slopes, poke
+        self._last_index, self._filled = index, k + 1
+        if self._filled >= (BURN_IN if self._response is None else BLOCK):
             self._absorb()
         return self
 
@@ -128,7 +133,8 @@ class DocrimeEstimator:
                 f"at least {needed + self.order + self.lags} frames are needed"
             )
         sums = self._sums.centred()
-        if self._response is None or np.linalg.cond(sums.gram[0, :, 0, :]) > 1e12:
+        excitation = np.linalg.eigvalsh(sums.gram[0, :, 0, :])
+        if self._response is None or excitation[0] <= 1e-12 * excitation[-1]:
             raise CalibrationError(
                 "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
             )
@@ -143,22 +149,20 @@ class DocrimeEstimator:
 
     def _absorb(self) -> None:
         """Move the gathered frames into the sums; fit the filter first if there is none yet."""
-        if not self._index:
+        if not self._filled:
             return
-        fresh = Telemetry.from_frames(
-            np.array(self._index, dtype=np.int64), np.stack(self._slopes), np.stack(self._pokes)
-        )
-        self.frames += len(self._index)
+        n, self._filled = self._filled, 0
+        fresh = Telemetry.from_frames(self._index[:n], self._slopes[:n], self._pokes[:n])
+        self.frames += n
         self.lost_frames += fresh.n_lost
-        start, gap = 0, 0
-        if self._data is not None and self._last_index is not None:
-            gap = self._index[0] - self._last_index - 1
+        start = 0
+        if self._data is not None:
+            gap = int(self._index[0]) - self._absorbed - 1
             self.lost_frames += gap
             start = 0 if self._response is None else self._data.present.size
             # A gap longer than the memory of filter and response separates the stretches for good.
             fresh = self._data.followed_by(fresh, min(gap, 2 * (self.order + self.lags)))
-        self._last_index = self._index[-1]
-        self._index, self._slopes, self._pokes = [], [], []
+        self._absorbed = int(self._index[n - 1])
         if self._whitener is None or self._response is None:
             self._fit(fresh)
         if self._whitener is not None and self._response is not None:
@@ -167,27 +171,32 @@ class DocrimeEstimator:
         self._data = fresh
 
     def _fit(self, data: Telemetry) -> None:
-        """Filter and temporal response from the first frames: frame differences, then two rounds.
+        """Temporal response and filter from the first frames: by frame differences, then by the filter.
 
         Too few frames leave both unset; the next call sees these frames again.
         """
+        # Each half of the frames must determine a matrix of its own.
+        if usable_rows(data, max(self.order, 1), self.lags).size < 2 * (self.n_modes + MIN_FREEDOM):
+            return
         # Differences tell the response well even where the plain estimator is asked for.
-        whitener = np.array([1.0, -1.0])
-        for last in (False, False, True) if self.order else (True,):
-            sums = LaggedSums.zeros(self.n_slopes, self.n_modes, self.lags)
-            sums.add(data, whitener)
-            if sums.count < self.n_modes + self.lags + MIN_FREEDOM:
-                return
-            sums = sums.centred()
-            response = sums.fit_response()
-            if last:
-                break
-            matrix = sums.solve(response.weights)[0]
-            at = data.complete(0, self.lags)
-            seen = sum(w * data.pokes[at - lag] for lag, w in enumerate(response.weights))
-            residuals = np.zeros_like(data.slopes)
-            residuals[at] = data.slopes[at] - seen @ matrix.T
-            usable = np.zeros_like(data.present)
-            usable[at] = True
+        difference = np.array([1.0, -1.0])
+        response, whitener = fit_response(data, difference, self.lags), np.ones(1)
+        if self.order:
+            residuals, usable = self._residuals(data, difference, response)
             whitener = prediction_error_filter(residuals, usable, self.order)
-        self._whitener, self._response = whitener if self.order else np.ones(1), response
+            response = fit_response(data, whitener, self.lags)
+        self._whitener, self._response = whitener, response
+
+    def _residuals(
+        self, data: Telemetry, whitener: NDArray[np.float64], response: TemporalResponse
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Slopes less what the pokes explain ``(n_times, n_slopes)``, and the rows where that is known."""
+        sums = LaggedSums.zeros(self.n_slopes, self.n_modes, 1)
+        sums.add(data, whitener, 0, response.weights)
+        matrix = sums.centred().solve(_ONE)[0].astype(np.float32)
+        at = data.complete(0, self.lags)
+        residuals = np.zeros_like(data.slopes)
+        residuals[at] = data.slopes[at] - apply_filter(data.pokes, response.weights, at) @ matrix.T
+        usable = np.zeros_like(data.present)
+        usable[at] = True
+        return residuals, usable

@@ -24,12 +24,12 @@ class Telemetry:
     """
 
     slopes: NDArray[np.float32]
-    pokes: NDArray[np.float64]
+    pokes: NDArray[np.floating]
     present: NDArray[np.bool_]
 
     @classmethod
     def from_frames(
-        cls, index: NDArray[np.int64], slopes: NDArray[np.float32], pokes: NDArray[np.float64]
+        cls, index: NDArray[np.int64], slopes: NDArray[np.float32], pokes: NDArray[np.floating]
     ) -> Telemetry:
         """Lay frames out by index.
 
@@ -50,7 +50,7 @@ class Telemetry:
         latest = np.maximum.accumulate(np.where(present, np.arange(n), 0))
         all_slopes = np.zeros((n, slopes.shape[1]), np.float32)
         all_slopes[at] = slopes
-        all_pokes = np.zeros((n, pokes.shape[1]))
+        all_pokes = np.zeros((n, pokes.shape[1]), pokes.dtype)
         all_pokes[at] = pokes
         return cls(all_slopes, all_pokes[latest], present)
 

@@ -39,13 +39,14 @@ def prediction_error_filter(
     """
     if order == 0:
         return np.ones(1)
+    # Rows that are missing are zero and add nothing to any product.
     clean = np.where(present[:, None], residuals, 0.0).astype(np.float64)
-    clean -= np.where(present[:, None], clean.sum(axis=0) / present.sum(), 0.0)
+    clean -= np.where(present[:, None], clean.sum(axis=0) / max(int(present.sum()), 1), 0.0)
+    n = present.size
     covariance = np.empty(order + 1)
     for lag in range(order + 1):
-        both = present[lag:] & present[: present.size - lag]
-        products = np.einsum("ts,ts->", clean[lag:][both], clean[: present.size - lag][both])
-        covariance[lag] = products / max(int(both.sum()), 1)
+        pairs = int((present[lag:] & present[: n - lag]).sum())
+        covariance[lag] = np.vdot(clean[lag:], clean[: n - lag]) / max(pairs, 1)
     if covariance[0] <= 0:
         return np.eye(1, order + 1)[0]
     # A whisper of white noise keeps the system well conditioned when the slopes are noise-free.
