@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Self, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from escape_hw.api.camera import Camera
 from escape_hw.api.device import Device
@@ -45,6 +46,8 @@ class Bench:
     rng
         Random generator of the procedures, seeded from ``system.seed`` and independent of every
         stream that a twin derives from the same seed.
+    dark
+        Dark frame of the sensor's camera in counts, once it was measured or set.
     """
 
     def __init__(
@@ -57,6 +60,7 @@ class Bench:
     ) -> None:
         self.config = config
         self.dm, self.wfs, self.science, self.screen = dm, wfs, science, screen
+        self.dark: NDArray[np.float32] | None = None
         stream = zlib.crc32(b"escape_hw.bench")
         self.rng = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(stream,)))
 

@@ -32,6 +32,8 @@ class SubApertureGrid:
     motion_px
         Rms motion of the spots along an axis, in pixels, during the measurement that a model of
         this sensor is to match.
+    background
+        Level of the dark pixels in counts that was subtracted when no dark frame was at hand.
     """
 
     pitch_px: float
@@ -41,6 +43,7 @@ class SubApertureGrid:
     flux: NDArray[np.float32]
     counts: float = 0.0
     motion_px: float = 0.0
+    background: float = 0.0
 
     @property
     def n_valid(self) -> int:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli import calibrate, loop, products, reproduce, systems
+from escape_hw.cli import calibrate, loop, perf, products, reproduce, systems
 
 app = typer.Typer(
     name="escape",
@@ -29,18 +29,7 @@ app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)
-
-
-@app.command("perf", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
-def perf(
-    context: typer.Context,
-    stages: Annotated[list[str] | None, typer.Argument(help="Stages to measure [default: all].")] = None,
-) -> None:
-    """Measure speed against OOPAO and pyRTC; one row per measurement."""
-    # The benchmarks bring their own options and heavy imports.
-    from escape_hw.cli.perf import main
-
-    raise typer.Exit(main([*(stages or []), *context.args]))
+app.command("perf")(perf.perf)
 
 
 def _version(wanted: bool) -> None:

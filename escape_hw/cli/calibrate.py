@@ -31,7 +31,7 @@ def calibrate(
     modes: Annotated[int | None, typer.Option("--modes", min=1, help="Number of modes.")] = None,
     accuracy: Annotated[
         float | None,
-        typer.Option("--accuracy", help="Wanted standard error of the shifts, % of a sub-aperture (escape)."),
+        typer.Option("--accuracy", help="Exit 1 unless the shifts are known to this % of a sub-aperture."),
     ] = None,
     plain: Annotated[
         bool, typer.Option("--plain", help="The paper's estimator, turbulence not whitened (docrime).")
@@ -92,7 +92,7 @@ def _procedure(
     def escape(bench: Bench) -> Procedure[CalibrationResult]:
         from escape_hw.calibration.escape import escape
 
-        return (yield from escape(bench, frames=frames, poke=poke, accuracy=accuracy))
+        return (yield from escape(bench, frames=frames, poke=poke))
 
     return {"push-pull": push_pull, "docrime": docrime, "escape": escape}[method]
 
@@ -181,7 +181,13 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
     product = load_matrix(im, expect_system=config.system.name, expect_actuators=config.devices.dm.n_act)
     measured = product.result.measured or product.matrix
     model = model_factory(config.calibration.model)(config, product.grid)
-    estimate = sprint(measured, model, learning_rate=config.calibration.learning_rate)
+    settings = config.calibration
+    estimate = sprint(
+        measured,
+        model,
+        modes=min(settings.sprint_modes, measured.n_modes),
+        learning_rate=settings.learning_rate,
+    )
     result = replace(product.result, matrix=measured, measured=None, registration=estimate)
     origin = replace(config_record(config), parents={im.name: product.sha256})
     folder.add("im", save_matrix(folder.file("im.fits"), result, origin))

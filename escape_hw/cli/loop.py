@@ -23,13 +23,13 @@ def loop(
     system: options.System,
     im: options.Matrix,
     gain: Annotated[
-        float | None, typer.Option("--gain", min=0, max=2, help="Gain [default: as configured].")
+        float | None, typer.Option("--gain", min=0, max=2, help="Gain (default: as configured).")
     ] = None,
     leak: Annotated[
-        float | None, typer.Option("--leak", min=0, max=1, help="Leak per frame [default: as configured].")
+        float | None, typer.Option("--leak", min=0, max=1, help="Leak per frame (default: as configured).")
     ] = None,
     drop: Annotated[
-        int | None, typer.Option("--drop", min=0, help="Eigenmodes left out [default: as configured].")
+        int | None, typer.Option("--drop", min=0, help="Eigenmodes left out (default: as configured).")
     ] = None,
     frames: Annotated[int, typer.Option("--frames", min=1, help="Frames to run.")] = 5000,
     best: Annotated[bool, typer.Option("--best-gain", help="Look for the best gain first.")] = False,
@@ -111,7 +111,7 @@ def _procedure(
         with without_turbulence(bench):
             model = yield from measure_model_psf(bench)
     if best:
-        gain, runs = yield from best_gain(bench, matrix, grid)
+        gain, runs = yield from best_gain(bench, matrix, grid, model_psf=model)
         stopped = [run for run in runs if run.partial]
         if stopped:
             return stopped[-1]

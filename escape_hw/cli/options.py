@@ -13,7 +13,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON docum
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bars.")]
 Out = Annotated[
     Path | None,
-    typer.Option("--out", metavar="DIR", help="Folder of the run [default: a dated one in your user data]."),
+    typer.Option("--out", metavar="DIR", help="Folder of the run (default: a dated one in your user data)."),
 ]
 Set = Annotated[
     list[str] | None,

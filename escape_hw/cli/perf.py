@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import platform
-import sys
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
-from escape_hw.errors import ConfigError, EscapeError
+import typer
+
+from escape_hw.cli.session import session
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from escape_hw.api.benchmark import Benchmark, BenchmarkRow
 
 GROUP = "escape.benchmarks"
-_ABOUT = "Measure our speed and accuracy beside OOPAO's and pyRTC's, on one thread each."
 
 
 def available() -> dict[str, EntryPoint]:
@@ -51,53 +52,33 @@ def measure(stages: Sequence[str] = ()) -> list[BenchmarkRow]:
     return rows
 
 
-def _head() -> dict[str, Any]:
-    return {"schema": 1, "command": "perf", "system": "razor-shwfs", "simulated": True, "seed": 1}
-
-
 def document(rows: Sequence[BenchmarkRow]) -> dict[str, Any]:
     """The JSON document."""
     return {
-        **_head(),
+        "schema": 1,
+        "system": "razor-shwfs",
+        "simulated": True,
+        "seed": 1,
         "python": platform.python_version(),
         "machine": platform.machine(),
         "rows": [row.to_dict() for row in rows],
     }
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Measure our speed and accuracy beside OOPAO's and pyRTC's, on one thread each.
-
-    Parameters
-    ----------
-    arguments
-        Names of stages, all by default, and ``--json`` for one JSON document.
-
-    Returns
-    -------
-    int
-        Exit code: 0, also where a peer is not installed; 2 for a stage that does not exist.
-    """
-    parser = argparse.ArgumentParser(prog="escape perf", description=_ABOUT)
-    parser.add_argument("stages", nargs="*", metavar="STAGE", help=f"one of: {', '.join(available())}")
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
-    wanted = parser.parse_args(arguments)
-    try:
-        rows = measure(wanted.stages)
-    except EscapeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        if wanted.json:
-            print(json.dumps({**_head(), "error": {"type": type(error).__name__, "message": str(error)}}))
-        return error.exit_code
-    if wanted.json:
-        print(json.dumps(document(rows), indent=2, allow_nan=False))
-    else:
-        _print_table(rows)
-    return 0
+def perf(
+    stages: Annotated[
+        list[str] | None, typer.Argument(metavar="[STAGE]...", help="Stages to measure; all by default.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+) -> None:
+    """Measure our speed and accuracy beside OOPAO's and pyRTC's, on one thread each."""
+    with session("perf", json=as_json) as one:
+        rows = measure(stages or ())
+        one.show(_table(rows))
+        one.result(document(rows))
 
 
-def _print_table(rows: Sequence[BenchmarkRow]) -> None:
-    from rich.console import Console
+def _table(rows: Sequence[BenchmarkRow]) -> Table:
     from rich.table import Table
 
     table = Table("stage", "ours", "peer", "unit", "times better", "peer is", "note")
@@ -114,4 +95,4 @@ def _print_table(rows: Sequence[BenchmarkRow]) -> None:
             row.peer_name,
             row.note,
         )
-    Console().print(table)
+    return table

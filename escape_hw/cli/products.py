@@ -49,7 +49,7 @@ def _show_product(one: Session, file: Path) -> None:
         sha256 = loop.sha256
         one.show(rich_table(strehl_table({loop.result.method: loop.result})))
     cards = tuple((key, str(value)) for key, value in header.items())
-    one.show(rich_table(Table(("Card", "value"), cards)), f"SHA-256: {sha256}")
+    one.show(rich_table(Table(("Card", "value"), cards, numeric=False)), f"SHA-256: {sha256}")
     one.result({**document, "file": file.absolute(), "header": header, "sha256": sha256})
 
 

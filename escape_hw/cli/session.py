@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
-#: Exit codes (design, command line).
+_PIPE_WIDTH = 120
+#: Exit codes; the same for every command.
 DONE, FAILED, USAGE, FAULT, ABORTED = 0, 1, 2, 3, 130
 
 
@@ -39,7 +40,8 @@ class Session:
         self.command, self.json, self.quiet = command, json, quiet
         self._stdout = sys.stdout
         self.errors = Console(stderr=True)
-        self.tables = Console(file=self._stdout)
+        # In a pipe or a log nobody's terminal limits the width.
+        self.tables = Console(file=self._stdout, width=None if self._stdout.isatty() else _PIPE_WIDTH)
         self.interrupts = Interrupts(self.tell)
         self.folder: RunFolder | None = None
         self.was_opened = False

@@ -71,7 +71,7 @@ def init(
     name: Annotated[str, typer.Argument(help="Name of the new system.")] = "my-system",
     base: Annotated[str, typer.Option("--base", help="System whose values it starts with.")] = "razor-shwfs",
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="File to write [default: standard output].")
+        Path | None, typer.Option("--out", metavar="FILE", help="File to write (default: standard output).")
     ] = None,
     json: options.Json = False,
 ) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from rich import box
+from rich.console import JustifyMethod
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -24,9 +26,14 @@ def bands(simulated: bool, partial: bool) -> Text:
 
 def rich_table(content: Table, title: str | None = None) -> RichTable:
     """A table of text for the terminal."""
-    table = RichTable(title=title, title_justify="left")
+    # No rules between columns: all of it fits a terminal of 80 columns.
+    table = RichTable(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for number, heading in enumerate(content.headings):
-        table.add_column(heading, justify="left" if number == 0 else "right", no_wrap=number > 0)
+        numbers = content.numeric and number > 0
+        # On a narrow terminal headings and words may wrap, values with their errors may not.
+        widest = max((len(row[number]) for row in content.rows if "±" in row[number]), default=None)
+        justify: JustifyMethod = "right" if numbers else "left"
+        table.add_column(heading, justify=justify, min_width=widest, overflow="fold")
     for row in content.rows:
         table.add_row(*(Text(cell) for cell in row))
     return table

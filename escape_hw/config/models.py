@@ -89,6 +89,12 @@ class CalibrationSection(Section):
         le=1,
         description="DO-CRIME: pokes are uniform in +-poke, rms surface as fraction of full stroke",
     )
+    poke_command: float = Field(
+        0.1,
+        gt=0,
+        le=1,
+        description="largest command of any actuator in the poke of one mode, fraction of full stroke",
+    )
     frames: int = Field(10000, ge=1, le=100_000_000, description="DO-CRIME: number of frames")
     push_pull_poke: float = Field(
         0.01, gt=0, le=1, description="push-pull: poke of each mode, rms surface as fraction of full stroke"

@@ -66,6 +66,9 @@ def pack_grid(grid: SubApertureGrid) -> list[Any]:
             PITCH=float(grid.pitch_px),
             ORIGINX=float(grid.origin_px[0]),
             ORIGINY=float(grid.origin_px[1]),
+            COUNTS=float(grid.counts),
+            MOTION=float(grid.motion_px),
+            BACKGND=float(grid.background),
         ),
         fits_file.image("FLUX", np.asarray(grid.flux, np.float32)),
     ]

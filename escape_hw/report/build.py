@@ -101,7 +101,7 @@ def _registration(run: RunContent) -> str:
         return ""
     caption = "Registration of the mirror seen by the sensor, with standard errors."
     if run.planted is not None:
-        caption += " The planted truth is shown only here; no estimator reads it."
+        caption += " Δ: difference from the planted truth, which is shown only here; no estimator reads it."
     parts = [html.table(tables.registration_table(estimates, run.planted), caption)]
     for number, (label, estimate) in enumerate(estimates.items()):
         if estimate.iterations:
@@ -122,7 +122,7 @@ def _registration(run: RunContent) -> str:
 def _loops(run: RunContent) -> str:
     if not run.loops:
         return ""
-    parts = [html.table(tables.strehl_table(run.loops))]
+    parts = [html.table(tables.strehl_table(run.loops), "rms: residual wavefront seen by the sensor.")]
     if any(loop.psf is not None for loop in run.loops.values()):
         parts.append(
             html.figure(
@@ -202,7 +202,7 @@ def _origin(run: RunContent) -> str:
         for name, path in run.document["products"].items()
         if path.suffix == ".fits"
     )
-    files = html.table(tables.Table(("Product", "file", "SHA-256"), rows)) if rows else ""
+    files = html.table(tables.Table(("Product", "file", "SHA-256"), rows, numeric=False)) if rows else ""
     return html.section(
         "Origin",
         files,

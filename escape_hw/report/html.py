@@ -43,9 +43,9 @@ def table(content: Table, caption: str = "") -> str:
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in content.rows
     )
     below = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return (
-        f'<div class="wide"><table>{below}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
-    )
+    kind = "" if content.numeric else ' class="text"'
+    inside = f"{below}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
+    return f'<div class="wide"><table{kind}>{inside}</table></div>'
 
 
 def figure(key: str, content: Figure, caption: str) -> str:

@@ -21,10 +21,11 @@ TITLES = {
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table of text: headings and rows, the first column naming the row."""
+    """A table of text: headings and rows, the first column naming the row; numbers in the others."""
 
     headings: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    numeric: bool = True
 
 
 def with_error(value: Measured) -> str:
@@ -55,14 +56,14 @@ def registration_table(
     estimates
         By the heading of their column, such as ``SHORT``; an empty heading stands for alpha alone.
     planted
-        The truth hidden in a twin, shown in a last column, and the pulls (difference over standard
-        error) beside each estimate.
+        The truth hidden in a twin, shown in a last column; beside each estimate then stands its
+        difference from the truth over its standard error.
     """
     headings = ["Component"]
     for label in estimates:
         headings.append(f"α {label}".strip())
         if planted is not None:
-            headings.append("(α − planted) / σ")
+            headings.append("Δ / σ")
     if planted is not None:
         headings.append("planted")
     rows = []
@@ -88,17 +89,25 @@ def _pull(value: Measured, truth: float) -> str:
 
 def strehl_table(loops: Mapping[str, LoopResult]) -> Table:
     """Three Strehl ratios with errors, gain, residual and stability of every loop."""
-    headings = ("Matrix", "Strehl, peak", "Strehl, OTF", "Strehl, encircled", "gain", "residual", "loop")
+    headings = (
+        "Matrix",
+        "Strehl, peak [%]",
+        "Strehl, OTF [%]",
+        "Strehl, encircled [%]",
+        "gain",
+        "rms [nm]",
+        "loop",
+    )
     rows = []
     for label, loop in loops.items():
         strehl = loop.strehl
         ratios = (
             ("–", "–", "–")
             if strehl is None
-            else tuple(percent(value).strip() for value in (strehl.peak, strehl.otf, strehl.encircled))
+            else tuple(percent(value).strip(" %") for value in (strehl.peak, strehl.otf, strehl.encircled))
         )
-        state = f"stable for {loop.frames / loop.rate_hz:.0f} s" if loop.stable else "UNSTABLE"
+        state = f"stable {loop.frames / loop.rate_hz:.0f} s" if loop.stable else "UNSTABLE"
         if loop.partial:
             state += ", aborted"
-        rows.append((label, *ratios, f"{loop.gain:.3g}", f"{loop.residual_rms_nm:.0f} nm rms", state))
+        rows.append((label, *ratios, f"{loop.gain:.3g}", f"{loop.residual_rms_nm:.0f}", state))
     return Table(headings, tuple(rows))

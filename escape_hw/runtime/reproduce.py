@@ -97,7 +97,7 @@ def _close_loops(bench: Bench, loop_frames: int, result: ShwfsResult) -> Procedu
         model = yield from measure_model_psf(bench)
     for label, calibration in result.calibrations.items():
         matrix, grid = calibration.matrix, calibration.grid
-        gain, scan = yield from best_gain(bench, matrix, grid)
+        gain, scan = yield from best_gain(bench, matrix, grid, model_psf=model)
         result.scans[label] = list(scan)
         if any(run.partial for run in scan):
             result.partial = True

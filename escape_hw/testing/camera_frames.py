@@ -124,6 +124,25 @@ def check_camera_keeps_deadlines(factory: Factory) -> None:
             camera.configure(original)
 
 
+@check(READS)
+def check_camera_polls_without_waiting(factory: Factory) -> None:
+    """``poll`` gives what is there or ``None``, takes no time, and counts no time-out."""
+    with opened(factory) as camera:
+        camera.next_frame(patience_s(camera))
+        delivered, taken_ns = 1, []
+        for _ in range(11):
+            began = camera.now_ns()
+            frame = camera.poll()
+            taken_ns.append(camera.now_ns() - began)
+            assert frame is None or isinstance(frame, Frame), f"poll() gave {type(frame).__name__}"
+            delivered += frame is not None
+        status = camera.status()
+        assert status.timeouts == 0, f"{status}: an empty poll() is no time-out"
+        assert status.delivered == delivered, f"{status}, but {delivered} frames were delivered"
+        usual_s, period_s = statistics.median(taken_ns) * 1e-9, 1 / camera.settings.frame_rate_hz
+        assert usual_s < 0.5 * period_s, f"poll() took {usual_s:.3g} s; it must not wait for a frame"
+
+
 def _slow_down(camera: Camera) -> None:
     try:
         camera.configure(replace(camera.settings, frame_rate_hz=min(20.0, camera.settings.frame_rate_hz)))
@@ -165,4 +184,5 @@ FRAMES: tuple[Check, ...] = (
     check_camera_counts_add_up,
     check_camera_refuses_timeouts,
     check_camera_keeps_deadlines,
+    check_camera_polls_without_waiting,
 )

@@ -108,7 +108,7 @@ def _uses(device: Any) -> dict[str, Callable[[], object]]:
             "shape": lambda: device.shape,
         }
     if isinstance(device, Camera):
-        return {"start": device.start, "next_frame": device.next_frame}
+        return {"start": device.start, "next_frame": device.next_frame, "poll": device.poll}
     if isinstance(device, TipTiltModulator):
         circle = Modulation(0.0, 1.0)
         return {

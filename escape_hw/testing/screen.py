@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -21,6 +22,7 @@ def check_screen_state_makes_sense(factory: Factory) -> None:
         assert screen.n_screens >= 1, f"n_screens is {screen.n_screens}"
         assert 0 <= state.screen < screen.n_screens, f"{state}, but there are {screen.n_screens} screens"
         assert isinstance(state.inserted, bool), f"inserted is {state.inserted!r}, not a bool"
+        assert isinstance(state.blocked, bool), f"blocked is {state.blocked!r}, not a bool"
         assert 0 <= state.speed_m_s < math.inf, f"speed_m_s is {state.speed_m_s}"
 
 
@@ -31,7 +33,11 @@ def check_screen_refuses_meaningless(factory: Factory) -> None:
         before = screen.state
         wrong: list[dict[str, Any]] = [{"screen": k} for k in (-1, screen.n_screens, 0.5, True)]
         wrong += [{"speed_m_s": v} for v in (-1.0, math.nan, math.inf)]
-        wrong += [{"inserted": "yes"}, {"screen": screen.n_screens, "inserted": not before.inserted}]
+        wrong += [
+            {"inserted": "yes"},
+            {"blocked": 1},
+            {"screen": screen.n_screens, "inserted": not before.inserted},
+        ]
         for change in wrong:
             refused(screen, SettingRejected, f"set({change})", partial(screen.set, **change))
             assert screen.state == before, f"set({change}) was refused, but the state changed"
@@ -50,11 +56,15 @@ def check_screen_set_keeps_the_rest(factory: Factory) -> None:
                 assert answer.inserted is inserted, f"set(inserted={inserted}) led to {answer}"
                 assert answer.screen == before.screen, "set(inserted=...) changed the screen"
                 assert answer.speed_m_s == before.speed_m_s, "set(inserted=...) changed the speed"
+            for blocked in (True, False):
+                answer = screen.set(blocked=blocked)
+                assert answer.blocked is blocked, f"set(blocked={blocked}) led to {answer}"
+                assert answer.screen == before.screen, "set(blocked=...) changed the screen"
             still = screen.set(speed_m_s=0.0)
             assert still.speed_m_s == 0.0, f"set(speed_m_s=0) led to {still}"
             assert still.screen == before.screen, "set(speed_m_s=...) changed the screen"
         finally:
-            screen.set(screen=before.screen, inserted=before.inserted, speed_m_s=before.speed_m_s)
+            screen.set(**asdict(before))
 
 
 @check(FULL)

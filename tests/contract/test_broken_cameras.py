@@ -121,6 +121,17 @@ def half_as_fast(self: Any) -> int:
     return int(2e9 / self._settings.frame_rate_hz)
 
 
+def polls_patiently(self: Any) -> Any:
+    return self._next_frame(1.0)
+
+
+def polls_through_next_frame(self: Any) -> Any:
+    try:
+        return self.next_frame(1e-6)
+    except FrameTimeout:
+        return None
+
+
 def miscounts(self: Any) -> Any:
     return replace(Camera.status(self), lost=3)
 
@@ -185,6 +196,8 @@ BROKEN: list[Broken] = [
     ("miscounts", SyntheticCamera, "camera_counts_add_up", {"status": miscounts}),
     ("any time-out", SyntheticCamera, "camera_refuses_timeouts", {"next_frame": waits_any_time}),
     ("gives None", SyntheticCamera, "camera_keeps_deadlines", {"_next_frame": gives_none}),
+    ("poll waits", SyntheticCamera, "camera_polls_without_waiting", {"_poll": polls_patiently}),
+    ("poll counts", SyntheticCamera, "camera_polls_without_waiting", {"poll": polls_through_next_frame}),
     ("waits for ever", SyntheticCamera, "camera_keeps_deadlines", {"_next_frame": waits_for_ever}),
 ]
 

@@ -331,7 +331,6 @@ def test_run_drives_a_procedure_and_stops_it() -> None:
         assert bench.run(counting(4, finished), observers=(lambda p: seen.append(p.fraction),)) == 4
         assert seen == [0.25, 0.5, 0.75, 1.0]
         stop = threading.Event()
-        stop.set()
         with pytest.raises(Aborted):
-            bench.run(counting(4, finished), abort=stop)
+            bench.run(counting(4, finished), abort=stop, observers=(lambda p: stop.set(),))
     assert finished == [4, 1]

@@ -179,6 +179,14 @@ def test_timeouts_are_positive_and_finite(timeout_s: float) -> None:
         assert not camera.is_running
 
 
+def test_poll_gives_what_is_there_and_counts_it() -> None:
+    timeout = FrameTimeout("wfs", "nothing")
+    with Scripted(4, timeout, 7) as camera:
+        polled = [camera.poll() for _ in range(3)]
+        assert [frame.index if frame else None for frame in polled] == [4, None, 7]
+        assert camera.status() == FrameStatus(delivered=2, lost=2)
+
+
 def test_nothing_works_while_closed_and_stop_does_no_harm() -> None:
     camera = SyntheticCamera("wfs")
     camera.stop()

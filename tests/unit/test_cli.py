@@ -79,16 +79,8 @@ def test_help_is_quick_and_light():
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     for command in (
-        "systems",
-        "config",
-        "calibrate",
-        "sprint",
-        "loop",
-        "reproduce",
-        "show",
-        "compare",
-        "report",
-    ):
+        "systems", "config", "calibrate", "sprint", "loop", "reproduce", "show", "compare", "report", "perf",
+    ):  # fmt: skip
         assert command in done.stdout
 
 
@@ -114,7 +106,6 @@ def test_config_check_init_schema(escape, document, tmp_path):
     assert "[devices.dm]" in escape("config", "init")[1]
 
 
-@pytest.mark.usefixtures("reports")
 def test_calibrate_document_has_every_promised_field(document, bench, tmp_path):
     code, found, _ = document("calibrate", "razor-shwfs", "--out", tmp_path / "run", "--seed", 7)
     assert code == 0
@@ -132,9 +123,8 @@ def test_calibrate_document_has_every_promised_field(document, bench, tmp_path):
     product = load_matrix(found["products"]["im"], expect_system="razor-shwfs")
     assert product.matrix.method == "escape"
     assert product.header["PARENT1"] == "docrime.fits"
-    assert Path(found["products"]["report"]).stat().st_size > 100_000
     names = {path.name for path in (tmp_path / "run").iterdir()}
-    assert {"config.toml", "run.log", "result.json", "report.html", "im.fits", "docrime.fits"} <= names
+    assert {"config.toml", "run.log", "result.json", "im.fits", "docrime.fits"} <= names
     assert bench.benches[0].closed
     assert bench.calls[0][1]["frames"] is None
 
@@ -174,7 +164,7 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
     code, found, _ = document("sprint", "razor-shwfs", "--im", im, "--out", tmp_path / "run")
     assert code == 0
     assert set(found["registration"]) == REGISTRATION
-    assert bench.calls == [("sprint", {"method": "docrime-whitened", "learning_rate": 1.0})]
+    assert bench.calls == [("sprint", {"method": "docrime-whitened", "modes": 50, "learning_rate": 1.0})]
     assert not bench.benches
     product = load_matrix(found["products"]["im"])
     assert product.registration is not None
@@ -233,6 +223,7 @@ def test_unstable_loop_and_lost_convergence_exit_1(document, bench, im, tmp_path
         ("loop", "razor-shwfs", "--im", "absent.fits"),
         ("show", "absent.fits"),
         ("report", "absent"),
+        ("perf", "no-such-stage"),
         ("nonsense",),
     ],
 )
@@ -402,7 +393,7 @@ def test_reproduce_shwfs_shows_registration_strehl_and_report(escape, bench, tmp
     run = tmp_path / "run"
     code, out, err = escape("reproduce", "shwfs", "--out", run, "--loop-frames", 321)
     assert code == 0, err
-    for word in ("planted", "Shift Y", "push-pull", "DO-CRIME", "ESCAPE", "Strehl, OTF", "±"):
+    for word in ("planted", "Shift Y", "push-pull", "DO-CRIME", "ESCAPE", "OTF", "±"):
         assert word in out
     assert out.strip().splitlines()[-1] == f"report: {run / 'report.html'}"
     assert bench.benches[0].screen_seen == {

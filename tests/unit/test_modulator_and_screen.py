@@ -62,6 +62,7 @@ def test_screen_keeps_what_is_not_given() -> None:
     with SteadyScreen() as screen:
         assert screen.set(inserted=False) == ScreenState(1, False, 0.0135)
         assert screen.set(screen=3, speed_m_s=0.0) == ScreenState(3, False, 0.0)
+        assert screen.set(blocked=True) == ScreenState(3, False, 0.0, True)
         assert screen.set() == screen.state
 
 
@@ -73,6 +74,7 @@ def test_screen_keeps_what_is_not_given() -> None:
         ({"screen": 1.5}, "whole number"),
         ({"screen": True}, "whole number"),
         ({"inserted": 1}, "true or false"),
+        ({"blocked": 1}, "true or false"),
         ({"speed_m_s": -0.1}, "not be negative|not negative"),
         ({"speed_m_s": math.inf}, "finite"),
         ({"speed_m_s": math.nan}, "finite"),

@@ -222,7 +222,7 @@ def test_numbers_are_rounded_to_their_error(value, sigma, text):
 def test_registration_table_has_the_papers_form():
     short, long = fake.registration(seed=3), fake.registration(0.3, seed=4)
     table = tables.registration_table({"SHORT": short, "LONG": long}, fake.PLANTED)
-    assert table.headings[0::2] == ("Component", "(α − planted) / σ", "(α − planted) / σ")
+    assert table.headings[0::2] == ("Component", "Δ / σ", "Δ / σ")
     assert (table.headings[1], table.headings[3], table.headings[-1]) == ("α SHORT", "α LONG", "planted")
     assert [row[0] for row in table.rows] == [
         "Shift X [% of Sub Aperture]",

@@ -1,0 +1,66 @@
+"""Frames in, slopes out, with the mirror's record beside: what every procedure does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.frames import Frame
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.bench import Bench
+
+#: Spots move and blur by more than their centres of gravity show: what the window and the threshold
+#: cut off, and the turbulence within each lenslet. Found on a twin with known optics (docs/decisions).
+MOTION_FACTOR = 1.2
+
+
+class Motion:
+    """Running rms motion of the spots."""
+
+    def __init__(self, n_slopes: int) -> None:
+        self._n = 0
+        self._sum = np.zeros(n_slopes)
+        self._squares = np.zeros(n_slopes)
+
+    def add(self, slopes: NDArray[np.float32]) -> None:
+        """Take the slopes of one frame ``(n_slopes,)``."""
+        self._n += 1
+        self._sum += slopes
+        self._squares += np.square(slopes, dtype=np.float64)
+
+    def of(self, grid: SubApertureGrid) -> SubApertureGrid:
+        """The grid with the motion filled in."""
+        if self._n < 2:
+            return grid
+        variance = np.maximum(self._squares / self._n - np.square(self._sum / self._n), 0).mean()
+        return replace(grid, motion_px=MOTION_FACTOR * float(np.sqrt(variance)))
+
+
+def next_frame(bench: Bench) -> Frame:
+    """The sensor's next frame within the configured time-out."""
+    return bench.wfs.next_frame(bench.config.devices.wfs.timeout_s)
+
+
+def measured_matrix(
+    bench: Bench,
+    grid: SubApertureGrid,
+    m2c: NDArray[np.float64],
+    data: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    method: str,
+    **metrics: float | int | str,
+) -> InteractionMatrix:
+    """An interaction matrix of this bench with its provenance."""
+    return InteractionMatrix(
+        data.astype(np.float32),
+        sigma.astype(np.float32),
+        m2c,
+        grid.valid,
+        bench.config.system.name,
+        method,
+        bench.simulated,
+        dict(metrics),
+    )

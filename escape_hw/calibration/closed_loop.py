@@ -1,0 +1,272 @@
+"""Closing the loop with a matrix, and judging it."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.frames import Frame
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.results import LoopResult, StrehlEstimate
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import next_frame
+from escape_hw.calibration.sensor_setup import extractor
+from escape_hw.errors import Aborted, CalibrationError, IncompatibleProduct
+from escape_hw.pipeline.integrator import LeakyIntegrator, gain_limit
+from escape_hw.pipeline.reconstructor import reconstructor
+from escape_hw.pipeline.strehl import strehl
+
+#: Seconds after closing during which the science frames do not count.
+_CLOSING_S = 0.3
+#: The loop counts as diverging when this share of the actuators stays clipped ...
+_SATURATED = 0.2
+#: ... for this many frames in a row.
+_SATURATED_FRAMES = 50
+#: Shares of the stable limit that the search for the best gain tries.
+GAIN_SHARES = (0.15, 0.25, 0.35, 0.45, 0.55, 0.65)
+#: Delay assumed for the gain's limit when the matrix does not carry a measured one.
+_USUAL_DELAY = 2.0
+
+
+@dataclass(slots=True, eq=False)
+class _Record:
+    """What a run gathers on its way."""
+
+    science: list[NDArray[np.uint16]] = field(default_factory=list)
+    residual: list[float] = field(default_factory=list)
+    latency: list[int] = field(default_factory=list)
+    frames: int = 0
+    diverged: bool = False
+    last: Frame | None = None
+    command: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+
+
+def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32]]:
+    """Mean PSF with a flat mirror and no turbulence in the beam (paper: the empirical model).
+
+    Raises
+    ------
+    CalibrationError
+        The system has no science camera.
+    """
+    science = bench.science
+    if science is None:
+        raise CalibrationError("this system has no science camera to take a PSF with")
+    bench.dm.flatten()
+    science.stop()
+    wait = bench.config.devices.science.timeout_s if bench.config.devices.science else 1.0
+    report = Reporter("model PSF", frames)
+    science.next_frame(wait)
+    total = np.zeros((), np.float64)
+    try:
+        for done in range(frames):
+            total = total + science.next_frame(wait).data
+            if report.due():
+                yield report(done + 1)
+    finally:
+        science.stop()
+    return (total / frames).astype(np.float32)
+
+
+def closed_loop(
+    bench: Bench,
+    matrix: InteractionMatrix,
+    grid: SubApertureGrid,
+    *,
+    gain: float | None = None,
+    leak: float | None = None,
+    dropped_modes: int | None = None,
+    frames: int = 5000,
+    model_psf: NDArray[np.float32] | None = None,
+    stage: str = "closed loop",
+) -> Procedure[LoopResult]:
+    """Close the loop for a number of frames and open it again.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    matrix, grid
+        The interaction matrix and the sensor's grid that it belongs to.
+    gain, leak, dropped_modes
+        Loop parameters; as configured by default.
+    frames
+        How long.
+    model_psf
+        PSF without turbulence; with it, and with a science camera, the Strehl ratios are measured.
+    stage
+        Name of the stage in progress reports.
+
+    Returns
+    -------
+    LoopResult
+        ``stable`` is false when the loop was opened because it diverged.
+
+    Raises
+    ------
+    IncompatibleProduct
+        The matrix belongs to another mirror or grid.
+    """
+    c = bench.config.loop
+    gain = c.gain if gain is None else gain
+    leak = c.leak if leak is None else leak
+    dropped = c.dropped_modes if dropped_modes is None else dropped_modes
+    if matrix.m2c.shape[0] != bench.dm.info.n_act or matrix.n_slopes != grid.n_slopes:
+        raise IncompatibleProduct(
+            f"the matrix is for {matrix.m2c.shape[0]} actuators and {matrix.n_slopes} slopes; "
+            f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
+        )
+    stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
+    control = LeakyIntegrator(reconstructor(matrix.data, scale=stroke, dropped_modes=dropped), gain, leak)
+    record, partial = _Record(), False
+    science = bench.science if model_psf is not None else None
+    bench.dm.flatten()
+    before = bench.wfs.status()
+    started = bench.wfs.now_ns()
+    if science is not None:
+        science.stop()
+    try:
+        yield from _run(bench, matrix, grid, control, frames, science is not None, record, stage)
+    except Aborted:
+        partial = True
+    finally:
+        bench.dm.flatten()
+        if science is not None:
+            science.stop()
+    seconds = max((bench.wfs.now_ns() - started) * 1e-9, 1e-9)
+    ratio: StrehlEstimate | None = None
+    notes = ["the loop diverged and was opened"] if record.diverged else []
+    if science is not None and model_psf is not None and record.science and not record.diverged:
+        try:
+            ratio = strehl(np.array(record.science, dtype=np.float32), model_psf)
+        except CalibrationError as error:
+            notes.append(str(error))
+    residual = np.array(record.residual, dtype=np.float32)
+    settled = residual[len(residual) // 10 :]
+    return LoopResult(
+        method=matrix.method, gain=gain, leak=leak, dropped_modes=dropped, frames=record.frames,
+        lost_frames=bench.wfs.status().lost - before.lost, rate_hz=record.frames / seconds,
+        stable=not record.diverged and _steady(residual),
+        residual_rms_nm=float(np.sqrt(np.mean(np.square(settled)))) if settled.size else math.nan,
+        strehl=ratio, latency_us=_percentiles(record.latency),
+        psf=np.mean(record.science, axis=0).astype(np.float32) if record.science else None,
+        model_psf=model_psf, residual_nm=residual[:: max(1, residual.size // 2000)],
+        last_command=record.command, last_frame=None if record.last is None else record.last.data,
+        partial=partial, notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _run(
+    bench: Bench,
+    matrix: InteractionMatrix,
+    grid: SubApertureGrid,
+    control: LeakyIntegrator,
+    frames: int,
+    watch: bool,
+    record: _Record,
+    stage: str,
+) -> Procedure[None]:
+    slopes_of = extractor(bench, grid)
+    to_modes = np.linalg.pinv(matrix.m2c)
+    # Reflection doubles the surface; modes have unit rms surface.
+    metres = 2 * bench.dm.info.stroke_m
+    closing = int(_CLOSING_S * bench.wfs.settings.frame_rate_hz)
+    report = Reporter(stage, frames)
+    saturated = 0
+    for done in range(frames):
+        frame = next_frame(bench)
+        began = time.perf_counter_ns()
+        modes = control(slopes_of(frame.data))
+        sent = bench.dm.send(matrix.m2c @ modes)
+        record.latency.append(time.perf_counter_ns() - began)
+        if not sent.guard.untouched:
+            control.applied(to_modes @ sent.sent)
+        record.frames, record.last, record.command = done + 1, frame, sent.sent
+        record.residual.append(metres * 1e9 * float(np.linalg.norm(control.residual)))
+        saturated = saturated + 1 if sent.guard.clipped > _SATURATED * sent.sent.size else 0
+        if saturated >= _SATURATED_FRAMES:
+            record.diverged = True
+            return
+        if watch and done >= closing and bench.science is not None:
+            image = bench.science.poll()
+            if image is not None and done > closing + 1:
+                record.science.append(image.data)
+        if report.due():
+            yield report(done + 1, residual_nm=record.residual[-1], gain=float(control.gain))
+
+
+def _steady(residual: NDArray[np.float32]) -> bool:
+    """False when the residual grows towards the end: the last third against the middle one."""
+    third = residual.size // 3
+    if third < 20:
+        return bool(np.isfinite(residual).all())
+    middle, last = np.median(residual[third : 2 * third]), np.median(residual[2 * third :])
+    return bool(np.isfinite(residual).all() and last < 2.0 * middle)
+
+
+def _percentiles(latency_ns: list[int]) -> dict[str, float]:
+    if not latency_ns:
+        return {"p50": math.nan, "p99": math.nan, "max": math.nan}
+    p50, p99, worst = np.percentile(np.array(latency_ns) / 1e3, [50, 99, 100])
+    return {"p50": float(p50), "p99": float(p99), "max": float(worst)}
+
+
+def best_gain(
+    bench: Bench,
+    matrix: InteractionMatrix,
+    grid: SubApertureGrid,
+    *,
+    gains: tuple[float, ...] | None = None,
+    frames: int = 1000,
+    model_psf: NDArray[np.float32] | None = None,
+) -> Procedure[tuple[float, list[LoopResult]]]:
+    """The gain with the least residual (or the highest Strehl ratio, given a model PSF).
+
+    Parameters
+    ----------
+    bench, matrix, grid
+        As for :func:`closed_loop`.
+    gains
+        Gains to try; by default shares of the largest stable one for the delay that was measured
+        with the matrix.
+    frames
+        Frames per gain.
+    model_psf
+        With it, gains are judged by the Strehl ratio.
+
+    Raises
+    ------
+    CalibrationError
+        No gain gives a stable loop.
+    """
+    delay = float(matrix.metrics.get("delay_frames", _USUAL_DELAY))
+    tried = gains or tuple(share * gain_limit(delay) for share in GAIN_SHARES)
+    runs: list[LoopResult] = []
+    for gain in tried:
+        run = yield from closed_loop(
+            bench, matrix, grid, gain=gain, frames=frames, model_psf=model_psf, stage=f"loop at gain {gain:.2f}"
+        )
+        runs.append(run)
+        if run.partial:
+            return gain, runs
+        if not run.stable and len([r for r in runs if not r.stable]) > 1:
+            break
+    stable = [run for run in runs if run.stable]
+    if not stable:
+        raise CalibrationError(
+            f"the loop closes at none of the gains {', '.join(f'{g:.2f}' for g in tried)}; "
+            "drop more modes or measure the matrix again"
+        )
+    return max(stable, key=_merit).gain, runs
+
+
+def _merit(run: LoopResult) -> float:
+    if run.strehl is not None:
+        return run.strehl.peak.value
+    return -run.residual_rms_nm

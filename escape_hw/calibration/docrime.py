@@ -1,0 +1,214 @@
+"""DO-CRIME in open loop: random pokes on every mode, under turbulence (paper; Lai et al. 2020)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.frames import Frame
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.results import CalibrationResult
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import Motion, measured_matrix, next_frame
+from escape_hw.calibration.docrime_estimator import DocrimeEstimator, DocrimeSolution
+from escape_hw.calibration.sensor_setup import (
+    SETUP_FRAMES,
+    extractor,
+    modal_basis,
+    poke_amplitudes,
+    setup_from_frames,
+)
+from escape_hw.errors import Aborted, CalibrationError, TooFewFrames
+from escape_hw.pipeline.slopes import SlopeExtractor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DocrimeRun:
+    """A DO-CRIME run: the calibration, and the solution it came from."""
+
+    result: CalibrationResult
+    solution: DocrimeSolution
+
+
+@dataclass(slots=True, eq=False)
+class _Session:
+    """State of a run: frames wait until the grid is known, then go straight to the estimator."""
+
+    bench: Bench
+    estimator_order: int
+    lags: int
+    n_modes: int
+    grid: SubApertureGrid | None
+    setup_frames: int
+    mean_frame: NDArray[np.float32] | None = None
+    slopes_of: SlopeExtractor | None = None
+    estimator: DocrimeEstimator | None = None
+    motion: Motion | None = None
+    waiting: list[tuple[Frame, NDArray[np.float64]]] = field(default_factory=list)
+    taken: int = 0
+
+    def take(self, frame: Frame, poke: NDArray[np.float64]) -> None:
+        self.taken += 1
+        if self.estimator is None:
+            self.waiting.append((frame, poke))
+            if self.grid is not None or len(self.waiting) >= self.setup_frames:
+                self.ready()
+        else:
+            self._feed(frame, poke)
+
+    def ready(self) -> None:
+        """Set up the sensor, on the frames that wait if no grid was given, and work them off."""
+        if self.estimator is not None or not self.waiting:
+            return
+        if self.grid is None:
+            total = np.zeros(self.waiting[0][0].data.shape)
+            for frame, _ in self.waiting:
+                total += frame.data
+            mean = (total / len(self.waiting)).astype(np.float32)
+            setup = setup_from_frames(self.bench, mean)
+            self.grid, self.mean_frame = setup.grid, setup.mean_frame
+        self.slopes_of = extractor(self.bench, self.grid)
+        self.motion = Motion(self.grid.n_slopes)
+        self.estimator = DocrimeEstimator(
+            self.grid.n_slopes, self.n_modes, order=self.estimator_order, lags=self.lags
+        )
+        for frame, poke in self.waiting:
+            self._feed(frame, poke)
+        self.waiting = []
+
+    def _feed(self, frame: Frame, poke: NDArray[np.float64]) -> None:
+        if self.slopes_of is None or self.motion is None or self.estimator is None:
+            raise RuntimeError("frames were fed before the sensor was set up")
+        slopes = self.slopes_of(frame.data)
+        self.motion.add(slopes)
+        self.estimator.partial_fit(frame.index, slopes, poke)
+
+
+def docrime_run(
+    bench: Bench,
+    *,
+    frames: int | None = None,
+    poke: float | None = None,
+    whiten: bool = True,
+    grid: SubApertureGrid | None = None,
+) -> Procedure[DocrimeRun]:
+    """As :func:`docrime`, with the solution beside the matrix."""
+    c = bench.config.calibration
+    n_frames = frames or c.frames
+    m2c = modal_basis(bench)
+    amplitude = poke_amplitudes(bench, m2c, poke or c.poke)
+    needed = _least_frames(m2c.shape[1], c.whiten_order if whiten else 0, c.lags)
+    if n_frames < needed:
+        raise TooFewFrames(
+            f"{n_frames} frames cannot constrain {m2c.shape[1]} modes; ask for at least {needed} frames, "
+            "or for fewer modes (basis.n_modes)"
+        )
+    to_modes = np.linalg.pinv(m2c)
+    session = _Session(
+        bench, c.whiten_order if whiten else 0, c.lags, m2c.shape[1], grid, min(SETUP_FRAMES, n_frames)
+    )
+    clipped, partial = 0, False
+    report = Reporter("DO-CRIME", n_frames)
+    try:
+        bench.dm.flatten()
+        try:
+            for done in range(n_frames):
+                frame = next_frame(bench)
+                sent = bench.dm.send(m2c @ (amplitude * bench.rng.uniform(-1.0, 1.0, m2c.shape[1])))
+                clipped += sent.guard.clipped
+                # What was really sent, not what was asked for: a clipped poke is still a known poke.
+                session.take(frame, to_modes @ sent.sent)
+                if report.due():
+                    yield report(done + 1, clipped=float(clipped))
+        except Aborted:
+            partial = True
+    finally:
+        bench.dm.flatten()
+    session.ready()
+    if session.estimator is None or session.grid is None or session.motion is None:
+        raise Aborted("aborted before the first frames")
+    try:
+        solution = session.estimator.solve()
+    except TooFewFrames:
+        if partial:
+            raise Aborted(f"aborted after {session.taken} frames, too few for a matrix") from None
+        raise
+    response = solution.response
+    matrix = measured_matrix(
+        bench, session.grid, m2c, solution.matrix, solution.sigma,
+        "docrime-whitened" if whiten else "docrime",
+        frames=solution.frames, lost_frames=solution.lost_frames, poke=float(poke or c.poke),
+        clipped=clipped, delay_frames=response.delay, whitening_order=solution.whitener.size - 1,
+    )  # fmt: skip
+    notes = []
+    if float(np.median(matrix.snr())) < 1:
+        notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
+    result = CalibrationResult(
+        matrix,
+        session.motion.of(session.grid),
+        solution.frames,
+        solution.lost_frames,
+        (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz,
+        response,
+        partial=partial,
+        mean_frame=session.mean_frame,
+        notes=tuple(notes),
+    )
+    return DocrimeRun(result, solution)
+
+
+def docrime(
+    bench: Bench,
+    *,
+    frames: int | None = None,
+    poke: float | None = None,
+    whiten: bool = True,
+    grid: SubApertureGrid | None = None,
+) -> Procedure[CalibrationResult]:
+    """Measure the interaction matrix by random pokes, under turbulence or not.
+
+    The sensor's grid is found on the first frames of the run itself, so it costs no sky time.
+
+    Parameters
+    ----------
+    bench
+        An open bench, loop open.
+    frames
+        Frames to take; as configured by default.
+    poke
+        Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
+    whiten
+        Subtract what the past predicts of the turbulence; false gives the paper's plain estimator.
+    grid
+        The sensor's grid, when it is known already.
+
+    Returns
+    -------
+    CalibrationResult
+        With the measured temporal response. Stopped early, ``partial`` is true.
+
+    Raises
+    ------
+    TooFewFrames
+        Too few frames for the number of modes; nothing moved.
+    CalibrationError
+        No spots, no response, or pokes that do not span the modes.
+    Aborted
+        Stopped before a matrix could be solved.
+    """
+    return (yield from docrime_run(bench, frames=frames, poke=poke, whiten=whiten, grid=grid)).result
+
+
+def _least_frames(n_modes: int, order: int, lags: int) -> int:
+    """Fewest frames worth starting with: twice the unknowns per slope."""
+    return 2 * (n_modes + order + lags)
+
+
+def with_motion(result: CalibrationResult, motion_px: float) -> CalibrationResult:
+    """The same calibration with another spot motion, for models of other conditions."""
+    if motion_px < 0:
+        raise CalibrationError(f"spot motion is {motion_px} pixels; it must not be negative")
+    return replace(result, grid=replace(result.grid, motion_px=motion_px))

@@ -1,0 +1,122 @@
+"""ESCAPE: DO-CRIME, then SPRINT, then the pseudo-synthetic interaction matrix (the paper)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.procedure import Procedure
+from escape_hw.api.registration import Registration
+from escape_hw.api.results import CalibrationResult, RegistrationEstimate
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import measured_matrix
+from escape_hw.calibration.docrime import docrime_run
+from escape_hw.calibration.sprint import sprint
+
+#: Half steps for the propagation of the registration's errors, in its units.
+_STEPS = (1.0, 1.0, 0.05, 0.1, 0.1)
+
+
+def pseudo_synthetic(
+    model: SyntheticModel, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The model's matrix at an estimated registration, and its standard errors.
+
+    Parameters
+    ----------
+    model
+        The synthetic model.
+    estimate
+        Result of SPRINT.
+    m2c
+        Modal basis ``(n_act, n_modes)``.
+
+    Returns
+    -------
+    matrix, sigma : ndarray, ``(n_slopes, n_modes)``
+        The errors are those of registration and gain, propagated to first order.
+    """
+    alpha, width = estimate.registration.to_array(), estimate.width.value
+    gain = estimate.gain.value
+    unit = model.zonal_matrix(estimate.registration, width) @ m2c
+    derivatives = []
+    for k, step in enumerate(_STEPS):
+        plus, minus = (
+            model.zonal_matrix(Registration.from_array(alpha + s * step * np.eye(5)[k]), width) for s in (1, -1)
+        )
+        derivatives.append(gain * ((plus - minus) @ m2c) / (2 * step))
+    jacobian = np.stack(derivatives)
+    variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
+    variance += np.square(unit * estimate.gain.sigma)
+    return gain * unit, np.sqrt(np.maximum(variance, 0))
+
+
+def synthesise(
+    bench: Bench, grid: SubApertureGrid, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+) -> CalibrationResult:
+    """A calibration made of a registration alone, with nothing moved.
+
+    Parameters
+    ----------
+    bench
+        Gives the model.
+    grid
+        The sensor's grid.
+    estimate
+        The registration.
+    m2c
+        Modal basis ``(n_act, n_modes)``.
+    """
+    data, sigma = pseudo_synthetic(bench.model(grid), estimate, m2c)
+    matrix = measured_matrix(bench, grid, m2c, data, sigma, "escape", gain=estimate.gain.value)
+    return CalibrationResult(matrix, grid, 0, 0, 0.0, registration=estimate)
+
+
+def escape(
+    bench: Bench,
+    *,
+    frames: int | None = None,
+    poke: float | None = None,
+    grid: SubApertureGrid | None = None,
+    whiten: bool = True,
+) -> Procedure[CalibrationResult]:
+    """Calibrate without a source: measure under turbulence, find the registration, synthesise.
+
+    Parameters
+    ----------
+    bench, frames, poke, grid, whiten
+        As for :func:`~escape_hw.calibration.docrime.docrime`.
+
+    Returns
+    -------
+    CalibrationResult
+        ``matrix`` is pseudo-synthetic, ``measured`` the DO-CRIME matrix behind it, ``registration``
+        what SPRINT found; ``registration.converged`` says whether to trust it.
+
+    Raises
+    ------
+    TooFewFrames, CalibrationError, Aborted
+        As for DO-CRIME.
+    """
+    run = yield from docrime_run(bench, frames=frames, poke=poke, grid=grid, whiten=whiten)
+    measured, c = run.result, bench.config.calibration
+    estimate = sprint(
+        measured.matrix,
+        bench.model(measured.grid),
+        modes=min(c.sprint_modes, measured.matrix.n_modes),
+        learning_rate=c.learning_rate,
+        covariance=run.solution.covariance,
+    )
+    made = synthesise(bench, measured.grid, estimate, measured.matrix.m2c)
+    metrics = {**measured.matrix.metrics, **made.matrix.metrics}
+    return replace(
+        measured,
+        matrix=replace(made.matrix, metrics=metrics),
+        registration=estimate,
+        measured=measured.matrix,
+        notes=(*measured.notes, *estimate.warnings),
+    )

@@ -1,0 +1,161 @@
+"""Push-pull: the baseline interaction matrix, mode by mode (paper, Methodology)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.results import CalibrationResult
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import Motion, measured_matrix, next_frame
+from escape_hw.calibration.sensor_setup import extractor, find_sensor, modal_basis, poke_amplitudes
+from escape_hw.errors import Aborted, CalibrationError
+from escape_hw.pipeline.slopes import SlopeExtractor
+
+#: Frames watched after a test step, to see when the sensor has settled.
+_STEP_FRAMES = 30
+#: The response has settled when it stays within this share of its end.
+_SETTLED = 0.02
+
+
+def settling_frames(
+    bench: Bench, slopes_of: SlopeExtractor, command: NDArray[np.float64]
+) -> Procedure[int]:
+    """Frames to skip after a step until the sensor shows all of it, found by a test step.
+
+    Raises
+    ------
+    CalibrationError
+        The sensor does not respond to the mirror.
+    """
+    reference = np.mean([slopes_of(next_frame(bench).data) for _ in range(10)], axis=0)
+    bench.dm.send(command)
+    try:
+        steps = np.array([slopes_of(next_frame(bench).data) - reference for _ in range(_STEP_FRAMES)])
+    finally:
+        bench.dm.flatten()
+    yield Reporter("test step", 1, "step")(1)
+    end = steps[_STEP_FRAMES // 2 :]
+    direction = end.mean(axis=0)
+    response = steps @ direction / float(direction @ direction)
+    scatter = float((end @ direction).std() / (direction @ direction))
+    if not scatter < 0.3:
+        raise CalibrationError(
+            "the wavefront sensor does not respond to a test step of the mirror; "
+            "is the light on, and is the turbulence out of the beam?"
+        )
+    # Averaged over the front, noise and vibration may exceed the band without meaning anything.
+    off = np.flatnonzero(np.abs(response[: _STEP_FRAMES // 2] - 1) > _SETTLED + 3 * scatter)
+    return int(off[-1]) + 2 if off.size else 1
+
+
+def push_pull(
+    bench: Bench,
+    *,
+    poke: float | None = None,
+    frames: int | None = None,
+    grid: SubApertureGrid | None = None,
+) -> Procedure[CalibrationResult]:
+    """Push and pull every mode and average the slopes.
+
+    ``D_i = (s(+a e_i) - s(-a e_i)) / 2 a`` (paper). Take it on a calibration source: on starlight the
+    turbulence drowns it.
+
+    Parameters
+    ----------
+    bench
+        An open bench without turbulence.
+    poke
+        Amplitude, rms surface as fraction of full stroke; as configured by default.
+    frames
+        Frames averaged per push and per pull; as configured by default.
+    grid
+        The sensor's grid; found first when not given.
+
+    Returns
+    -------
+    CalibrationResult
+        Standard errors from the scatter of the frames. Stopped early, ``partial`` is true and the
+        modes that were not reached are left out.
+
+    Raises
+    ------
+    CalibrationError
+        No spots, or no response.
+    Aborted
+        Stopped before the first mode was measured.
+    """
+    c = bench.config.calibration
+    n_frames = frames or c.push_pull_frames
+    try:
+        bench.dm.flatten()
+        mean_frame = None
+        if grid is None:
+            setup = yield from find_sensor(bench)
+            grid, mean_frame = setup.grid, setup.mean_frame
+        slopes_of = extractor(bench, grid)
+        m2c = modal_basis(bench)
+        amplitude = poke_amplitudes(bench, m2c, poke or c.push_pull_poke)
+        skip = yield from settling_frames(bench, slopes_of, m2c[:, 0] * amplitude[0] * 3)
+        start = bench.wfs.status()
+        columns: list[NDArray[np.float64]] = []
+        errors: list[NDArray[np.float64]] = []
+        partial = False
+        motion = Motion(grid.n_slopes)
+        report = Reporter("push-pull", m2c.shape[1], "mode")
+        try:
+            for mode in range(m2c.shape[1]):
+                column, error = _one_mode(
+                    bench, slopes_of, m2c[:, mode], amplitude[mode], skip, n_frames, motion
+                )
+                columns.append(column)
+                errors.append(error)
+                if report.due():
+                    yield report(mode + 1)
+        except Aborted:
+            if not columns:
+                raise
+            partial = True
+        status = bench.wfs.status()
+    finally:
+        bench.dm.flatten()
+    delivered = status.delivered - start.delivered
+    lost = status.lost - start.lost
+    matrix = measured_matrix(
+        bench, grid, m2c[:, : len(columns)], np.stack(columns, 1), np.stack(errors, 1), "push-pull",
+        frames=delivered, lost_frames=lost, poke=float(poke or c.push_pull_poke), settling_frames=skip,
+    )  # fmt: skip
+    return CalibrationResult(
+        matrix, motion.of(grid), delivered, lost,
+        (delivered + lost) / bench.wfs.settings.frame_rate_hz, partial=partial, mean_frame=mean_frame,
+    )  # fmt: skip
+
+
+def _one_mode(
+    bench: Bench,
+    slopes_of: SlopeExtractor,
+    shape: NDArray[np.float64],
+    amplitude: float,
+    skip: int,
+    frames: int,
+    motion: Motion,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Column and its standard errors for one mode, each ``(n_slopes,)``."""
+    means, variances, sent = [], [], []
+    for sign in (1.0, -1.0):
+        report = bench.dm.send(sign * amplitude * shape)
+        # What the guard cut off was not poked: the amplitude is that of the shape really sent.
+        sent.append(float(report.sent @ shape / (shape @ shape)))
+        for _ in range(skip):
+            next_frame(bench)
+        stack = np.array([slopes_of(next_frame(bench).data) for _ in range(frames)], dtype=np.float64)
+        for slopes in stack:
+            motion.add(slopes.astype(np.float32))
+        means.append(stack.mean(axis=0))
+        variances.append(stack.var(axis=0, ddof=1) / frames if frames > 1 else np.full(stack.shape[1], np.nan))
+    span = sent[0] - sent[1]
+    if not span > 0:
+        raise CalibrationError("a poke was clipped away entirely; lower calibration.push_pull_poke")
+    return (means[0] - means[1]) / span, np.sqrt(variances[0] + variances[1]) / span

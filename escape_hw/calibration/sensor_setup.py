@@ -1,0 +1,173 @@
+"""Setting up the sensor from its own frames: background, grid, references."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.bench import Bench
+from escape_hw.calibration.modes import karhunen_loeve, unit_rms, zonal
+from escape_hw.errors import CalibrationError, ConfigError
+from escape_hw.pipeline.grid import find_grid
+from escape_hw.pipeline.slopes import SlopeExtractor
+
+#: Frames whose mean the grid is found on.
+SETUP_FRAMES = 200
+#: Outer scale of the turbulence assumed for the modal basis, in pupil diameters.
+_OUTER_SCALE = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorSetup:
+    """What the sensor's frames say about it: the grid, and the mean frame it was found on."""
+
+    grid: SubApertureGrid
+    mean_frame: NDArray[np.float32]
+
+
+def threshold_counts(bench: Bench) -> float:
+    """Centre-of-gravity threshold in counts above the background."""
+    return bench.config.sensor.threshold * bench.wfs.info.full_scale
+
+
+def background_level(mean_frame: NDArray[np.float32], spot_px: float) -> float:
+    """Level of the pixels that no spot reaches, in counts: the mode of the darkest half.
+
+    Between the spots and outside the pupil a frame is dark; a quarter of the darkest quantile and
+    its mirror image about the median of the darkest fifth leave out the wings of the spots.
+    """
+    darkest = np.sort(mean_frame.ravel())[: max(1, mean_frame.size // 5)]
+    return float(np.median(darkest))
+
+
+def setup_from_frames(
+    bench: Bench, mean_frame: NDArray[np.float32], references: str = "lattice"
+) -> SensorSetup:
+    """Find the grid on a mean frame.
+
+    Parameters
+    ----------
+    bench
+        Gives the design of the sensor and, when it was measured, the dark frame.
+    mean_frame
+        Mean of raw frames in counts ``(rows, columns)``.
+    references
+        See :func:`~escape_hw.pipeline.grid.find_grid`.
+    """
+    sensor = bench.config.sensor
+    background = background_level(mean_frame, sensor.spot_px) if bench.dark is None else 0.0
+    clean = mean_frame - (background if bench.dark is None else bench.dark)
+    grid = find_grid(
+        clean.astype(np.float32),
+        n_sub=sensor.n_sub,
+        nominal_pitch_px=sensor.pitch_px,
+        threshold=threshold_counts(bench),
+        min_flux=sensor.min_flux,
+        references=references,
+    )
+    return SensorSetup(replace(grid, background=background), mean_frame)
+
+
+def extractor(bench: Bench, grid: SubApertureGrid) -> SlopeExtractor:
+    """Slopes of this bench's camera on a grid."""
+    region = bench.wfs.settings.region
+    shape = (region.height, region.width)
+    dark = bench.dark if bench.dark is not None else np.full(shape, grid.background, np.float32)
+    return SlopeExtractor(grid, shape, dark=dark, threshold=threshold_counts(bench))
+
+
+def find_sensor(
+    bench: Bench, *, frames: int = SETUP_FRAMES, references: str = "lattice"
+) -> Procedure[SensorSetup]:
+    """Watch the sensor for a while and find its grid.
+
+    Raises
+    ------
+    CalibrationError
+        No spots where the design says there should be.
+    """
+    total = np.zeros((), np.float64)
+    report = Reporter("find the lenslet grid", frames)
+    for done in range(frames):
+        total = total + bench.wfs.next_frame(bench.config.devices.wfs.timeout_s).data
+        if report.due():
+            yield report(done + 1)
+    return setup_from_frames(bench, (total / frames).astype(np.float32), references)
+
+
+def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.float32]]:
+    """Mean dark frame, with the beam stop in; kept as ``bench.dark``.
+
+    Raises
+    ------
+    CalibrationError
+        The system has no beam stop that can be moved by command.
+    """
+    if bench.screen is None:
+        raise CalibrationError(
+            "this system has no beam stop under control; block the beam by hand and set bench.dark"
+        )
+    total = np.zeros((), np.float64)
+    report = Reporter("dark frame", frames)
+    before = bench.screen.state.blocked
+    bench.screen.set(blocked=True)
+    try:
+        for _ in range(3):
+            # Frames that began before the stop was in.
+            bench.wfs.next_frame(bench.config.devices.wfs.timeout_s)
+        for done in range(frames):
+            total = total + bench.wfs.next_frame(bench.config.devices.wfs.timeout_s).data
+            if report.due():
+                yield report(done + 1)
+    finally:
+        bench.screen.set(blocked=before)
+    bench.dark = (total / frames).astype(np.float32)
+    return bench.dark
+
+
+def modal_basis(bench: Bench) -> NDArray[np.float64]:
+    """Mode-to-command matrix ``(n_act, n_modes)`` that the configuration asks for.
+
+    Raises
+    ------
+    ConfigError
+        The basis does not fit the mirror.
+    """
+    basis, model = bench.config.basis, bench.model()
+    surfaces, pupil, pixel = model.influence_functions()
+    if surfaces.shape[0] != bench.dm.info.n_act:
+        raise ConfigError(f"the model has {surfaces.shape[0]} actuators, the mirror {bench.dm.info.n_act}")
+    if basis.kind == "zonal":
+        return zonal(surfaces, pupil, basis.n_modes)
+    if basis.kind == "file":
+        # Imported here: astropy takes a second to load, and only this needs it.
+        from escape_hw.io.fits import load_matrix
+
+        m2c = load_matrix(basis.file).matrix.m2c
+        if m2c.shape[0] != surfaces.shape[0] or m2c.shape[1] < basis.n_modes:
+            raise ConfigError(
+                f"basis.file holds {m2c.shape[0]} actuators and {m2c.shape[1]} modes; "
+                f"{surfaces.shape[0]} and at least {basis.n_modes} are needed"
+            )
+        return unit_rms(m2c[:, : basis.n_modes], surfaces, pupil)
+    return karhunen_loeve(surfaces, pupil, pixel, basis.n_modes, _OUTER_SCALE * bench.config.system.pupil_m)
+
+
+def poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDArray[np.float64]:
+    """Amplitude of each mode's poke ``(n_modes,)``, rms surface as fraction of full stroke.
+
+    Modes that the mirror makes with large commands (those that live at the pupil's rim) are poked
+    less, so that no single mode takes more than ``calibration.poke_command`` of any actuator.
+
+    Raises
+    ------
+    ConfigError
+        The poke is not in (0, 1].
+    """
+    if not 0 < poke <= 1:
+        raise ConfigError(f"poke is {poke}; it must lie in (0, 1], rms surface as fraction of full stroke")
+    return np.minimum(poke, bench.config.calibration.poke_command / np.abs(m2c).max(axis=0))

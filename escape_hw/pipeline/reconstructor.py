@@ -1,0 +1,59 @@
+"""Reconstructors from interaction matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.errors import CalibrationError
+
+
+def reconstructor(
+    matrix: NDArray[np.floating],
+    *,
+    scale: NDArray[np.floating] | None = None,
+    dropped_modes: int = 0,
+    regularisation: float = 0.0,
+) -> NDArray[np.float32]:
+    """Pseudo-inverse by singular values, truncated or damped.
+
+    ``R = V Sigma^+(phi) U^T`` (paper), with the ``phi`` largest of the singular values kept; with
+    Tikhonov regularisation ``sigma^+ = sigma / (sigma^2 + lambda^2)``.
+
+    Parameters
+    ----------
+    matrix
+        Interaction matrix ``(n_slopes, n_modes)``.
+    scale
+        Stroke that a unit of each mode takes ``(n_modes,)``. Eigenmodes are those of slopes per
+        stroke, so that the weakest are what costs the mirror most for the least signal; by default
+        every mode counts alike.
+    dropped_modes
+        How many of the weakest eigenmodes are left out.
+    regularisation
+        lambda relative to the largest singular value; 0 for none.
+
+    Returns
+    -------
+    ndarray of float32, ``(n_modes, n_slopes)``
+
+    Raises
+    ------
+    CalibrationError
+        Nothing is left, or the matrix is not finite.
+    """
+    if not np.isfinite(matrix).all():
+        raise CalibrationError("the interaction matrix is not finite; measure it again")
+    n_modes = matrix.shape[1]
+    if not 0 <= dropped_modes < n_modes:
+        raise CalibrationError(f"{dropped_modes} dropped modes of {n_modes} leave none; drop fewer")
+    stroke = np.ones(n_modes) if scale is None else np.asarray(scale, dtype=np.float64)
+    u, s, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64) / stroke, full_matrices=False)
+    kept = slice(0, min(n_modes, s.size) - dropped_modes)
+    if s[0] <= 0 or s[kept][-1] <= s[0] * 1e-12:
+        raise CalibrationError(
+            f"the interaction matrix is singular: eigenmode {s[kept].size} is not seen at all; "
+            "drop more modes or measure it again"
+        )
+    inverse = s[kept] / (s[kept] ** 2 + (regularisation * s[0]) ** 2)
+    return np.ascontiguousarray((vt[kept].T * inverse) @ u[:, kept].T / stroke[:, None], dtype=np.float32)

@@ -1,0 +1,55 @@
+"""Progress on a terminal and elsewhere."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from escape_hw.api.procedure import Progress
+from escape_hw.cli.progress import ProgressView, time_left
+
+
+def shown(terminal: bool, quiet: bool = False) -> str:
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=terminal, width=120)
+    with ProgressView(console, quiet) as view:
+        for stage in ("push-pull", "DO-CRIME"):
+            for done in (1, 50, 100):
+                view(Progress(stage, done, 100, elapsed_s=done * 0.9, metrics={"rms": 0.123456}))
+    return stream.getvalue()
+
+
+def test_bars_show_stage_counts_and_time_left():
+    text = shown(terminal=True)
+    for word in ("push-pull", "DO-CRIME", "100/100", "frames", "done", "rms 0.123"):
+        assert word in text
+
+
+def test_lines_elsewhere_are_few():
+    lines = shown(terminal=False).splitlines()
+    assert lines == [
+        "push-pull: 1 of 100 frames, 1 min 29 s left",
+        "DO-CRIME: 1 of 100 frames, 1 min 29 s left",
+    ]
+
+
+def test_quiet_shows_nothing():
+    assert shown(terminal=True, quiet=True) == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (0.2, "0 s left"),
+        (59.4, "59 s left"),
+        (61, "1 min 01 s left"),
+        (3660, "1 h 01 min left"),
+        (float("nan"), ""),
+        (float("inf"), ""),
+        (-1, ""),
+    ],
+)
+def test_time_left_in_words(seconds, words):
+    assert time_left(seconds) == words
