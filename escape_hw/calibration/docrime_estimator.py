@@ -12,8 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.results import TemporalResponse
-from escape_hw.calibration.lagged_sums import LaggedSums
-from escape_hw.calibration.response import fit_response, usable_rows
+from escape_hw.calibration.regression import RegressionSums
+from escape_hw.calibration.response import (
+    ResponseTracker,
+    autocovariance,
+    filtered,
+    fit_response,
+    usable_rows,
+)
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.whitening import apply_filter, prediction_error_filter
 from escape_hw.errors import CalibrationError, TooFewFrames
@@ -21,10 +27,9 @@ from escape_hw.errors import CalibrationError, TooFewFrames
 #: Frames kept to fit the whitening filter before the sums start.
 BURN_IN = 1000
 #: Frames gathered before the sums are updated: large enough for matrix products to be efficient.
-BLOCK = 256
+BLOCK = 250
 #: Degrees of freedom without which no standard error is worth stating.
 MIN_FREEDOM = 20
-_ONE = np.ones(1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +41,8 @@ class DocrimeSolution:
     matrix, sigma
         ``(n_slopes, n_modes)``: slopes per unit mode, and standard errors.
     covariance
-        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``.
+        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; diagonal where
+        correlations were not asked for.
     whitener
         The filter used, ``[1]`` for the plain estimator.
     """
@@ -61,23 +67,28 @@ class DocrimeEstimator:
         Past frames that predict the turbulence; 0 is the paper's plain estimator.
     lags
         Frames over which the temporal response is estimated.
+    correlations
+        Find how the noise of the slopes is correlated, which SPRINT's error bars want; costs as much
+        as the rest when there are many slopes.
     """
 
-    def __init__(self, n_slopes: int, n_modes: int, *, order: int = 6, lags: int = 5) -> None:
+    def __init__(
+        self, n_slopes: int, n_modes: int, *, order: int = 6, lags: int = 5, correlations: bool = True
+    ) -> None:
         if order < 0 or lags < 1:
             raise ValueError(f"order is {order} and lags {lags}; they must be at least 0 and 1")
         self.n_slopes, self.n_modes, self.order, self.lags = n_slopes, n_modes, order, lags
-        rows = max(BURN_IN, BLOCK)
-        self._index = np.empty(rows, np.int64)
-        self._slopes = np.empty((rows, n_slopes), np.float32)
-        self._pokes = np.empty((rows, n_modes), np.float32)
+        self._index = np.empty(BURN_IN, np.int64)
+        self._slopes = np.empty((BURN_IN, n_slopes), np.float32)
+        self._pokes = np.empty((BURN_IN, n_modes), np.float32)
         self._filled = 0
         self._data: Telemetry | None = None
         self._last_index: int | None = None
         self._absorbed = 0
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
-        self._sums = LaggedSums.zeros(n_slopes, n_modes, 1)
+        self._tracker: ResponseTracker | None = None
+        self._sums = RegressionSums.zeros(n_slopes, n_modes, correlations=correlations)
         self.frames = self.lost_frames = 0
 
     def partial_fit(
@@ -101,7 +112,8 @@ class DocrimeEstimator:
         """
         if slopes.shape != (self.n_slopes,) or poke.shape != (self.n_modes,):
             raise ValueError(
-                f"slopes {slopes.shape} and poke {poke.shape} do not fit ({self.n_slopes},) and ({self.n_modes},)"
+                f"slopes {slopes.shape} and poke {poke.shape} do not fit "
+                f"({self.n_slopes},) and ({self.n_modes},)"
             )
         # A sum of squares is finite when all numbers are, and takes a tenth of the time to ask.
         if not math.isfinite(slopes.dot(slopes) + poke.dot(poke)):
@@ -111,9 +123,47 @@ class DocrimeEstimator:
         k = self._filled
         self._index[k], self._slopes[k], self._pokes[k] = index, slopes, poke
         self._last_index, self._filled = index, k + 1
-        if self._filled >= (BURN_IN if self._response is None else BLOCK):
+        if self._filled >= self._room():
             self._absorb()
         return self
+
+    def extend(
+        self, index: NDArray[np.int64], slopes: NDArray[np.floating], pokes: NDArray[np.floating]
+    ) -> DocrimeEstimator:
+        """Take many recorded frames at once; see :meth:`partial_fit`.
+
+        Parameters
+        ----------
+        index
+            Frame indices ``(n,)``, rising.
+        slopes, pokes
+            ``(n, n_slopes)`` and ``(n, n_modes)``.
+        """
+        n = len(index)
+        if slopes.shape != (n, self.n_slopes) or pokes.shape != (n, self.n_modes):
+            raise ValueError(
+                f"slopes {slopes.shape} and pokes {pokes.shape} do not fit {n} frames of "
+                f"{self.n_slopes} slopes and {self.n_modes} modes"
+            )
+        if not (np.isfinite(slopes).all() and np.isfinite(pokes).all()):
+            raise ValueError("slopes or pokes are not finite")
+        before = index[:1] - 1 if self._last_index is None else [self._last_index]
+        if n and (np.diff(index, prepend=before) <= 0).any():
+            raise ValueError("frame indices must rise")
+        done = 0
+        while done < n:
+            take, k = min(BURN_IN - self._filled, n - done), self._filled
+            self._index[k : k + take] = index[done : done + take]
+            self._slopes[k : k + take] = slopes[done : done + take]
+            self._pokes[k : k + take] = pokes[done : done + take]
+            done += take
+            self._last_index, self._filled = int(index[done - 1]), k + take
+            if self._filled >= self._room():
+                self._absorb()
+        return self
+
+    def _room(self) -> int:
+        return BURN_IN if self._response is None else BLOCK
 
     def solve(self) -> DocrimeSolution:
         """The matrix, its standard errors and the temporal response so far.
@@ -133,18 +183,25 @@ class DocrimeEstimator:
                 f"at least {needed + self.order + self.lags} frames are needed"
             )
         sums = self._sums.centred()
-        excitation = np.linalg.eigvalsh(sums.gram[0, :, 0, :])
-        if self._response is None or excitation[0] <= 1e-12 * excitation[-1]:
+        excitation = np.linalg.eigvalsh(sums.gram)
+        if self._tracker is None or excitation[0] <= 1e-12 * excitation[-1]:
             raise CalibrationError(
                 "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
             )
-        matrix, gram = sums.solve(_ONE)
-        freedom = sums.count - self.n_modes - self.lags
-        covariance = sums.residual_power(matrix, _ONE) / freedom
+        matrix = sums.solve()
+        covariance = sums.residual_power(matrix) / (sums.count - self.n_modes - self.lags)
+        covariance = covariance if covariance.ndim == 2 else np.diag(covariance)
         variance = np.maximum(np.diag(covariance), 0.0)
-        sigma = np.sqrt(np.outer(variance, np.diag(np.linalg.inv(gram))))
+        sigma = np.sqrt(np.outer(variance, np.diag(np.linalg.inv(sums.gram))))
+        scale = self._tracker.scale()
         return DocrimeSolution(
-            matrix, sigma, self._response, covariance, self._whitener, self.frames, self.lost_frames
+            matrix * scale,
+            sigma * abs(scale),
+            self._tracker.response(),
+            covariance,
+            self._whitener,
+            self.frames,
+            self.lost_frames,
         )
 
     def _absorb(self) -> None:
@@ -163,20 +220,34 @@ class DocrimeEstimator:
             # A gap longer than the memory of filter and response separates the stretches for good.
             fresh = self._data.followed_by(fresh, min(gap, 2 * (self.order + self.lags)))
         self._absorbed = int(self._index[n - 1])
-        if self._whitener is None or self._response is None:
+        if self._response is None:
             self._fit(fresh)
-        if self._whitener is not None and self._response is not None:
-            self._sums.add(fresh, self._whitener, start, self._response.weights)
+        if self._response is not None:
+            self._sum(fresh, start)
             fresh = fresh.tail(2 * self.order + self.lags)
         self._data = fresh
+
+    def _sum(self, data: Telemetry, start: int) -> None:
+        """Add the rows from ``start`` on to the sums."""
+        if self._whitener is None or self._response is None:
+            raise RuntimeError("sums need the filter and the response")
+        slopes, pokes, now = filtered(data, self._whitener, self.lags, start)
+        if not now.size:
+            return
+        self._sums.add(slopes, apply_filter(pokes, self._response.weights, now))
+        if self._tracker is None:
+            self._tracker = ResponseTracker(
+                self._sums.centred().solve(), self._response, now.size, autocovariance(pokes, now, self.lags)
+            )
+        else:
+            self._tracker.add(slopes, pokes, now)
 
     def _fit(self, data: Telemetry) -> None:
         """Temporal response and filter from the first frames: by frame differences, then by the filter.
 
         Too few frames leave both unset; the next call sees these frames again.
         """
-        # Each half of the frames must determine a matrix of its own.
-        if usable_rows(data, max(self.order, 1), self.lags).size < 2 * (self.n_modes + MIN_FREEDOM):
+        if usable_rows(data, max(self.order, 1), self.lags).size < self.n_modes + self.lags + MIN_FREEDOM:
             return
         # Differences tell the response well even where the plain estimator is asked for.
         difference = np.array([1.0, -1.0])
@@ -191,12 +262,13 @@ class DocrimeEstimator:
         self, data: Telemetry, whitener: NDArray[np.float64], response: TemporalResponse
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Slopes less what the pokes explain ``(n_times, n_slopes)``, and the rows where that is known."""
-        sums = LaggedSums.zeros(self.n_slopes, self.n_modes, 1)
-        sums.add(data, whitener, 0, response.weights)
-        matrix = sums.centred().solve(_ONE)[0].astype(np.float32)
+        slopes, pokes, now = filtered(data, whitener, self.lags)
+        sums = RegressionSums.zeros(self.n_slopes, self.n_modes, correlations=False)
+        matrix = sums.add(slopes, apply_filter(pokes, response.weights, now)).centred().solve()
         at = data.complete(0, self.lags)
         residuals = np.zeros_like(data.slopes)
-        residuals[at] = data.slopes[at] - apply_filter(data.pokes, response.weights, at) @ matrix.T
+        explained = apply_filter(data.pokes, response.weights, at) @ matrix.T.astype(np.float32)
+        residuals[at] = data.slopes[at] - explained
         usable = np.zeros_like(data.present)
         usable[at] = True
         return residuals, usable
