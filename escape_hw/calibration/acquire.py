@@ -38,6 +38,26 @@ class Motion:
         variance = np.maximum(self._squares / self._n - np.square(self._sum / self._n), 0).mean()
         return replace(grid, motion_px=MOTION_FACTOR * float(np.sqrt(variance)))
 
+    def references(self, grid: SubApertureGrid) -> SubApertureGrid:
+        """The grid with its references moved onto the lattice of the mean spots of all frames.
+
+        The grid was found on the first frames, whose mean tilt and focus are the turbulence's own;
+        over the whole run they average out further. The windows stay where they are, so every
+        slope of the run keeps its meaning.
+        """
+        if self._n < 2:
+            return grid
+        mean = (self._sum / self._n).reshape(2, -1).T
+        rows, columns = np.nonzero(grid.valid)
+        at = np.stack([columns, rows], axis=1) - (np.array(grid.valid.shape[::-1]) - 1) / 2
+        weight = grid.flux[grid.valid].astype(float)
+        shift = weight @ mean / weight.sum()
+        middle = weight @ at / weight.sum()
+        lever = at - middle
+        stretch = float((weight[:, None] * lever * (mean - shift)).sum() / (weight[:, None] * lever**2).sum())
+        lattice = shift + stretch * lever
+        return replace(grid, references_px=(grid.references_px + lattice).astype(np.float32))
+
 
 def next_frame(bench: Bench) -> Frame:
     """The sensor's next frame within the configured time-out."""

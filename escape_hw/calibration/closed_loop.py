@@ -250,7 +250,13 @@ def best_gain(
     runs: list[LoopResult] = []
     for gain in tried:
         run = yield from closed_loop(
-            bench, matrix, grid, gain=gain, frames=frames, model_psf=model_psf, stage=f"loop at gain {gain:.2f}"
+            bench,
+            matrix,
+            grid,
+            gain=gain,
+            frames=frames,
+            model_psf=model_psf,
+            stage=f"loop at gain {gain:.2f}",
         )
         runs.append(run)
         if run.partial:

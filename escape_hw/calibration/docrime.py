@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from escape_hw.calibration.sensor_setup import (
     poke_amplitudes,
     setup_from_frames,
 )
-from escape_hw.errors import Aborted, CalibrationError, TooFewFrames
+from escape_hw.errors import Aborted, TooFewFrames
 from escape_hw.pipeline.slopes import SlopeExtractor
 
 
@@ -78,6 +78,13 @@ class _Session:
         for frame, poke in self.waiting:
             self._feed(frame, poke)
         self.waiting = []
+
+    def finished_grid(self) -> SubApertureGrid:
+        """The grid with all that the run taught about it; given references stay as they were."""
+        if self.grid is None or self.motion is None:
+            raise RuntimeError("the sensor was never set up")
+        grid = self.motion.of(self.grid)
+        return grid if self.mean_frame is None else self.motion.references(grid)
 
     def _feed(self, frame: Frame, poke: NDArray[np.float64]) -> None:
         if self.slopes_of is None or self.motion is None or self.estimator is None:
@@ -148,7 +155,7 @@ def docrime_run(
         notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
     result = CalibrationResult(
         matrix,
-        session.motion.of(session.grid),
+        session.finished_grid(),
         solution.frames,
         solution.lost_frames,
         (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz,
@@ -205,10 +212,3 @@ def docrime(
 def _least_frames(n_modes: int, order: int, lags: int) -> int:
     """Fewest frames worth starting with: twice the unknowns per slope."""
     return 2 * (n_modes + order + lags)
-
-
-def with_motion(result: CalibrationResult, motion_px: float) -> CalibrationResult:
-    """The same calibration with another spot motion, for models of other conditions."""
-    if motion_px < 0:
-        raise CalibrationError(f"spot motion is {motion_px} pixels; it must not be negative")
-    return replace(result, grid=replace(result.grid, motion_px=motion_px))

@@ -46,7 +46,8 @@ def pseudo_synthetic(
     derivatives = []
     for k, step in enumerate(_STEPS):
         plus, minus = (
-            model.zonal_matrix(Registration.from_array(alpha + s * step * np.eye(5)[k]), width) for s in (1, -1)
+            model.zonal_matrix(Registration.from_array(alpha + s * step * np.eye(5)[k]), width)
+            for s in (1, -1)
         )
         derivatives.append(gain * ((plus - minus) @ m2c) / (2 * step))
     jacobian = np.stack(derivatives)

@@ -20,9 +20,7 @@ _STEP_FRAMES = 30
 _SETTLED = 0.02
 
 
-def settling_frames(
-    bench: Bench, slopes_of: SlopeExtractor, command: NDArray[np.float64]
-) -> Procedure[int]:
+def settling_frames(bench: Bench, slopes_of: SlopeExtractor, command: NDArray[np.float64]) -> Procedure[int]:
     """Frames to skip after a step until the sensor shows all of it, found by a test step.
 
     Raises
@@ -154,7 +152,9 @@ def _one_mode(
         for slopes in stack:
             motion.add(slopes.astype(np.float32))
         means.append(stack.mean(axis=0))
-        variances.append(stack.var(axis=0, ddof=1) / frames if frames > 1 else np.full(stack.shape[1], np.nan))
+        variances.append(
+            stack.var(axis=0, ddof=1) / frames if frames > 1 else np.full(stack.shape[1], np.nan)
+        )
     span = sent[0] - sent[1]
     if not span > 0:
         raise CalibrationError("a poke was clipped away entirely; lower calibration.push_pull_poke")

@@ -28,7 +28,9 @@ def centre_of(image: NDArray[np.float64]) -> tuple[float, float]:
     out = []
     for axis, at in ((0, row), (1, column)):
         if not 0 < at < image.shape[axis] - 1:
-            raise CalibrationError("the PSF's peak lies at the edge of the science camera's region; re-centre it")
+            raise CalibrationError(
+                "the PSF's peak lies at the edge of the science camera's region; re-centre it"
+            )
         line = image[at - 1 : at + 2, column] if axis == 0 else image[row, at - 1 : at + 2]
         bend = line[0] - 2 * line[1] + line[2]
         out.append(at + (0.5 * (line[0] - line[2]) / bend if bend < 0 else 0.0))
@@ -85,9 +87,7 @@ def ratios(
     )
 
 
-def strehl(
-    frames: NDArray[np.floating], model: NDArray[np.floating], batches: int = 8
-) -> StrehlEstimate:
+def strehl(frames: NDArray[np.floating], model: NDArray[np.floating], batches: int = 8) -> StrehlEstimate:
     """Strehl ratios of a stack of frames, with standard errors.
 
     The value is that of the mean of all frames; the error comes from the scatter of the means of
