@@ -27,9 +27,11 @@ from escape_hw.errors import CalibrationError, TooFewFrames
 #: Frames kept to fit the whitening filter before the sums start.
 BURN_IN = 1000
 #: Frames gathered before the sums are updated: large enough for matrix products to be efficient.
-BLOCK = 250
+BLOCK = 500
 #: Degrees of freedom without which no standard error is worth stating.
 MIN_FREEDOM = 20
+#: Slopes that the filter, common to all, is found from.
+_FEW_SLOPES = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,20 +147,20 @@ class DocrimeEstimator:
                 f"slopes {slopes.shape} and pokes {pokes.shape} do not fit {n} frames of "
                 f"{self.n_slopes} slopes and {self.n_modes} modes"
             )
-        if not (np.isfinite(slopes).all() and np.isfinite(pokes).all()):
+        if not math.isfinite(np.vdot(slopes, slopes) + np.vdot(pokes, pokes)):
             raise ValueError("slopes or pokes are not finite")
         before = index[:1] - 1 if self._last_index is None else [self._last_index]
         if n and (np.diff(index, prepend=before) <= 0).any():
             raise ValueError("frame indices must rise")
         done = 0
         while done < n:
-            take, k = min(BURN_IN - self._filled, n - done), self._filled
+            take, k = min(self._room() - self._filled, n - done), self._filled
             self._index[k : k + take] = index[done : done + take]
             self._slopes[k : k + take] = slopes[done : done + take]
             self._pokes[k : k + take] = pokes[done : done + take]
             done += take
             self._last_index, self._filled = int(index[done - 1]), k + take
-            if self._filled >= self._room():
+            if self._filled >= (BURN_IN if self._response is None else 250):
                 self._absorb()
         return self
 
@@ -177,17 +179,13 @@ class DocrimeEstimator:
         """
         self._absorb()
         needed = self.n_modes + self.lags + MIN_FREEDOM
-        if self._whitener is None or self._sums.count < needed:
+        if self._whitener is None or self._tracker is None or self._sums.count < needed:
             raise TooFewFrames(
                 f"{self._sums.count} complete frames cannot constrain {self.n_modes} modes; "
                 f"at least {needed + self.order + self.lags} frames are needed"
             )
         sums = self._sums.centred()
-        excitation = np.linalg.eigvalsh(sums.gram)
-        if self._tracker is None or excitation[0] <= 1e-12 * excitation[-1]:
-            raise CalibrationError(
-                "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
-            )
+        _require_excitation(sums.gram)
         matrix = sums.solve()
         covariance = sums.residual_power(matrix) / (sums.count - self.n_modes - self.lags)
         covariance = covariance if covariance.ndim == 2 else np.diag(covariance)
@@ -249,11 +247,12 @@ class DocrimeEstimator:
         """
         if usable_rows(data, max(self.order, 1), self.lags).size < self.n_modes + self.lags + MIN_FREEDOM:
             return
+        _require_excitation(data.pokes.T @ data.pokes)
         # Differences tell the response well even where the plain estimator is asked for.
-        difference = np.array([1.0, -1.0])
-        response, whitener = fit_response(data, difference, self.lags), np.ones(1)
+        difference, few = np.array([1.0, -1.0]), data.thinned(_FEW_SLOPES)
+        response, whitener = fit_response(few, difference, self.lags), np.ones(1)
         if self.order:
-            residuals, usable = self._residuals(data, difference, response)
+            residuals, usable = self._residuals(few, difference, response)
             whitener = prediction_error_filter(residuals, usable, self.order)
             response = fit_response(data, whitener, self.lags)
         self._whitener, self._response = whitener, response
@@ -263,7 +262,7 @@ class DocrimeEstimator:
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Slopes less what the pokes explain ``(n_times, n_slopes)``, and the rows where that is known."""
         slopes, pokes, now = filtered(data, whitener, self.lags)
-        sums = RegressionSums.zeros(self.n_slopes, self.n_modes, correlations=False)
+        sums = RegressionSums.zeros(slopes.shape[1], self.n_modes, correlations=False)
         matrix = sums.add(slopes, apply_filter(pokes, response.weights, now)).centred().solve()
         at = data.complete(0, self.lags)
         residuals = np.zeros_like(data.slopes)
@@ -272,3 +271,12 @@ class DocrimeEstimator:
         usable = np.zeros_like(data.present)
         usable[at] = True
         return residuals, usable
+
+
+def _require_excitation(gram: NDArray[np.floating]) -> None:
+    """Raise :class:`CalibrationError` unless pokes with these sums of squares span the modes."""
+    values = np.linalg.eigvalsh(gram.astype(np.float64))
+    if values[0] <= 1e-7 * values[-1]:
+        raise CalibrationError(
+            "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
+        )

@@ -79,8 +79,7 @@ def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> T
     TemporalResponse
         Standard errors hold for turbulence that moves neighbouring slopes together.
     """
-    slopes, pokes, now = filtered(data, whitener, lags)
-    slopes = np.ascontiguousarray(slopes[:, :: max(1, -(-slopes.shape[1] // SLOPES))])
+    slopes, pokes, now = filtered(data.thinned(SLOPES), whitener, lags)
     slopes -= slopes.mean(axis=0)
     pokes -= pokes.mean(axis=0)
     best = _strongest_lag(slopes, pokes, now, lags)

@@ -70,13 +70,18 @@ class Telemetry:
             ok &= self.present[first - k : n - k]
         return np.flatnonzero(ok) + first
 
+    def thinned(self, n_slopes: int) -> Telemetry:
+        """At most ``n_slopes`` of the slopes, evenly spread."""
+        step = max(1, -(-self.slopes.shape[1] // n_slopes))
+        return Telemetry(np.ascontiguousarray(self.slopes[:, ::step]), self.pokes, self.present)
+
     def tail(self, rows: int) -> Telemetry:
         """The last ``rows`` rows, as the past of what follows."""
         start = max(0, self.present.size - rows)
         return Telemetry(self.slopes[start:], self.pokes[start:], self.present[start:])
 
     def followed_by(self, other: Telemetry, gap: int = 0) -> Telemetry:
-        """This stretch, ``gap`` lost frames, and another."""
+        """The stretch itself, ``gap`` lost frames, and another."""
         if gap:
             hold = np.repeat(self.pokes[-1:], gap, axis=0)
             blank = np.zeros((gap, self.slopes.shape[1]), np.float32)
