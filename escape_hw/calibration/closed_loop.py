@@ -223,7 +223,7 @@ def best_gain(
     grid: SubApertureGrid,
     *,
     gains: tuple[float, ...] | None = None,
-    frames: int = 1000,
+    frames: int = 1500,
     model_psf: NDArray[np.float32] | None = None,
 ) -> Procedure[tuple[float, list[LoopResult]]]:
     """The gain with the least residual (or the highest Strehl ratio, given a model PSF).
@@ -269,7 +269,23 @@ def best_gain(
             f"the loop closes at none of the gains {', '.join(f'{g:.2f}' for g in tried)}; "
             "drop more modes or measure the matrix again"
         )
-    return max(stable, key=_merit).gain, runs
+    return _peak(stable), runs
+
+
+def _peak(runs: list[LoopResult]) -> float:
+    """Gain at the top of a parabola through the merits, so that one lucky run does not decide.
+
+    With fewer than four runs, or where the parabola has no top, the best run's gain.
+    """
+    gains = np.array([run.gain for run in runs])
+    merits = np.array([_merit(run) for run in runs])
+    best = float(gains[int(np.argmax(merits))])
+    if gains.size < 4:
+        return best
+    bend, slope, _ = np.polyfit(gains, merits, 2)
+    if bend >= 0:
+        return best
+    return float(np.clip(-slope / (2 * bend), gains.min(), gains.max()))
 
 
 def _merit(run: LoopResult) -> float:
