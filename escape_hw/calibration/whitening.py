@@ -20,7 +20,8 @@ def prediction_error_filter(
 
     Least squares of every row on the rows before it, summed over the slopes, on rows whose past is
     complete (the covariance method: with turbulence this smooth, sums over unequal rows, as in the
-    Yule-Walker equations, would spoil the filter as soon as frames are lost). One filter for all slopes keeps generalised and ordinary least squares equal across slopes, whatever their
+    Yule-Walker equations, would spoil the filter as soon as frames are lost). One filter for all
+    slopes keeps generalised and ordinary least squares equal across slopes, whatever their
     correlation (Zellner 1962: equal regressors).
 
     Parameters
@@ -45,12 +46,12 @@ def prediction_error_filter(
         whole &= present[order - lag : n - lag]
     at = np.flatnonzero(whole) + order
     if at.size == 0:
-        return np.eye(1, order + 1)[0]
+        return np.asarray(np.eye(1, order + 1)[0])
     clean = residuals - residuals[at].mean(axis=0)
     past = np.stack([clean[at - lag].ravel() for lag in range(order + 1)]).astype(np.float64)
     covariance = past @ past.T
     if covariance[0, 0] <= 0:
-        return np.eye(1, order + 1)[0]
+        return np.asarray(np.eye(1, order + 1)[0])
     # A whisper of white noise keeps the system well conditioned when the slopes are noise-free.
     covariance[np.diag_indices(order + 1)] *= 1 + 1e-6
     return np.concatenate([[1.0], -np.linalg.solve(covariance[1:, 1:], covariance[1:, 0])])
