@@ -96,7 +96,8 @@ class DocrimeEstimator:
         """
         if slopes.shape != (self.n_slopes,) or poke.shape != (self.n_modes,):
             raise ValueError(
-                f"slopes {slopes.shape} and poke {poke.shape} do not fit ({self.n_slopes},) and ({self.n_modes},)"
+                f"slopes {slopes.shape} and poke {poke.shape} do not fit "
+                f"({self.n_slopes},) and ({self.n_modes},)"
             )
         if not (np.isfinite(slopes).all() and np.isfinite(poke).all()):
             raise ValueError(f"frame {index}: slopes or poke are not finite")

@@ -121,7 +121,7 @@ class LaggedSums:
         gram = np.einsum("l,lmkn,k->mn", weights, self.gram, weights, optimize=True)
         cross = np.einsum("l,lsm->sm", weights, self.cross)
         both = cross @ matrix.T
-        return self.power - both - both.T + matrix @ gram @ matrix.T
+        return np.asarray(self.power - both - both.T + matrix @ gram @ matrix.T)
 
     def response_to(self, matrix: NDArray[np.float64]) -> TemporalResponse:
         """Temporal response given a matrix, scaled to sum 1, with standard errors."""

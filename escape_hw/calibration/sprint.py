@@ -89,7 +89,7 @@ class _Problem:
         return _State(gain, registration.to_array(), 0.0, 0.0, zeros, zeros.copy(), np.zeros(n_slopes))
 
     def _weighted(self, zonal: NDArray[np.float64]) -> NDArray[np.float64]:
-        return zonal / self.by_slope[:, None]
+        return np.asarray(zonal / self.by_slope[:, None])
 
     def linearise(self, state: _State) -> NormalEquations:
         """Model and derivatives about a state."""
@@ -128,7 +128,7 @@ class _Problem:
             state.offset(),
         )
 
-    def move(self, state: _State, step: NDArray[np.float64]) -> _State:
+    def move(self, state: _State, step: NDArray[np.floating]) -> _State:
         n_act = self.model.n_act
         gains, widths, slopes = np.split(step[8:], [n_act, 2 * n_act])
         return _State(

@@ -76,7 +76,7 @@ class Telemetry:
         return Telemetry(self.slopes[start:], self.pokes[start:], self.present[start:])
 
     def followed_by(self, other: Telemetry, gap: int = 0) -> Telemetry:
-        """This stretch, ``gap`` lost frames, and another."""
+        """Append ``gap`` lost frames and another stretch."""
         if gap:
             hold = np.repeat(self.pokes[-1:], gap, axis=0)
             blank = np.zeros((gap, self.slopes.shape[1]), np.float32)

@@ -47,10 +47,11 @@ def prediction_error_filter(
         products = np.einsum("ts,ts->", clean[lag:][both], clean[: present.size - lag][both])
         covariance[lag] = products / max(int(both.sum()), 1)
     if covariance[0] <= 0:
-        return np.eye(1, order + 1)[0]
+        return np.concatenate([np.ones(1), np.zeros(order)])
     # A whisper of white noise keeps the system well conditioned when the slopes are noise-free.
     covariance[0] *= 1 + 1e-6
-    return np.concatenate([[1.0], -solve_toeplitz(covariance[:-1], covariance[1:])])
+    prediction: NDArray[np.float64] = solve_toeplitz(covariance[:-1], covariance[1:])
+    return np.concatenate([np.ones(1), -prediction])
 
 
 def apply_filter(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
@@ -22,7 +24,7 @@ def _comb_power(profile: NDArray[np.float64], pitch: float) -> complex:
 def _pitch_and_phase(image: NDArray[np.float64], nominal: float) -> tuple[float, float, float]:
     """Common pitch of both axes, and the position of one lenslet centre along x and y."""
     profiles = [image.sum(axis=0), image.sum(axis=1)]
-    profiles = [p - ndimage.uniform_filter1d(p, int(round(nominal)) | 1) for p in profiles]
+    profiles = [p - ndimage.uniform_filter1d(p, round(nominal) | 1) for p in profiles]
 
     def lack(pitch: float) -> float:
         return -sum(abs(_comb_power(p, pitch)) ** 2 for p in profiles)
@@ -100,15 +102,11 @@ def find_grid(
         )
     pitch, x, y = _pitch_and_phase(light, nominal_pitch_px)
     x, y = _centre_lattice(light, pitch, x, y, n_sub)
-    grid = None
     for _ in range(3):
         grid = _grid_at(image, n_sub, pitch, (x, y), min_flux)
-        extractor = SlopeExtractor(grid, image.shape, threshold=0.0)  # type: ignore[arg-type]
-        offset = _measure(extractor, light)
-        spots = grid.centres_px() + offset
+        spots = grid.centres_px() + _measure(grid, light)
         rows, columns = np.nonzero(grid.valid)
         pitch, x, y = _lattice_fit(rows, columns, spots, grid.flux[grid.valid].astype(float))
-    assert grid is not None  # noqa: S101 - the loop above ran
     if abs(pitch / nominal_pitch_px - 1) > _PITCH_RANGE:
         raise CalibrationError(
             f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal_pitch_px}; "
@@ -116,15 +114,7 @@ def find_grid(
         )
     grid = _grid_at(image, n_sub, pitch, (x, y), min_flux)
     if references == "mean":
-        extractor = SlopeExtractor(grid, image.shape, threshold=0.0)  # type: ignore[arg-type]
-        grid = SubApertureGrid(
-            grid.pitch_px,
-            grid.origin_px,
-            grid.valid,
-            _measure(extractor, light).astype(np.float32),
-            grid.flux,
-            grid.counts,
-        )
+        grid = replace(grid, references_px=_measure(grid, light).astype(np.float32))
     return grid
 
 
@@ -133,14 +123,16 @@ def _centre_lattice(
 ) -> tuple[float, float]:
     """Number the lenslets so that the pupil's light is centred on the ``n_sub`` by ``n_sub`` grid."""
     # The outline of the pupil, not its brightness: a Gaussian beam need not be centred on it.
-    smooth = ndimage.uniform_filter(light, int(round(pitch)))
+    smooth = ndimage.uniform_filter(light, round(pitch))
     outline = smooth > 0.3 * np.percentile(smooth, 99)
     rows, columns = np.nonzero(outline)
     half = (n_sub - 1) / 2
-    middle = [0.5 * (v.min() + v.max()) for v in (columns, rows)]
-    return tuple(  # type: ignore[return-value]
-        phase + pitch * round((m - phase) / pitch - half) for m, phase in zip(middle, (x, y), strict=True)
-    )
+
+    def first(at: NDArray[np.intp], phase: float) -> float:
+        middle = 0.5 * float(at.min() + at.max())
+        return phase + pitch * round((middle - phase) / pitch - half)
+
+    return first(columns, x), first(rows, y)
 
 
 def _grid_at(
@@ -148,7 +140,8 @@ def _grid_at(
 ) -> SubApertureGrid:
     line = np.arange(n_sub) * pitch
     centres = np.stack([a.ravel() for a in np.meshgrid(origin[0] + line, origin[1] + line)], axis=1)
-    boxes = windows(centres, pitch, image.shape)  # type: ignore[arg-type]
+    rows, columns = image.shape
+    boxes = windows(centres, pitch, (rows, columns))
     area = np.pad(image.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     top, end, left, right = boxes.T
     flux = area[end, right] - area[top, right] - area[end, left] + area[top, left]
@@ -168,8 +161,10 @@ def _grid_at(
     )
 
 
-def _measure(extractor: SlopeExtractor, light: NDArray[np.float64]) -> NDArray[np.float64]:
+def _measure(grid: SubApertureGrid, light: NDArray[np.float64]) -> NDArray[np.float64]:
     """Spot offsets ``(n_valid, 2)`` of a mean frame that is no longer made of whole counts."""
+    rows, columns = light.shape
+    extractor = SlopeExtractor(grid, (rows, columns), threshold=0.0)
     scale = 60000.0 / float(light.max())
     slopes = extractor(np.asarray(light * scale, dtype=np.uint16))
     return np.asarray(slopes.reshape(2, -1).T, dtype=np.float64)
