@@ -14,6 +14,11 @@ from escape_hw.pipeline.slopes import SlopeExtractor, windows
 
 #: How far the real pitch may lie from the nominal one.
 _PITCH_RANGE = 0.03
+#: Least contrast of the light folded at the pitch. Spots under the strongest screen of the bench leave
+#: 0.85, spots that do not stand on the lattice below 0.2.
+_CONTRAST = 0.3
+#: Spots further off the lattice than this many median distances do not count.
+_OUTLIER = 5.0
 
 
 def _comb_power(profile: NDArray[np.float64], pitch: float) -> complex:
@@ -38,18 +43,47 @@ def _pitch_and_phase(image: NDArray[np.float64], nominal: float) -> tuple[float,
     return pitch, float(phases[0]), float(phases[1])
 
 
+def _contrast(light: NDArray[np.float64], pitch: float) -> float:
+    """How much the light gathers once per pitch: 1 for points on the lattice, 0 for none."""
+    return sum(abs(_comb_power(light.sum(axis=axis), pitch)) for axis in (0, 1)) / (2 * float(light.sum()))
+
+
+def _check_lattice(light: NDArray[np.float64], pitch: float, nominal: float) -> None:
+    """Raise unless the spots really stand one pitch apart."""
+    if abs(pitch / nominal - 1) > _PITCH_RANGE:
+        raise CalibrationError(
+            f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal}; "
+            "check sensor.pitch_px and the binning"
+        )
+    contrast = _contrast(light, pitch)
+    # Spots two or three of the assumed pitches apart look regular too, at a harmonic.
+    wider = max(_contrast(light, m * pitch) for m in (2, 3))
+    if contrast < _CONTRAST or wider > contrast / 2:
+        raise CalibrationError(
+            f"the spots on the wavefront sensor do not stand {nominal} pixels apart, as the design says; "
+            "check sensor.pitch_px and the binning, and that the light comes through the lenslets"
+        )
+
+
 def _lattice_fit(
     rows: NDArray[np.intp], columns: NDArray[np.intp], spots: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Weighted least-squares pitch and origin (x, y) of spots on a square lattice."""
+    """Weighted least-squares pitch and origin (x, y) of spots on a square lattice.
+
+    Spots that lie further off than the many do (a hot pixel in the window) are left out.
+    """
     n = rows.size
-    design = np.zeros((2 * n, 3))
-    design[:n, 0], design[n:, 0] = columns, rows
-    design[:n, 1] = design[n:, 2] = 1.0
-    w = np.sqrt(np.tile(weight, 2))
-    answer = np.linalg.lstsq(design * w[:, None], np.concatenate([spots[:, 0], spots[:, 1]]) * w, rcond=None)[
-        0
-    ]
+    design = np.zeros((2, n, 3))
+    design[0, :, 0], design[1, :, 0] = columns, rows
+    design[0, :, 1] = design[1, :, 2] = 1.0
+    w: NDArray[np.floating] = np.sqrt(weight)
+    answer: NDArray[np.floating] = np.zeros(3)
+    for _ in range(3):
+        answer = np.linalg.lstsq((design * w[:, None]).reshape(2 * n, 3), (spots.T * w).ravel(), rcond=None)[
+            0
+        ]
+        off = np.hypot(*(spots.T - design @ answer))
+        w = np.sqrt(weight) * (off <= _OUTLIER * np.median(off) + 1e-6)
     return float(answer[0]), float(answer[1]), float(answer[2])
 
 
@@ -106,12 +140,8 @@ def find_grid(
         grid = _grid_at(image, n_sub, pitch, (x, y), min_flux)
         spots = grid.centres_px() + _measure(grid, light)
         rows, columns = np.nonzero(grid.valid)
-        pitch, x, y = _lattice_fit(rows, columns, spots, grid.flux[grid.valid].astype(float))
-    if abs(pitch / nominal_pitch_px - 1) > _PITCH_RANGE:
-        raise CalibrationError(
-            f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal_pitch_px}; "
-            "check sensor.pitch_px and the binning"
-        )
+        pitch, x, y = _lattice_fit(rows, columns, spots, np.minimum(grid.flux[grid.valid], 1.0).astype(float))
+    _check_lattice(light, pitch, nominal_pitch_px)
     grid = _grid_at(image, n_sub, pitch, (x, y), min_flux)
     if references == "mean":
         grid = replace(grid, references_px=_measure(grid, light).astype(np.float32))
@@ -122,9 +152,17 @@ def _centre_lattice(
     light: NDArray[np.float64], pitch: float, x: float, y: float, n_sub: int
 ) -> tuple[float, float]:
     """Number the lenslets so that the pupil's light is centred on the ``n_sub`` by ``n_sub`` grid."""
-    # The outline of the pupil, not its brightness: a Gaussian beam need not be centred on it.
     smooth = ndimage.uniform_filter(light, round(pitch))
-    outline = smooth > 0.3 * np.percentile(smooth, 99)
+    # Opening by more than one pitch removes hot pixels, which would push the outline out.
+    brush = round(1.5 * pitch) | 1
+    opened = ndimage.maximum_filter(ndimage.minimum_filter(smooth, brush, mode="constant"), brush)
+    # The outline of the pupil, not its brightness: a Gaussian beam need not be centred on it.
+    outline = opened > 0.1 * np.percentile(opened, 99)
+    if not outline.any():
+        raise CalibrationError(
+            "single bright pixels but no evenly lit pupil on the wavefront sensor; "
+            "check source, exposure and sensor.pitch_px"
+        )
     rows, columns = np.nonzero(outline)
     half = (n_sub - 1) / 2
 

@@ -53,7 +53,7 @@ class LeakyIntegrator:
 
     def applied(self, modes: NDArray[np.floating]) -> None:
         """Tell the integrator what the mirror really did, so that it does not wind up."""
-        self.state = np.asarray(modes, dtype=np.float32)
+        self.state = np.array(modes, dtype=np.float32)
 
     def reset(self) -> None:
         """Forget everything."""
