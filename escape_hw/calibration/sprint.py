@@ -99,7 +99,7 @@ class _Problem:
             np.zeros(self.n_lines), zeros, zeros.copy(), np.zeros(n_slopes))
 
     def _weighted(self, zonal: NDArray[np.float64]) -> NDArray[np.float64]:
-        return zonal / self.by_slope[:, None]
+        return np.asarray(zonal / self.by_slope[:, None])
 
     def linearise(self, state: _State) -> NormalEquations:
         """Model and derivatives about a state."""
@@ -148,7 +148,7 @@ class _Problem:
             state.offset(),
         )
 
-    def move(self, state: _State, step: NDArray[np.float64]) -> _State:
+    def move(self, state: _State, step: NDArray[np.floating]) -> _State:
         n_act = self.model.n_act
         v, n = len(self.variants), len(self.variants) + self.n_lines
         variant, sampling, gains, widths, slopes = np.split(step[8:], [v, n, n + n_act, n + 2 * n_act])

@@ -61,7 +61,8 @@ class ShackHartmannModel:
         self._pupil = pupil_geometry(config)
         if grid.valid.shape != (self._pupil.n_sub, self._pupil.n_sub):
             raise ValueError(
-                f"the grid has {grid.valid.shape} lenslets, the design {self._pupil.n_sub} x {self._pupil.n_sub}"
+                f"the grid has {grid.valid.shape} lenslets, "
+                f"the design {self._pupil.n_sub} x {self._pupil.n_sub}"
             )
         self._positions = actuator_positions(config)
         self._pitch = pitch_on_pupil(config)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from itertools import pairwise
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -135,7 +136,7 @@ class SimBench:
         image = np.zeros((self.config.devices.wfs.region[3], self.config.devices.wfs.region[2]), np.float32)
         edges = np.linspace(start_s, end_s, steps + 1)
         opd = np.zeros(self.pupil.amplitude.shape, np.float32)
-        for a, b in zip(edges[:-1], edges[1:], strict=True):
+        for a, b in pairwise(edges):
             opd = self.optical_path(float(a), float(b))
             sensor.frame(opd + self._ncpa, image)
         return (image / np.float32(steps) if steps > 1 else image), opd
