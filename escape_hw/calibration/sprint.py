@@ -49,7 +49,9 @@ class _State:
     def offset(self) -> NDArray[np.float64]:
         """Distance from the priors' means, in the order of the unknowns."""
         head = np.concatenate([[0.0], np.zeros(5), [self.width, self.shape]])
-        return np.concatenate([head, self.variant, self.sampling, self.actuator_gain, self.actuator_width, self.slope_gain])
+        return np.concatenate(
+            [head, self.variant, self.sampling, self.actuator_gain, self.actuator_width, self.slope_gain]
+        )
 
 
 class _Problem:
@@ -95,8 +97,17 @@ class _Problem:
         zeros = np.zeros(n_act)
         model = self._weighted(self.model.zonal_matrix(registration)) @ self.modes
         gain = float(np.vdot(model, self.data) / np.vdot(model, model))
-        return _State(gain, registration.to_array(), 0.0, 0.0, np.zeros(len(self.variants)),
-            np.zeros(self.n_lines), zeros, zeros.copy(), np.zeros(n_slopes))
+        return _State(
+            gain,
+            registration.to_array(),
+            0.0,
+            0.0,
+            np.zeros(len(self.variants)),
+            np.zeros(self.n_lines),
+            zeros,
+            zeros.copy(),
+            np.zeros(n_slopes),
+        )
 
     def _weighted(self, zonal: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(zonal / self.by_slope[:, None])
@@ -130,7 +141,7 @@ class _Problem:
         unit = modal(shaped)
         parts = (*moved, by_width, by_shape, *variants)
         common = np.stack([unit, *(state.gain * modal(z) for z in parts)])
-        # Where a slope samples the wavefront: its own shift, shared by the lenslets of a column (x) or row (y).
+        # Where a slope samples the wavefront: a shift shared by the lenslets of a column (x) or row (y).
         sampled = np.zeros((self.lines.max() + 1, *unit.shape))
         half = unit.shape[0] // 2
         rows_of = np.arange(unit.shape[0])

@@ -44,7 +44,7 @@ class LeakyIntegrator:
     """
 
     def __init__(self, reconstructor: NDArray[np.float32], gain: float, leak: float) -> None:
-        if not 0 < gain:
+        if not gain > 0:
             raise ValueError(f"gain is {gain}; it must be positive")
         if not 0 <= leak <= 1:
             raise ValueError(f"leak is {leak}; it must lie in [0, 1]")
