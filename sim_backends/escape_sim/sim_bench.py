@@ -261,7 +261,10 @@ class SimBench:
             screen = self.config.devices.screen
             if screen is None:
                 raise ConfigError(f"system {self.config.system.name!r} has no [devices.screen] section")
-            rng = np.random.default_rng(self._plates_seed.spawn(number + 1)[number])
+            # A key of its own for each plate, so that the order of use does not matter.
+            key = (*self._plates_seed.spawn_key, number)
+            seed = np.random.SeedSequence(self._plates_seed.entropy, spawn_key=key)
+            rng = np.random.default_rng(seed)
             pixel = self.pupil.pixel_m
             phase = von_karman_screen(
                 _PLATE_PIXELS, pixel, screen.screens_r0_m[number], screen.outer_scale_m, rng
