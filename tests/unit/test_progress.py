@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from escape_hw.api.procedure import Progress
-from escape_hw.cli.progress import ProgressView, time_left
+from escape_hw.runtime.progress import ProgressView, time_left
 
 
 def shown(terminal: bool, quiet: bool = False) -> str:

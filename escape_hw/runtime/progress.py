@@ -17,7 +17,7 @@ _LINE_PERIOD_S = 10.0
 
 
 class ProgressView:
-    """Shows a procedure's progress: bars on a terminal, now and then a line elsewhere."""
+    """Shows a procedure's progress: bars on a terminal or in a notebook, now and then a line elsewhere."""
 
     def __init__(self, console: Console, quiet: bool = False) -> None:
         self._console, self._quiet = console, quiet
@@ -28,7 +28,7 @@ class ProgressView:
 
     def __enter__(self) -> Self:
         """Begin to draw."""
-        if not self._quiet and self._console.is_terminal:
+        if not self._quiet and (self._console.is_terminal or self._console.is_jupyter):
             self._bars = RichProgress(
                 SpinnerColumn(),
                 TextColumn("{task.description}"),
