@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,10 @@ from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.api.threads import one_thread
 from escape_hw.bench import Bench
 from escape_hw.config.load import load_system
+
+if TYPE_CHECKING:
+    from escape_hw.calibration.sensor_setup import SensorSetup
+    from escape_hw.pipeline.slopes import SlopeExtractor
 
 T = TypeVar("T")
 
@@ -67,6 +71,37 @@ class System(Bench):
 
             with ProgressView(Console(stderr=True)) as view:
                 return run_procedure(procedure, observers=(*observers, view), abort=abort)
+
+    def find_sensor(self, *, frames: int = 200, progress: bool = False) -> SensorSetup:
+        """Watch the sensor and find its lenslet grid; the mirror stays as it is.
+
+        Parameters
+        ----------
+        frames
+            Frames to average; under turbulence, the more the better.
+        progress
+            Show a bar with the time left.
+
+        Raises
+        ------
+        CalibrationError
+            No spots where the design says there should be.
+        """
+        from escape_hw.calibration.sensor_setup import find_sensor
+
+        return self.run(find_sensor(self, frames=frames), progress=progress)
+
+    def slopes_of(self, grid: SubApertureGrid) -> SlopeExtractor:
+        """A function that takes ``frame.data`` and returns slopes ``(n_slopes,)`` in pixels.
+
+        Parameters
+        ----------
+        grid
+            From :meth:`find_sensor` or a calibration.
+        """
+        from escape_hw.calibration.sensor_setup import extractor
+
+        return extractor(self, grid)
 
     def calibrate(
         self,
@@ -118,8 +153,9 @@ class System(Bench):
     def find_registration(self, matrix: InteractionMatrix, grid: SubApertureGrid) -> RegistrationEstimate:
         """Where the mirror sits on the sensor, from a measured matrix (SPRINT); nothing moves.
 
-        ``calibrate("escape")`` does this as well, with better error bars: it still knows how the
-        turbulence moves neighbouring slopes together.
+        ``calibrate("escape")`` does this as well, and its error bars are the better ones: a matrix no
+        longer tells how vibration and turbulence move all slopes together, so that the error bars
+        found here are too small where they matter.
 
         Parameters
         ----------

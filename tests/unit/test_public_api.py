@@ -58,7 +58,12 @@ def test_errors_and_configuration_do_not_load_the_numerics() -> None:
 
 @pytest.mark.parametrize(
     ("method", "procedure"),
-    [("close_loop", "closed_loop"), ("find_best_gain", "best_gain"), ("take_model_psf", "measure_model_psf")],
+    [
+        ("close_loop", "closed_loop"),
+        ("find_best_gain", "best_gain"),
+        ("take_model_psf", "measure_model_psf"),
+        ("find_sensor", "find_sensor"),
+    ],
 )
 def test_methods_and_procedures_have_the_same_defaults(method: str, procedure: str) -> None:
     ours = inspect.signature(getattr(escape_hw.System, method)).parameters
