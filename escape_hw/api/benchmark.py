@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
+
+from escape_hw.api.threads import hold_to_one_thread
 
 Better = Literal["higher", "lower"]
 
@@ -93,3 +96,10 @@ def _elapsed(call: Callable[[], object], repeats: int) -> float:
     for _ in range(repeats):
         call()
     return time.perf_counter() - start
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Hold the linear-algebra libraries to one thread, for thread pools fight and hide the cost."""
+    with hold_to_one_thread():
+        yield

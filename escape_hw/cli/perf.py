@@ -38,7 +38,7 @@ def measure(stages: Sequence[str] = ()) -> list[BenchmarkRow]:
     ConfigError
         A stage does not exist.
     """
-    from escape_hw.api.threads import one_thread
+    from escape_hw.api.benchmark import one_thread
 
     known = available()
     unknown = [name for name in stages if name not in known]

@@ -78,11 +78,9 @@ class Session:
             With the partial result.
         """
         from escape_hw.api.procedure import run
-        from escape_hw.api.threads import one_thread
         from escape_hw.runtime.progress import ProgressView
 
-        view = ProgressView(self.errors, self.quiet)
-        with one_thread(), view, self.interrupts.procedure() as abort:
+        with ProgressView(self.errors, self.quiet) as view, self.interrupts.procedure() as abort:
             return run(procedure, observers=(view,), abort=abort)
 
     def attempt(self, procedure: Procedure[T]) -> tuple[T, Aborted | None]:

@@ -15,7 +15,6 @@ from escape_hw.api.procedure import Observer, Procedure
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.api.threads import one_thread
 from escape_hw.bench import Bench
 from escape_hw.config.load import load_system
 
@@ -28,6 +27,8 @@ T = TypeVar("T")
 
 class System(Bench):
     """A bench with everything that can be done on it.
+
+    While it is open, linear algebra runs on one thread: the products of a loop are small.
 
     The methods that take a while run a procedure to its end; ``progress=True`` shows a bar with the
     time left on standard error. Ctrl-C stops any of them: the mirror is flattened and
@@ -43,8 +44,6 @@ class System(Bench):
         progress: bool = False,
     ) -> T:
         """Drive a procedure to its end and return its result.
-
-        Linear algebra runs on one thread meanwhile.
 
         Parameters
         ----------
@@ -62,15 +61,14 @@ class System(Bench):
         Aborted
             Stopped by ``abort`` or Ctrl-C.
         """
-        with one_thread():
-            if not progress:
-                return run_procedure(procedure, observers=observers, abort=abort)
-            from rich.console import Console
+        if not progress:
+            return run_procedure(procedure, observers=observers, abort=abort)
+        from rich.console import Console
 
-            from escape_hw.runtime.progress import ProgressView
+        from escape_hw.runtime.progress import ProgressView
 
-            with ProgressView(Console(stderr=True)) as view:
-                return run_procedure(procedure, observers=(*observers, view), abort=abort)
+        with ProgressView(Console(stderr=True)) as view:
+            return run_procedure(procedure, observers=(*observers, view), abort=abort)
 
     def find_sensor(self, *, frames: int = 200, progress: bool = False) -> SensorSetup:
         """Watch the sensor and find its lenslet grid; the mirror stays as it is.
@@ -175,8 +173,7 @@ class System(Bench):
 
         settings = self.config.calibration
         modes = min(settings.sprint_modes, matrix.n_modes)
-        with one_thread():
-            return sprint(matrix, self.model(grid), modes=modes, learning_rate=settings.learning_rate)
+        return sprint(matrix, self.model(grid), modes=modes, learning_rate=settings.learning_rate)
 
     def take_model_psf(self, *, frames: int = 20, progress: bool = False) -> NDArray[np.float32]:
         """The PSF of the flat mirror without turbulence, which Strehl ratios are measured against.

@@ -92,7 +92,7 @@ class _Views:
             )
 
     def _transform(
-        self, centre: NDArray[np.float64], at: NDArray[np.intp], p: int, field: int
+        self, centre: NDArray[np.floating], at: NDArray[np.intp], p: int, field: int
     ) -> NDArray[np.complex128]:
         """Fourier matrices ``(n_valid, p, size)``, zero where the lenslet's image does not reach."""
         first = first_pixels(centre, field)
