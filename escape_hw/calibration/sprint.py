@@ -215,7 +215,8 @@ def sprint(
         Iterations before giving up.
     covariance
         Covariance of the slopes' noise ``(n_slopes, n_slopes)`` up to a factor, where it is known:
-        turbulence moves neighbouring slopes together, and the error bars must know.
+        turbulence moves neighbouring slopes together, and the error bars must know. Without it they
+        learn of it from the scatter between modes, less precisely.
     priors
         Scatter of what the model does not know.
 
@@ -306,19 +307,26 @@ def _covariance(
     """Sandwich covariance of the common parameters, in units of their own.
 
     The middle holds the scatter of the scores from slope to slope as it is found, which includes
-    whatever the model still misses, and the known correlation of the noise between slopes.
+    whatever the model still misses, and the correlation of the noise between slopes: as known, or
+    else as the scatter from mode to mode shows it (two-way clusters: Cameron, Gelbach & Miller 2011).
     """
     bread = np.linalg.inv(_reduced(system))
     scores = system.efficient()
-    by_slope = np.einsum("psm,sm->ps", scores, system.residual)
+    each = scores * system.residual
+    by_slope = each.sum(axis=2)
     meat = by_slope @ by_slope.T
-    if noise is not None:
+    if noise is None:
+        by_mode, flat = each.sum(axis=1), each.reshape(len(each), -1)
+        # Vibration that moves all slopes together while one mode is measured shows here only.
+        values, vectors = np.linalg.eigh(meat + by_mode @ by_mode.T - flat @ flat.T)
+        meat = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    else:
         whole = noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
         whole[np.diag_indices_from(whole)] = 0.0
         meat += np.einsum("psm,st,qtm->pq", scores, whole, scores, optimize=True)
     # Never better than the noise alone allows.
-    floor = np.maximum(np.diag(bread) / np.diag(bread @ meat @ bread), 1.0)
-    scale = np.sqrt(floor)
+    found = np.maximum(np.diag(bread @ meat @ bread), 1e-12 * np.diag(bread))
+    scale = np.sqrt(np.maximum(np.diag(bread) / found, 1.0))
     return np.asarray(bread @ meat @ bread * np.outer(scale, scale))
 
 
