@@ -237,7 +237,8 @@ class DocrimeEstimator:
             self._tracker = ResponseTracker(
                 self._sums.centred().solve(), self._response, now.size, autocovariance(pokes, now, self.lags)
             )
-        else:
+        elif self.order:
+            # Without the filter later frames would tell less than the first ones' differences did.
             self._tracker.add(slopes, pokes, now)
 
     def _fit(self, data: Telemetry) -> None:

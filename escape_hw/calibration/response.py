@@ -127,7 +127,10 @@ def _regress(
     scores = np.einsum("lts,ts->lt", z, error).astype(np.float64)
     bread = np.linalg.inv(normal)
     total = weights.sum()
-    return weights / total, bread @ (scores @ scores.T) @ bread / total**2
+    weights = weights / total
+    # Scaled to sum 1, a weight errs with all others: d(w / sum) = (1 - w 1^T) dw / sum.
+    scaled = (np.eye(lags) - weights[:, None]) @ bread / total
+    return weights, scaled @ (scores @ scores.T) @ scaled.T
 
 
 class ResponseTracker:

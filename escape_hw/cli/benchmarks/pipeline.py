@@ -79,7 +79,7 @@ def _peer_slopes(
 
 def _integrator(n_modes: int, n_slopes: int) -> BenchmarkRow:
     rng = np.random.default_rng(0)
-    matrix = rng.standard_normal((n_modes, n_slopes)).astype(np.float32) / n_slopes
+    matrix = rng.standard_normal((n_modes, n_slopes)).astype(np.float32) / np.float32(n_slopes)
     slopes = rng.standard_normal(n_slopes).astype(np.float32)
     start = rng.standard_normal(n_modes).astype(np.float32)
     gain, leak = 0.3, 0.01
