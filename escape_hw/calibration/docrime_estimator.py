@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.lagged_sums import LaggedSums
 from escape_hw.calibration.telemetry import Telemetry
-from escape_hw.calibration.whitening import prediction_error_filter
+from escape_hw.calibration.whitening import autocovariance, prediction_error_filter
 from escape_hw.errors import CalibrationError, TooFewFrames
 
 #: Frames kept to fit the whitening filter before the sums start.
@@ -22,6 +22,8 @@ BURN_IN = 1000
 BLOCK = 256
 #: Degrees of freedom without which no standard error is worth stating.
 MIN_FREEDOM = 20
+#: Standard deviations by which the mirror's share of the slopes must exceed what chance makes.
+_CLEARLY = 5.0
 _ONE = np.ones(1)
 
 
@@ -72,6 +74,7 @@ class DocrimeEstimator:
         self._last_index: int | None = None
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
+        self._spread = 1.0
         self._sums = LaggedSums.zeros(n_slopes, n_modes, 1)
         self.frames = self.lost_frames = 0
 
@@ -135,11 +138,40 @@ class DocrimeEstimator:
         matrix, gram = sums.solve(_ONE)
         freedom = sums.count - self.n_modes - self.lags
         covariance = sums.residual_power(matrix, _ONE) / freedom
-        variance = np.maximum(np.diag(covariance), 0.0)
+        self._require_response(matrix, gram, covariance * self._spread, self._response.weights.size)
+        variance = np.maximum(np.diag(covariance), 0.0) * self._spread
         sigma = np.sqrt(np.outer(variance, np.diag(np.linalg.inv(gram))))
         return DocrimeSolution(
             matrix, sigma, self._response, covariance, self._whitener, self.frames, self.lost_frames
         )
+
+    def _require_response(
+        self,
+        matrix: NDArray[np.float64],
+        gram: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+        lags: int,
+    ) -> None:
+        """Refuse a matrix that chance alone explains: the sensor does not see the mirror.
+
+        Without a response, the power that the pokes explain is that of the noise on average, with
+        the scatter of as many degrees of freedom as modes and independent slopes have; choosing the
+        temporal response that explains most adds what the largest eigenvalue of a Wishart matrix
+        exceeds the mean by (Marchenko & Pastur 1967).
+        """
+        noise = float(np.trace(covariance))
+        if not noise > 0:
+            return
+        explained = float(np.einsum("sm,mn,sn->", matrix, gram, matrix, optimize=True))
+        freedom = self.n_modes * noise**2 / float(np.square(covariance).sum())
+        chance = (1 + np.sqrt(lags / freedom)) ** 2 * (1 + _CLEARLY * np.sqrt(2 / freedom))
+        ratio = explained / (self.n_modes * noise)
+        if ratio < chance:
+            raise CalibrationError(
+                f"the wavefront sensor does not respond to the mirror: the pokes explain {ratio:.2f} times "
+                f"the power of the noise, and chance alone up to {chance:.2f}; check that the mirror is in the "
+                "beam and powered, or use larger pokes or more frames"
+            )
 
     def _absorb(self) -> None:
         """Move the gathered frames into the sums; fit the filter first if there is none yet."""
@@ -183,11 +215,33 @@ class DocrimeEstimator:
             if last:
                 break
             matrix = sums.solve(response.weights)[0]
-            at = data.complete(0, self.lags)
-            seen = sum(w * data.pokes[at - lag] for lag, w in enumerate(response.weights))
-            residuals = np.zeros_like(data.slopes)
-            residuals[at] = data.slopes[at] - seen @ matrix.T
-            usable = np.zeros_like(data.present)
-            usable[at] = True
-            whitener = prediction_error_filter(residuals, usable, self.order)
+            whitener = prediction_error_filter(*self._residuals(data, matrix, response), self.order)
+        if not self.order:
+            turbulence = self._residuals(data, sums.solve(response.weights)[0], response)
+            self._spread = _spread(autocovariance(*turbulence, self.lags - 1), response.weights)
         self._whitener, self._response = whitener if self.order else np.ones(1), response
+
+    def _residuals(
+        self, data: Telemetry, matrix: NDArray[np.float64], response: TemporalResponse
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Slopes less what the pokes explain ``(n_times, n_slopes)``, and where they are known."""
+        at = data.complete(0, self.lags)
+        seen = sum(w * data.pokes[at - lag] for lag, w in enumerate(response.weights))
+        residuals = np.zeros_like(data.slopes)
+        residuals[at] = data.slopes[at] - seen @ matrix.T
+        usable = np.zeros_like(data.present)
+        usable[at] = True
+        return residuals, usable
+
+
+def _spread(noise: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    """Factor on the variance of the plain estimator, whose noise is not white.
+
+    A poke that shows in several frames meets the same turbulence in all of them: ``sum over k of
+    rho_noise(k) rho_poke(k)``, with the autocorrelations of the noise and of the poke as it is seen.
+    """
+    seen = np.correlate(weights, weights, "full")[weights.size - 1 :]
+    if not noise[0] > 0:
+        return 1.0
+    terms = (noise / noise[0]) * (seen / seen[0])
+    return float(max(1 + 2 * terms[1:].sum(), 0.0))

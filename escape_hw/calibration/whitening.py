@@ -14,6 +14,30 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 
 
+def autocovariance(
+    residuals: NDArray[np.float32], present: NDArray[np.bool_], order: int
+) -> NDArray[np.float64]:
+    """Autocovariance at lags 0 to ``order``, summed over the slopes, ``(order + 1,)``.
+
+    Parameters
+    ----------
+    residuals
+        ``(n_times, n_slopes)``; rows where ``present`` is false are ignored.
+    present
+        ``(n_times,)``.
+    order
+        Largest lag in frames.
+    """
+    clean = np.where(present[:, None], residuals, 0.0).astype(np.float64)
+    clean -= np.where(present[:, None], clean.sum(axis=0) / present.sum(), 0.0)
+    covariance = np.empty(order + 1)
+    for lag in range(order + 1):
+        both = present[lag:] & present[: present.size - lag]
+        products = np.einsum("ts,ts->", clean[lag:][both], clean[: present.size - lag][both])
+        covariance[lag] = products / max(int(both.sum()), 1)
+    return covariance
+
+
 def prediction_error_filter(
     residuals: NDArray[np.float32], present: NDArray[np.bool_], order: int
 ) -> NDArray[np.float64]:
@@ -39,13 +63,7 @@ def prediction_error_filter(
     """
     if order == 0:
         return np.ones(1)
-    clean = np.where(present[:, None], residuals, 0.0).astype(np.float64)
-    clean -= np.where(present[:, None], clean.sum(axis=0) / present.sum(), 0.0)
-    covariance = np.empty(order + 1)
-    for lag in range(order + 1):
-        both = present[lag:] & present[: present.size - lag]
-        products = np.einsum("ts,ts->", clean[lag:][both], clean[: present.size - lag][both])
-        covariance[lag] = products / max(int(both.sum()), 1)
+    covariance = autocovariance(residuals, present, order)
     if covariance[0] <= 0:
         return np.eye(1, order + 1)[0]
     # A whisper of white noise keeps the system well conditioned when the slopes are noise-free.

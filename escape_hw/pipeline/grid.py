@@ -12,6 +12,11 @@ from escape_hw.pipeline.slopes import SlopeExtractor, windows
 
 #: How far the real pitch may lie from the nominal one.
 _PITCH_RANGE = 0.03
+#: Least contrast of the comb of spots (1 for points, 0 for even light). Turbulence that smears the
+#: spots over half a pitch leaves more than 0.5; the noise of a dark camera makes up to 0.05.
+_LEAST_CONTRAST = 0.2
+#: Pixels above the threshold without which there is nothing to look at: a few spots.
+_LEAST_PIXELS = 24
 
 
 def _comb_power(profile: NDArray[np.float64], pitch: float) -> complex:
@@ -34,6 +39,20 @@ def _pitch_and_phase(image: NDArray[np.float64], nominal: float) -> tuple[float,
     pitch = float(optimize.minimize_scalar(lack, bounds=(best - step, best + step), method="bounded").x)
     phases = [-np.angle(_comb_power(p, pitch)) * pitch / (2 * np.pi) for p in profiles]
     return pitch, float(phases[0]), float(phases[1])
+
+
+def _require_spots(light: NDArray[np.float64], pitch: float) -> None:
+    """Refuse light that no lenslets made: the noise of a dark camera, or an even glow."""
+    if np.count_nonzero(light) < _LEAST_PIXELS:
+        raise CalibrationError(
+            "no light above the threshold on the wavefront sensor; check source, beam stop and exposure"
+        )
+    contrast = min(abs(_comb_power(light.sum(axis=axis), pitch)) for axis in (0, 1)) / light.sum()
+    if contrast < _LEAST_CONTRAST:
+        raise CalibrationError(
+            f"no regular spots {pitch:.2f} pixels apart on the wavefront sensor (contrast {contrast:.2f}, "
+            f"{_LEAST_CONTRAST} is needed); check source, beam stop, exposure and sensor.pitch_px"
+        )
 
 
 def _lattice_fit(
@@ -94,11 +113,8 @@ def find_grid(
         raise ValueError(f"references is {references!r}; choose 'lattice' or 'mean'")
     image = np.asarray(mean_frame, dtype=np.float64)
     light = np.maximum(image - threshold, 0.0)
-    if not light.any():
-        raise CalibrationError(
-            "no light above the threshold on the wavefront sensor; check source and exposure"
-        )
     pitch, x, y = _pitch_and_phase(light, nominal_pitch_px)
+    _require_spots(light, pitch)
     x, y = _centre_lattice(light, pitch, x, y, n_sub)
     grid = None
     for _ in range(3):
