@@ -5,7 +5,8 @@ The names below are the public namespace for scripts::
     import escape_hw
 
     with escape_hw.open_system("razor-shwfs") as bench:
-        bench.dm.send(bench.dm.shape)
+        found = bench.calibrate("escape", progress=True)
+        run = bench.close_loop(found.matrix, found.grid)
 
 They are loaded when first used, so that importing the package stays cheap.
 """
@@ -16,26 +17,127 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from escape_hw.api.procedure import run
-    from escape_hw.runtime.system import open_system
+    from escape_hw import errors, testing
+    from escape_hw.api.camera import Camera
+    from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
+    from escape_hw.api.matrix import InteractionMatrix
+    from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
+    from escape_hw.api.procedure import Procedure, Progress, Reporter, run
+    from escape_hw.api.registration import Registration
+    from escape_hw.api.results import CalibrationResult, LoopResult, Measured, RegistrationEstimate
+    from escape_hw.api.screen import PhaseScreen, ScreenState
+    from escape_hw.api.sensor import SubApertureGrid
+    from escape_hw.calibration.closed_loop import best_gain, closed_loop, measure_model_psf
+    from escape_hw.calibration.docrime import docrime
+    from escape_hw.calibration.escape import escape
+    from escape_hw.calibration.push_pull import push_pull
+    from escape_hw.calibration.sensor_setup import find_sensor, measure_dark
+    from escape_hw.calibration.sprint import sprint
+    from escape_hw.config.bundled import bundled_systems
+    from escape_hw.config.load import load_system
+    from escape_hw.config.registry import register_device
+    from escape_hw.io.fits import load_matrix, save_matrix
+    from escape_hw.runtime.system import System, open_system
+    from escape_hw.safety.limits import MirrorLimits
 
 __version__ = "0.1.0"
 
-#: Public name -> module that defines it. Add a line here, to ``__all__`` and to the block for type
-#: checkers above to publish a name.
+#: Public name -> module that defines it (a module of that very name is published as a whole). Add a
+#: line here, to ``__all__`` and to the block for type checkers above to publish a name.
 _HOME = {
+    "Camera": "escape_hw.api.camera",
+    "CameraInfo": "escape_hw.api.frames",
+    "CameraSettings": "escape_hw.api.frames",
+    "CalibrationResult": "escape_hw.api.results",
+    "DMInfo": "escape_hw.api.mirror",
+    "DeformableMirror": "escape_hw.api.mirror",
+    "Frame": "escape_hw.api.frames",
+    "InteractionMatrix": "escape_hw.api.matrix",
+    "LoopResult": "escape_hw.api.results",
+    "Measured": "escape_hw.api.results",
+    "MirrorLimits": "escape_hw.safety.limits",
+    "PhaseScreen": "escape_hw.api.screen",
+    "Procedure": "escape_hw.api.procedure",
+    "Progress": "escape_hw.api.procedure",
+    "Region": "escape_hw.api.frames",
+    "Registration": "escape_hw.api.registration",
+    "RegistrationEstimate": "escape_hw.api.results",
+    "Reporter": "escape_hw.api.procedure",
+    "ScreenState": "escape_hw.api.screen",
+    "SendReport": "escape_hw.api.mirror",
+    "SubApertureGrid": "escape_hw.api.sensor",
+    "System": "escape_hw.runtime.system",
+    "best_gain": "escape_hw.calibration.closed_loop",
+    "bundled_systems": "escape_hw.config.bundled",
+    "closed_loop": "escape_hw.calibration.closed_loop",
+    "docrime": "escape_hw.calibration.docrime",
+    "errors": "escape_hw.errors",
+    "escape": "escape_hw.calibration.escape",
+    "find_sensor": "escape_hw.calibration.sensor_setup",
+    "load_matrix": "escape_hw.io.fits",
+    "load_system": "escape_hw.config.load",
+    "measure_dark": "escape_hw.calibration.sensor_setup",
+    "measure_model_psf": "escape_hw.calibration.closed_loop",
     "open_system": "escape_hw.runtime.system",
+    "push_pull": "escape_hw.calibration.push_pull",
+    "register_device": "escape_hw.config.registry",
     "run": "escape_hw.api.procedure",
+    "save_matrix": "escape_hw.io.fits",
+    "sprint": "escape_hw.calibration.sprint",
+    "testing": "escape_hw.testing",
 }
 
-__all__ = ["__version__", "open_system", "run"]
+__all__ = [
+    "CalibrationResult",
+    "Camera",
+    "CameraInfo",
+    "CameraSettings",
+    "DMInfo",
+    "DeformableMirror",
+    "Frame",
+    "InteractionMatrix",
+    "LoopResult",
+    "Measured",
+    "MirrorLimits",
+    "PhaseScreen",
+    "Procedure",
+    "Progress",
+    "Region",
+    "Registration",
+    "RegistrationEstimate",
+    "Reporter",
+    "ScreenState",
+    "SendReport",
+    "SubApertureGrid",
+    "System",
+    "__version__",
+    "best_gain",
+    "bundled_systems",
+    "closed_loop",
+    "docrime",
+    "errors",
+    "escape",
+    "find_sensor",
+    "load_matrix",
+    "load_system",
+    "measure_dark",
+    "measure_model_psf",
+    "open_system",
+    "push_pull",
+    "register_device",
+    "run",
+    "save_matrix",
+    "sprint",
+    "testing",
+]
 
 
 def __getattr__(name: str) -> Any:
     home = _HOME.get(name)
     if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(home), name)
+    module = importlib.import_module(home)
+    value = module if home == f"{__name__}.{name}" else getattr(module, name)
     globals()[name] = value
     return value
 

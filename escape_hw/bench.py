@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import zlib
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,14 @@ from escape_hw.api.mirror import DeformableMirror
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.screen import PhaseScreen
 from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.threads import hold_to_one_thread
 from escape_hw.config.device_models import DeviceConfig
 from escape_hw.config.models import SystemConfig
 from escape_hw.config.registry import device_factory, model_factory
 from escape_hw.errors import ConfigError
+
+if TYPE_CHECKING:
+    from threadpoolctl import threadpool_limits
 
 log = logging.getLogger(__name__)
 
@@ -61,6 +65,7 @@ class Bench:
         self.config = config
         self.dm, self.wfs, self.science, self.screen = dm, wfs, science, screen
         self.dark: NDArray[np.float32] | None = None
+        self._threads: threadpool_limits | None = None
         stream = zlib.crc32(b"escape_hw.bench")
         self.rng = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(stream,)))
 
@@ -120,6 +125,8 @@ class Bench:
         DeviceError
             A device cannot be reached; those opened before it are closed again.
         """
+        if self._threads is None:
+            self._threads = hold_to_one_thread()
         try:
             for device in self.devices:
                 device.open()
@@ -168,6 +175,9 @@ class Bench:
 
     def _close_all(self, cause: BaseException | None) -> BaseException | None:
         """Close in reverse; failures become notes on the cause or on the first failure."""
+        if self._threads is not None:
+            self._threads.restore_original_limits()
+            self._threads = None
         first = cause
         for device in reversed(self.devices):
             try:

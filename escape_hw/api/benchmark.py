@@ -10,6 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from escape_hw.api.threads import hold_to_one_thread
+
 Better = Literal["higher", "lower"]
 
 
@@ -99,7 +101,5 @@ def _elapsed(call: Callable[[], object], repeats: int) -> float:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Hold the linear-algebra libraries to one thread, for thread pools fight and hide the cost."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1):
+    with hold_to_one_thread():
         yield

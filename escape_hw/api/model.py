@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,5 +60,13 @@ class SyntheticModel(Protocol):
         -------
         ndarray, ``(n_slopes, n_act)``
             In the sensor's slope unit, all x then all y over the valid sub-apertures.
+        """
+        ...
+
+    def variants(self) -> Sequence[Self]:
+        """Models that differ from this one by one standard deviation of something uncertain.
+
+        SPRINT fits how much of each difference the data hold, so that the registration does not pay
+        for it and its errors know of it. Empty when the model is sure of itself.
         """
         ...

@@ -144,6 +144,8 @@ def closed_loop(
     record, partial = _Record(), False
     science = bench.science if model_psf is not None else None
     bench.dm.flatten()
+    # One frame first: what the camera lost while nobody read it is not a loss of the loop.
+    next_frame(bench)
     before = bench.wfs.status()
     started = bench.wfs.now_ns()
     if science is not None:

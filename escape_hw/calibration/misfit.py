@@ -24,6 +24,9 @@ class Priors:
         Widths of single influence functions.
     slope_gain
         Gains of single slopes: uneven light, spot size and alignment with the pixels.
+    sampling
+        Where within its lenslet a slope samples the wavefront, in % of a sub-aperture; common to the
+        x slopes of a column and to the y slopes of a row, which fall on the pixels alike.
     width, shape
         Common width of the influence functions, and the share of a broad pedestal in them.
     """
@@ -33,6 +36,7 @@ class Priors:
     slope_gain: float = 0.1
     width: float = 0.2
     shape: float = 0.2
+    sampling: float = 0.5
 
 
 @dataclass(slots=True, eq=False)

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from escape_hw.errors import CalibrationError
+
+#: On a symmetric mirror modes come in pairs of equal variance, and rounding would decide how a pair lies
+#: in its plane (and which half of one is cut off). This much anisotropy decides it instead.
+_LEAN = 1e-4
 
 
 def unit_rms(
@@ -35,6 +40,23 @@ def fix_signs(m2c: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(m2c * np.sign(m2c[pivot, np.arange(m2c.shape[1])]))
 
 
+def von_karman_covariance(distance_m: NDArray[np.float64], outer_scale_m: float) -> NDArray[np.float64]:
+    """Covariance of von Karman phase at a distance, relative to the variance.
+
+    ``x^(5/6) K_5/6(x) 2^(1/6) / Gamma(5/6)`` with ``x = 2 pi r / L0``: the Fourier transform of the
+    power spectrum ``(f^2 + 1 / L0^2)^(-11/6)`` (Conan 2000).
+
+    Parameters
+    ----------
+    distance_m
+        Distances of any shape in metres.
+    outer_scale_m
+        Outer scale in metres.
+    """
+    x = 2 * np.pi * np.maximum(distance_m, 1e-9 * outer_scale_m) / outer_scale_m
+    return np.asarray(x ** (5 / 6) * special.kv(5 / 6, x) * (2 ** (1 / 6) / special.gamma(5 / 6)))
+
+
 def karhunen_loeve(
     surfaces: NDArray[np.float64],
     pupil: NDArray[np.bool_],
@@ -44,8 +66,9 @@ def karhunen_loeve(
 ) -> NDArray[np.float64]:
     """Karhunen-Loeve modes of von Karman turbulence within the span of the influence functions.
 
-    Double diagonalisation (Gendron 1995): modes orthonormal over the pupil, without piston, whose
-    turbulent coefficients are uncorrelated; ordered by falling variance.
+    Double diagonalisation (Gendron 1995): modes whose turbulent coefficients are uncorrelated, ordered
+    by falling variance, and which are orthonormal over the pupil once their piston is taken out; no
+    sensor sees it.
 
     Parameters
     ----------
@@ -73,7 +96,11 @@ def karhunen_loeve(
     n_act, n = surfaces.shape[0], pupil.shape[0]
     inside = surfaces[:, pupil]
     inside = inside - inside.mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(inside @ inside.T / inside.shape[1])
+    gram = inside @ inside.T / inside.shape[1]
+    rows, columns = np.nonzero(pupil)
+    lean = np.square(columns - columns.mean()) - np.square(rows - rows.mean())
+    leaning = (inside * (1 + _LEAN * lean / np.abs(lean).max())) @ inside.T / inside.shape[1]
+    values, vectors = np.linalg.eigh(leaning)
     keep = values > values[-1] * 1e-9
     if n_modes > min(int(keep.sum()), n_act - 1):
         raise CalibrationError(
@@ -81,18 +108,23 @@ def karhunen_loeve(
             f"{min(int(keep.sum()), n_act - 1)} without piston; lower basis.n_modes"
         )
     order = np.argsort(values)[::-1][:n_modes]
-    orthonormal = vectors[:, order] / np.sqrt(values[order])
+    chosen = vectors[:, order] / np.sqrt(values[order])
+    orthonormal = np.linalg.solve(np.linalg.cholesky(chosen.T @ gram @ chosen), chosen.T).T
     padded = np.zeros((n_act, 2 * n, 2 * n))
     padded[:, :n, :n] = np.where(pupil, surfaces, 0.0)
     padded[:, :n, :n][:, pupil] = inside
-    f = np.fft.fftfreq(2 * n, pixel_m)
-    spectrum = (f[:, None] ** 2 + f[None, : n + 1] ** 2 + outer_scale_m**-2) ** (-11 / 6)
-    transform = np.fft.rfft2(padded)
+    # With twice the pupil's size every pair of pixels keeps its own distance: nothing wraps around.
+    apart = np.minimum(np.arange(2 * n), 2 * n - np.arange(2 * n)) * pixel_m
+    kernel = von_karman_covariance(np.hypot((1 + _LEAN) * apart[:, None], apart), outer_scale_m)
+    spectrum = np.fft.rfft2(kernel).real
+    transform = np.fft.rfft2(padded).reshape(n_act, -1)
     # rfft2 keeps half the plane: the columns between the first and the last count twice.
     twice = np.full(n + 1, 2.0)
     twice[[0, -1]] = 1.0
-    weighted = (transform * np.sqrt(spectrum * twice)).reshape(n_act, -1)
-    covariance = (weighted.real @ weighted.real.T + weighted.imag @ weighted.imag.T) / inside.shape[1]
+    weighted = transform * (spectrum * twice).ravel()
+    covariance = weighted.real @ transform.real.T + weighted.imag @ transform.imag.T
+    # An overall factor turns no mode.
+    covariance /= np.trace(covariance)
     turbulent = orthonormal.T @ covariance @ orthonormal
     variance, turn = np.linalg.eigh(turbulent)
     m2c = orthonormal @ turn[:, np.argsort(variance)[::-1]]

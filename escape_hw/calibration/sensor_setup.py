@@ -191,4 +191,4 @@ def poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDAr
     """
     if not 0 < poke <= 1:
         raise ConfigError(f"poke is {poke}; it must lie in (0, 1], rms surface as fraction of full stroke")
-    return np.minimum(poke, bench.config.calibration.poke_command / np.abs(m2c).max(axis=0))
+    return np.asarray(np.minimum(poke, bench.config.calibration.poke_command / np.abs(m2c).max(axis=0)))

@@ -30,6 +30,9 @@ _WIDTH_STEP = 0.05
 #: Width of the broad pedestal that influence functions may stand on, relative to their own.
 _PEDESTAL = 1.7
 _GAIN, _WIDTH, _SHAPE = 0, 6, 7
+#: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
+#: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
+_FLOOR = np.array([0.05, 0.05, 5e-4, 0.03, 0.012])
 
 
 @dataclass(slots=True, eq=False)
@@ -40,6 +43,8 @@ class _State:
     alpha: NDArray[np.float64]
     width: float
     shape: float
+    variant: NDArray[np.float64]
+    sampling: NDArray[np.float64]
     actuator_gain: NDArray[np.float64]
     actuator_width: NDArray[np.float64]
     slope_gain: NDArray[np.float64]
@@ -47,7 +52,9 @@ class _State:
     def offset(self) -> NDArray[np.float64]:
         """Distance from the priors' means, in the order of the unknowns."""
         head = np.concatenate([[0.0], np.zeros(5), [self.width, self.shape]])
-        return np.concatenate([head, self.actuator_gain, self.actuator_width, self.slope_gain])
+        return np.concatenate(
+            [head, self.variant, self.sampling, self.actuator_gain, self.actuator_width, self.slope_gain]
+        )
 
 
 class _Problem:
@@ -71,10 +78,18 @@ class _Problem:
             self.by_mode = np.full(data.shape[1], max(float(data.std()), 1e-30))
         self.data = data / self.by_slope[:, None] / self.by_mode
         self.modes = self.m2c / self.by_mode
+        self.variants = tuple(model.variants())
+        rows, cols = np.nonzero(matrix.valid)
+        # x slopes share what their column does to them, y slopes what their row does.
+        self.lines = np.unique(np.concatenate([cols, matrix.valid.shape[1] + rows]), return_inverse=True)[1]
+        self.n_lines = int(self.lines.max()) + 1
+        self.patches = np.tile(np.unique(rows // 2 * 1000 + cols // 2, return_inverse=True)[1], 2)
         self.precision = np.concatenate(
             [
                 np.zeros(6),
                 [priors.width**-2, priors.shape**-2],
+                np.ones(len(self.variants)),
+                np.full(self.n_lines, priors.sampling**-2),
                 np.full(model.n_act, priors.actuator_gain**-2),
                 np.full(model.n_act, priors.actuator_width**-2),
                 np.full(data.shape[0], priors.slope_gain**-2),
@@ -86,10 +101,20 @@ class _Problem:
         zeros = np.zeros(n_act)
         model = self._weighted(self.model.zonal_matrix(registration)) @ self.modes
         gain = float(np.vdot(model, self.data) / np.vdot(model, model))
-        return _State(gain, registration.to_array(), 0.0, 0.0, zeros, zeros.copy(), np.zeros(n_slopes))
+        return _State(
+            gain,
+            registration.to_array(),
+            0.0,
+            0.0,
+            np.zeros(len(self.variants)),
+            np.zeros(self.n_lines),
+            zeros,
+            zeros.copy(),
+            np.zeros(n_slopes),
+        )
 
     def _weighted(self, zonal: NDArray[np.float64]) -> NDArray[np.float64]:
-        return zonal / self.by_slope[:, None]
+        return np.asarray(zonal / self.by_slope[:, None])
 
     def linearise(self, state: _State) -> NormalEquations:
         """Model and derivatives about a state."""
@@ -114,9 +139,19 @@ class _Problem:
         def modal(z: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.asarray(rows * (z * acting) @ self.modes)
 
+        variants = [self._weighted(v.zonal_matrix(here, w)) - zonal[0] for v in self.variants]
+        for share, difference in zip(state.variant, variants, strict=True):
+            shaped = shaped + share * difference
         unit = modal(shaped)
-        common = np.stack([unit, *(state.gain * modal(z) for z in (*moved, by_width, by_shape))])
-        model = state.gain * unit
+        parts = (*moved, by_width, by_shape, *variants)
+        common = np.stack([unit, *(state.gain * modal(z) for z in parts)])
+        # Where a slope samples the wavefront: a shift shared by the lenslets of a column (x) or row (y).
+        sampled = np.zeros((self.lines.max() + 1, *unit.shape))
+        half = unit.shape[0] // 2
+        rows_of = np.arange(unit.shape[0])
+        sampled[self.lines, rows_of] = np.where((rows_of < half)[:, None], common[1], common[2])
+        common = np.concatenate([common, sampled])
+        model = state.gain * unit + np.einsum("l,lsm->sm", state.sampling, sampled)
         return normal_equations(
             common,
             state.gain * rows * shaped,
@@ -128,14 +163,17 @@ class _Problem:
             state.offset(),
         )
 
-    def move(self, state: _State, step: NDArray[np.float64]) -> _State:
+    def move(self, state: _State, step: NDArray[np.floating]) -> _State:
         n_act = self.model.n_act
-        gains, widths, slopes = np.split(step[8:], [n_act, 2 * n_act])
+        v, n = len(self.variants), len(self.variants) + self.n_lines
+        variant, sampling, gains, widths, slopes = np.split(step[8:], [v, n, n + n_act, n + 2 * n_act])
         return _State(
             state.gain + step[_GAIN],
             state.alpha + step[1:6],
             float(np.clip(state.width + step[_WIDTH], -0.5, 1.0)),
             float(np.clip(state.shape + step[_SHAPE], -0.5, 0.5)),
+            state.variant + variant,
+            state.sampling + sampling,
             state.actuator_gain + gains,
             state.actuator_width + widths,
             state.slope_gain + slopes,
@@ -271,21 +309,27 @@ def _covariance(
 ) -> NDArray[np.float64]:
     """Sandwich covariance of the common parameters, in units of their own.
 
-    The middle holds the scatter of the scores from slope to slope as it is found, which includes
-    whatever the model still misses, and the known correlation of the noise between slopes.
+    The middle holds the noise with its correlation between slopes, where it is known, and the
+    scatter of the scores from patch to patch of 2 x 2 sub-apertures as it is found, which includes
+    what the model still misses: neighbouring lenslets fall on the pixels in opposite ways, so that
+    much of it cancels within a patch. What is common to the whole pupil no scatter can show;
+    :data:`_FLOOR` stands for it.
     """
     bread = np.linalg.inv(_reduced(system))
     scores = system.efficient()
     by_slope = np.einsum("psm,sm->ps", scores, system.residual)
-    meat = by_slope @ by_slope.T
+    by_patch = np.zeros((by_slope.shape[0], int(problem.patches.max()) + 1))
+    np.add.at(by_patch.T, problem.patches, by_slope.T)
+    meat = by_patch @ by_patch.T
     if noise is not None:
         whole = noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
-        whole[np.diag_indices_from(whole)] = 0.0
         meat += np.einsum("psm,st,qtm->pq", scores, whole, scores, optimize=True)
+    found = bread @ meat @ bread
     # Never better than the noise alone allows.
-    floor = np.maximum(np.diag(bread) / np.diag(bread @ meat @ bread), 1.0)
-    scale = np.sqrt(floor)
-    return np.asarray(bread @ meat @ bread * np.outer(scale, scale))
+    scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))
+    covariance = found * np.outer(scale, scale)
+    covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(_FLOOR)
+    return np.asarray(covariance)
 
 
 def _estimate(

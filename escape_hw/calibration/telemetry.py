@@ -24,12 +24,12 @@ class Telemetry:
     """
 
     slopes: NDArray[np.float32]
-    pokes: NDArray[np.float64]
+    pokes: NDArray[np.floating]
     present: NDArray[np.bool_]
 
     @classmethod
     def from_frames(
-        cls, index: NDArray[np.int64], slopes: NDArray[np.float32], pokes: NDArray[np.float64]
+        cls, index: NDArray[np.int64], slopes: NDArray[np.float32], pokes: NDArray[np.floating]
     ) -> Telemetry:
         """Lay frames out by index.
 
@@ -50,7 +50,7 @@ class Telemetry:
         latest = np.maximum.accumulate(np.where(present, np.arange(n), 0))
         all_slopes = np.zeros((n, slopes.shape[1]), np.float32)
         all_slopes[at] = slopes
-        all_pokes = np.zeros((n, pokes.shape[1]))
+        all_pokes = np.zeros((n, pokes.shape[1]), pokes.dtype)
         all_pokes[at] = pokes
         return cls(all_slopes, all_pokes[latest], present)
 
@@ -70,13 +70,18 @@ class Telemetry:
             ok &= self.present[first - k : n - k]
         return np.flatnonzero(ok) + first
 
+    def thinned(self, n_slopes: int) -> Telemetry:
+        """At most ``n_slopes`` of the slopes, evenly spread."""
+        step = max(1, -(-self.slopes.shape[1] // n_slopes))
+        return Telemetry(np.ascontiguousarray(self.slopes[:, ::step]), self.pokes, self.present)
+
     def tail(self, rows: int) -> Telemetry:
         """The last ``rows`` rows, as the past of what follows."""
         start = max(0, self.present.size - rows)
         return Telemetry(self.slopes[start:], self.pokes[start:], self.present[start:])
 
     def followed_by(self, other: Telemetry, gap: int = 0) -> Telemetry:
-        """This stretch, ``gap`` lost frames, and another."""
+        """The stretch itself, ``gap`` lost frames, and another."""
         if gap:
             hold = np.repeat(self.pokes[-1:], gap, axis=0)
             blank = np.zeros((gap, self.slopes.shape[1]), np.float32)

@@ -11,31 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.linalg import solve_toeplitz
-
-
-def autocovariance(
-    residuals: NDArray[np.float32], present: NDArray[np.bool_], order: int
-) -> NDArray[np.float64]:
-    """Autocovariance at lags 0 to ``order``, summed over the slopes, ``(order + 1,)``.
-
-    Parameters
-    ----------
-    residuals
-        ``(n_times, n_slopes)``; rows where ``present`` is false are ignored.
-    present
-        ``(n_times,)``.
-    order
-        Largest lag in frames.
-    """
-    clean = np.where(present[:, None], residuals, 0.0).astype(np.float64)
-    clean -= np.where(present[:, None], clean.sum(axis=0) / present.sum(), 0.0)
-    covariance = np.empty(order + 1)
-    for lag in range(order + 1):
-        both = present[lag:] & present[: present.size - lag]
-        products = np.einsum("ts,ts->", clean[lag:][both], clean[: present.size - lag][both])
-        covariance[lag] = products / max(int(both.sum()), 1)
-    return covariance
 
 
 def prediction_error_filter(
@@ -43,8 +18,10 @@ def prediction_error_filter(
 ) -> NDArray[np.float64]:
     """Prediction-error filter common to all slopes.
 
-    Solves the Yule-Walker equations for the autocovariance summed over the slopes. One filter for
-    all slopes keeps generalised and ordinary least squares equal across slopes, whatever their
+    Least squares of every row on the rows before it, summed over the slopes, on rows whose past is
+    complete (the covariance method: with turbulence this smooth, sums over unequal rows, as in the
+    Yule-Walker equations, would spoil the filter as soon as frames are lost). One filter for all
+    slopes keeps generalised and ordinary least squares equal across slopes, whatever their
     correlation (Zellner 1962: equal regressors).
 
     Parameters
@@ -63,12 +40,21 @@ def prediction_error_filter(
     """
     if order == 0:
         return np.ones(1)
-    covariance = autocovariance(residuals, present, order)
-    if covariance[0] <= 0:
-        return np.eye(1, order + 1)[0]
+    n = present.size
+    whole = np.ones(max(n - order, 0), np.bool_)
+    for lag in range(order + 1):
+        whole &= present[order - lag : n - lag]
+    at = np.flatnonzero(whole) + order
+    if at.size == 0:
+        return np.asarray(np.eye(1, order + 1)[0])
+    clean = residuals - residuals[at].mean(axis=0)
+    past = np.stack([clean[at - lag].ravel() for lag in range(order + 1)]).astype(np.float64)
+    covariance = past @ past.T
+    if covariance[0, 0] <= 0:
+        return np.asarray(np.eye(1, order + 1)[0])
     # A whisper of white noise keeps the system well conditioned when the slopes are noise-free.
-    covariance[0] *= 1 + 1e-6
-    return np.concatenate([[1.0], -solve_toeplitz(covariance[:-1], covariance[1:])])
+    covariance[np.diag_indices(order + 1)] *= 1 + 1e-6
+    return np.concatenate([[1.0], -np.linalg.solve(covariance[1:, 1:], covariance[1:, 0])])
 
 
 def apply_filter(

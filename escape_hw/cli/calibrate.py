@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
 
-METHODS = ("push-pull", "docrime", "escape")
-
 
 def calibrate(
     system: options.System,
@@ -67,7 +65,7 @@ def _procedure(
 ) -> Callable[[Bench], Procedure[CalibrationResult]]:
     """The chosen procedure; refuses what does not go together before anything is opened."""
     from escape_hw.errors import ConfigError
-    from escape_hw.runtime.records import without_turbulence
+    from escape_hw.runtime.procedures import METHODS, calibrate_by
 
     if method not in METHODS:
         raise ConfigError(f"--method {method}: unknown; it is one of {', '.join(METHODS)}")
@@ -78,23 +76,7 @@ def _procedure(
     if plain and method != "docrime":
         raise ConfigError("--plain: it goes with --method docrime")
 
-    def push_pull(bench: Bench) -> Procedure[CalibrationResult]:
-        from escape_hw.calibration.push_pull import push_pull
-
-        with without_turbulence(bench):
-            return (yield from push_pull(bench, poke=poke, frames=frames))
-
-    def docrime(bench: Bench) -> Procedure[CalibrationResult]:
-        from escape_hw.calibration.docrime import docrime
-
-        return (yield from docrime(bench, frames=frames, poke=poke, whiten=not plain))
-
-    def escape(bench: Bench) -> Procedure[CalibrationResult]:
-        from escape_hw.calibration.escape import escape
-
-        return (yield from escape(bench, frames=frames, poke=poke))
-
-    return {"push-pull": push_pull, "docrime": docrime, "escape": escape}[method]
+    return lambda bench: calibrate_by(bench, method, frames=frames, poke=poke, whiten=not plain)
 
 
 def _finish(

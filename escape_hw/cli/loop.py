@@ -102,14 +102,13 @@ def _procedure(
     bench: Bench, product: MatrixProduct, frames: int, best: bool, strehl: bool
 ) -> Procedure[LoopResult]:
     """Model PSF where the bench can take one, best gain when asked, then the loop itself."""
-    from escape_hw.calibration.closed_loop import best_gain, closed_loop, measure_model_psf
-    from escape_hw.runtime.records import without_turbulence
+    from escape_hw.calibration.closed_loop import best_gain, closed_loop
+    from escape_hw.runtime.procedures import model_psf
 
     matrix, grid = product.matrix, product.grid
     model = gain = None
     if strehl and bench.science is not None:
-        with without_turbulence(bench):
-            model = yield from measure_model_psf(bench)
+        model = yield from model_psf(bench)
     if best:
         gain, runs = yield from best_gain(bench, matrix, grid, model_psf=model)
         stopped = [run for run in runs if run.partial]

@@ -78,7 +78,7 @@ class Session:
             With the partial result.
         """
         from escape_hw.api.procedure import run
-        from escape_hw.cli.progress import ProgressView
+        from escape_hw.runtime.progress import ProgressView
 
         with ProgressView(self.errors, self.quiet) as view, self.interrupts.procedure() as abort:
             return run(procedure, observers=(view,), abort=abort)

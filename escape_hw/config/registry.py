@@ -22,11 +22,37 @@ _KINDS = {DEVICES: "device driver", MODELS: "synthetic model"}
 DeviceFactory = Callable[[str, SystemConfig, dict[str, object]], Device]
 #: ``factory(config, grid) -> model``; without a grid the model takes the nominal one.
 ModelFactory = Callable[[SystemConfig, SubApertureGrid | None], SyntheticModel]
+#: Drivers that a script registered for its own process.
+_OWN: dict[str, DeviceFactory] = {}
+
+
+def register_device(name: str, factory: DeviceFactory) -> None:
+    """Offer a driver or twin under a name, in this process only.
+
+    For scripts and notebooks that try a driver out; a package declares an entry point in the group
+    ``escape.devices`` instead. Registering the same name again replaces the earlier factory.
+
+    Parameters
+    ----------
+    name
+        What ``driver`` or ``sim_driver`` of a device section says.
+    factory
+        ``factory(name, config, shared)`` makes a device that is not open, see :data:`DeviceFactory`.
+
+    Raises
+    ------
+    ConfigError
+        An installed package offers that name already.
+    """
+    if any(entry.name == name for entry in importlib.metadata.entry_points(group=DEVICES)):
+        raise ConfigError(f"device driver '{name}' is offered by an installed package; choose another name")
+    _OWN[name] = factory
 
 
 def available(group: str) -> tuple[str, ...]:
     """Names registered in a group (:data:`DEVICES` or :data:`MODELS`), sorted."""
-    return tuple(sorted({entry.name for entry in importlib.metadata.entry_points(group=group)}))
+    own = _OWN if group == DEVICES else ()
+    return tuple(sorted({*own, *(entry.name for entry in importlib.metadata.entry_points(group=group))}))
 
 
 def device_factory(name: str) -> DeviceFactory:
@@ -37,7 +63,7 @@ def device_factory(name: str) -> DeviceFactory:
     ConfigError
         Unknown name (with the nearest one), or its package is not completely installed.
     """
-    return cast(DeviceFactory, _load(DEVICES, name))
+    return _OWN[name] if name in _OWN else cast(DeviceFactory, _load(DEVICES, name))
 
 
 def model_factory(name: str) -> ModelFactory:

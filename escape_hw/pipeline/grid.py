@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
@@ -12,11 +14,11 @@ from escape_hw.pipeline.slopes import SlopeExtractor, windows
 
 #: How far the real pitch may lie from the nominal one.
 _PITCH_RANGE = 0.03
-#: Least contrast of the comb of spots (1 for points, 0 for even light). Turbulence that smears the
-#: spots over half a pitch leaves more than 0.5; the noise of a dark camera makes up to 0.05.
-_LEAST_CONTRAST = 0.2
-#: Pixels above the threshold without which there is nothing to look at: a few spots.
-_LEAST_PIXELS = 24
+#: Least contrast of the light folded at the pitch. Spots under the strongest screen of the bench leave
+#: 0.85, spots that do not stand on the lattice below 0.2.
+_CONTRAST = 0.3
+#: Spots further off the lattice than this many median distances do not count.
+_OUTLIER = 5.0
 
 
 def _comb_power(profile: NDArray[np.float64], pitch: float) -> complex:
@@ -27,7 +29,7 @@ def _comb_power(profile: NDArray[np.float64], pitch: float) -> complex:
 def _pitch_and_phase(image: NDArray[np.float64], nominal: float) -> tuple[float, float, float]:
     """Common pitch of both axes, and the position of one lenslet centre along x and y."""
     profiles = [image.sum(axis=0), image.sum(axis=1)]
-    profiles = [p - ndimage.uniform_filter1d(p, int(round(nominal)) | 1) for p in profiles]
+    profiles = [p - ndimage.uniform_filter1d(p, round(nominal) | 1) for p in profiles]
 
     def lack(pitch: float) -> float:
         return -sum(abs(_comb_power(p, pitch)) ** 2 for p in profiles)
@@ -41,32 +43,47 @@ def _pitch_and_phase(image: NDArray[np.float64], nominal: float) -> tuple[float,
     return pitch, float(phases[0]), float(phases[1])
 
 
-def _require_spots(light: NDArray[np.float64], pitch: float) -> None:
-    """Refuse light that no lenslets made: the noise of a dark camera, or an even glow."""
-    if np.count_nonzero(light) < _LEAST_PIXELS:
+def _contrast(light: NDArray[np.float64], pitch: float) -> float:
+    """How much the light gathers once per pitch: 1 for points on the lattice, 0 for none."""
+    return sum(abs(_comb_power(light.sum(axis=axis), pitch)) for axis in (0, 1)) / (2 * float(light.sum()))
+
+
+def _check_lattice(light: NDArray[np.float64], pitch: float, nominal: float) -> None:
+    """Raise unless the spots really stand one pitch apart."""
+    if abs(pitch / nominal - 1) > _PITCH_RANGE:
         raise CalibrationError(
-            "no light above the threshold on the wavefront sensor; check source, beam stop and exposure"
+            f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal}; "
+            "check sensor.pitch_px and the binning"
         )
-    contrast = min(abs(_comb_power(light.sum(axis=axis), pitch)) for axis in (0, 1)) / light.sum()
-    if contrast < _LEAST_CONTRAST:
+    contrast = _contrast(light, pitch)
+    # Spots two or three of the assumed pitches apart look regular too, at a harmonic.
+    wider = max(_contrast(light, m * pitch) for m in (2, 3))
+    if contrast < _CONTRAST or wider > contrast / 2:
         raise CalibrationError(
-            f"no regular spots {pitch:.2f} pixels apart on the wavefront sensor (contrast {contrast:.2f}, "
-            f"{_LEAST_CONTRAST} is needed); check source, beam stop, exposure and sensor.pitch_px"
+            f"the spots on the wavefront sensor do not stand {nominal} pixels apart, as the design says; "
+            "check sensor.pitch_px and the binning, and that the light comes through the lenslets"
         )
 
 
 def _lattice_fit(
     rows: NDArray[np.intp], columns: NDArray[np.intp], spots: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Weighted least-squares pitch and origin (x, y) of spots on a square lattice."""
+    """Weighted least-squares pitch and origin (x, y) of spots on a square lattice.
+
+    Spots that lie further off than the many do (a hot pixel in the window) are left out.
+    """
     n = rows.size
-    design = np.zeros((2 * n, 3))
-    design[:n, 0], design[n:, 0] = columns, rows
-    design[:n, 1] = design[n:, 2] = 1.0
-    w = np.sqrt(np.tile(weight, 2))
-    answer = np.linalg.lstsq(design * w[:, None], np.concatenate([spots[:, 0], spots[:, 1]]) * w, rcond=None)[
-        0
-    ]
+    design = np.zeros((2, n, 3))
+    design[0, :, 0], design[1, :, 0] = columns, rows
+    design[0, :, 1] = design[1, :, 2] = 1.0
+    w: NDArray[np.floating] = np.sqrt(weight)
+    answer: NDArray[np.floating] = np.zeros(3)
+    for _ in range(3):
+        answer = np.linalg.lstsq((design * w[:, None]).reshape(2 * n, 3), (spots.T * w).ravel(), rcond=None)[
+            0
+        ]
+        off = np.hypot(*(spots.T - design @ answer))
+        w = np.sqrt(weight) * (off <= _OUTLIER * np.median(off) + 1e-6)
     return float(answer[0]), float(answer[1]), float(answer[2])
 
 
@@ -113,34 +130,21 @@ def find_grid(
         raise ValueError(f"references is {references!r}; choose 'lattice' or 'mean'")
     image = np.asarray(mean_frame, dtype=np.float64)
     light = np.maximum(image - threshold, 0.0)
+    if not light.any():
+        raise CalibrationError(
+            "no light above the threshold on the wavefront sensor; check source and exposure"
+        )
     pitch, x, y = _pitch_and_phase(light, nominal_pitch_px)
-    _require_spots(light, pitch)
     x, y = _centre_lattice(light, pitch, x, y, n_sub)
-    grid = None
     for _ in range(3):
         grid = _grid_at(image, n_sub, pitch, (x, y), min_flux)
-        extractor = SlopeExtractor(grid, image.shape, threshold=0.0)  # type: ignore[arg-type]
-        offset = _measure(extractor, light)
-        spots = grid.centres_px() + offset
+        spots = grid.centres_px() + _measure(grid, light)
         rows, columns = np.nonzero(grid.valid)
-        pitch, x, y = _lattice_fit(rows, columns, spots, grid.flux[grid.valid].astype(float))
-    assert grid is not None  # noqa: S101 - the loop above ran
-    if abs(pitch / nominal_pitch_px - 1) > _PITCH_RANGE:
-        raise CalibrationError(
-            f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal_pitch_px}; "
-            "check sensor.pitch_px and the binning"
-        )
+        pitch, x, y = _lattice_fit(rows, columns, spots, np.minimum(grid.flux[grid.valid], 1.0).astype(float))
+    _check_lattice(light, pitch, nominal_pitch_px)
     grid = _grid_at(image, n_sub, pitch, (x, y), min_flux)
     if references == "mean":
-        extractor = SlopeExtractor(grid, image.shape, threshold=0.0)  # type: ignore[arg-type]
-        grid = SubApertureGrid(
-            grid.pitch_px,
-            grid.origin_px,
-            grid.valid,
-            _measure(extractor, light).astype(np.float32),
-            grid.flux,
-            grid.counts,
-        )
+        grid = replace(grid, references_px=_measure(grid, light).astype(np.float32))
     return grid
 
 
@@ -148,15 +152,25 @@ def _centre_lattice(
     light: NDArray[np.float64], pitch: float, x: float, y: float, n_sub: int
 ) -> tuple[float, float]:
     """Number the lenslets so that the pupil's light is centred on the ``n_sub`` by ``n_sub`` grid."""
+    smooth = ndimage.uniform_filter(light, round(pitch))
+    # Opening by more than one pitch removes hot pixels, which would push the outline out.
+    brush = round(1.5 * pitch) | 1
+    opened = ndimage.maximum_filter(ndimage.minimum_filter(smooth, brush, mode="constant"), brush)
     # The outline of the pupil, not its brightness: a Gaussian beam need not be centred on it.
-    smooth = ndimage.uniform_filter(light, int(round(pitch)))
-    outline = smooth > 0.3 * np.percentile(smooth, 99)
+    outline = opened > 0.1 * np.percentile(opened, 99)
+    if not outline.any():
+        raise CalibrationError(
+            "single bright pixels but no evenly lit pupil on the wavefront sensor; "
+            "check source, exposure and sensor.pitch_px"
+        )
     rows, columns = np.nonzero(outline)
     half = (n_sub - 1) / 2
-    middle = [0.5 * (v.min() + v.max()) for v in (columns, rows)]
-    return tuple(  # type: ignore[return-value]
-        phase + pitch * round((m - phase) / pitch - half) for m, phase in zip(middle, (x, y), strict=True)
-    )
+
+    def first(at: NDArray[np.intp], phase: float) -> float:
+        middle = 0.5 * float(at.min() + at.max())
+        return phase + pitch * round((middle - phase) / pitch - half)
+
+    return first(columns, x), first(rows, y)
 
 
 def _grid_at(
@@ -164,7 +178,8 @@ def _grid_at(
 ) -> SubApertureGrid:
     line = np.arange(n_sub) * pitch
     centres = np.stack([a.ravel() for a in np.meshgrid(origin[0] + line, origin[1] + line)], axis=1)
-    boxes = windows(centres, pitch, image.shape)  # type: ignore[arg-type]
+    rows, columns = image.shape
+    boxes = windows(centres, pitch, (rows, columns))
     area = np.pad(image.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     top, end, left, right = boxes.T
     flux = area[end, right] - area[top, right] - area[end, left] + area[top, left]
@@ -184,8 +199,10 @@ def _grid_at(
     )
 
 
-def _measure(extractor: SlopeExtractor, light: NDArray[np.float64]) -> NDArray[np.float64]:
+def _measure(grid: SubApertureGrid, light: NDArray[np.float64]) -> NDArray[np.float64]:
     """Spot offsets ``(n_valid, 2)`` of a mean frame that is no longer made of whole counts."""
+    rows, columns = light.shape
+    extractor = SlopeExtractor(grid, (rows, columns), threshold=0.0)
     scale = 60000.0 / float(light.max())
     slopes = extractor(np.asarray(light * scale, dtype=np.uint16))
     return np.asarray(slopes.reshape(2, -1).T, dtype=np.float64)

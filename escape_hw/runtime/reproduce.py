@@ -9,7 +9,7 @@ from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.bench import Bench
 from escape_hw.errors import Aborted
-from escape_hw.runtime.records import without_turbulence
+from escape_hw.runtime.procedures import calibrate_by, model_psf
 
 #: The paper's two runs: 20 seconds and 3 minutes at 500 Hz.
 SHORT_FRAMES, LONG_FRAMES = 10_000, 100_000
@@ -73,16 +73,12 @@ def reproduce_shwfs(
 
 
 def _calibrate(bench: Bench, frames: int, result: ShwfsResult) -> Procedure[None]:
-    from escape_hw.calibration.escape import escape
-    from escape_hw.calibration.push_pull import push_pull
-
-    with without_turbulence(bench):
-        baseline = yield from push_pull(bench)
+    baseline = yield from calibrate_by(bench, "push-pull")
     result.calibrations["push-pull"] = baseline
     result.partial = baseline.partial
     if result.partial:
         return
-    found = yield from escape(bench, frames=frames)
+    found = yield from calibrate_by(bench, "escape", frames=frames)
     measured = measured_part(found)
     if measured is not None:
         result.calibrations["DO-CRIME"] = measured
@@ -91,10 +87,9 @@ def _calibrate(bench: Bench, frames: int, result: ShwfsResult) -> Procedure[None
 
 
 def _close_loops(bench: Bench, loop_frames: int, result: ShwfsResult) -> Procedure[None]:
-    from escape_hw.calibration.closed_loop import best_gain, closed_loop, measure_model_psf
+    from escape_hw.calibration.closed_loop import best_gain, closed_loop
 
-    with without_turbulence(bench):
-        model = yield from measure_model_psf(bench)
+    model = yield from model_psf(bench)
     for label, calibration in result.calibrations.items():
         matrix, grid = calibration.matrix, calibration.grid
         gain, scan = yield from best_gain(bench, matrix, grid, model_psf=model)
@@ -117,12 +112,10 @@ def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -
     frames
         Frames by the heading of the column; SHORT and LONG of the paper by default.
     """
-    from escape_hw.calibration.escape import escape
-
     result = Table1Result()
     try:
         for label, count in (frames or {"SHORT": SHORT_FRAMES, "LONG": LONG_FRAMES}).items():
-            found = yield from escape(bench, frames=count)
+            found = yield from calibrate_by(bench, "escape", frames=count)
             result.calibrations[label] = found
             if found.partial:
                 result.partial = True

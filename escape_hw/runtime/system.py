@@ -5,18 +5,35 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Observer, Procedure
 from escape_hw.api.procedure import run as run_procedure
+from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
+from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
 from escape_hw.config.load import load_system
+
+if TYPE_CHECKING:
+    from escape_hw.calibration.sensor_setup import SensorSetup
+    from escape_hw.pipeline.slopes import SlopeExtractor
 
 T = TypeVar("T")
 
 
 class System(Bench):
-    """A bench with everything that can be done on it."""
+    """A bench with everything that can be done on it.
+
+    While it is open, linear algebra runs on one thread: the products of a loop are small.
+
+    The methods that take a while run a procedure to its end; ``progress=True`` shows a bar with the
+    time left on standard error. Ctrl-C stops any of them: the mirror is flattened and
+    :class:`~escape_hw.errors.Aborted` carries what was measured so far as ``partial``.
+    """
 
     def run(
         self,
@@ -24,6 +41,7 @@ class System(Bench):
         *,
         observers: tuple[Observer, ...] = (),
         abort: threading.Event | None = None,
+        progress: bool = False,
     ) -> T:
         """Drive a procedure to its end and return its result.
 
@@ -35,13 +53,241 @@ class System(Bench):
             Called with every progress report.
         abort
             Set it from any thread to stop the procedure.
+        progress
+            Show a bar with the time left on standard error.
 
         Raises
         ------
         Aborted
             Stopped by ``abort`` or Ctrl-C.
         """
-        return run_procedure(procedure, observers=observers, abort=abort)
+        if not progress:
+            return run_procedure(procedure, observers=observers, abort=abort)
+        from rich.console import Console
+
+        from escape_hw.runtime.progress import ProgressView
+
+        with ProgressView(Console(stderr=True)) as view:
+            return run_procedure(procedure, observers=(*observers, view), abort=abort)
+
+    def find_sensor(self, *, frames: int = 200, progress: bool = False) -> SensorSetup:
+        """Watch the sensor and find its lenslet grid; the mirror stays as it is.
+
+        Parameters
+        ----------
+        frames
+            Frames to average; under turbulence, the more the better.
+        progress
+            Show a bar with the time left.
+
+        Raises
+        ------
+        CalibrationError
+            No spots where the design says there should be.
+        """
+        from escape_hw.calibration.sensor_setup import find_sensor
+
+        return self.run(find_sensor(self, frames=frames), progress=progress)
+
+    def slopes_of(self, grid: SubApertureGrid) -> SlopeExtractor:
+        """A function that takes ``frame.data`` and returns slopes ``(n_slopes,)`` in pixels.
+
+        Parameters
+        ----------
+        grid
+            From :meth:`find_sensor` or a calibration.
+        """
+        from escape_hw.calibration.sensor_setup import extractor
+
+        return extractor(self, grid)
+
+    def calibrate(
+        self,
+        method: str = "escape",
+        *,
+        frames: int | None = None,
+        poke: float | None = None,
+        grid: SubApertureGrid | None = None,
+        whiten: bool = True,
+        progress: bool = False,
+    ) -> CalibrationResult:
+        """Measure an interaction matrix and, with ``"escape"``, the registration behind it.
+
+        Parameters
+        ----------
+        method
+            ``"push-pull"`` (needs a source: the phase screen, where the bench moves one, is out of
+            the beam meanwhile), ``"docrime"`` or ``"escape"`` (both under turbulence).
+        frames
+            Frames to measure with (push-pull: per push and per pull); as configured by default.
+        poke
+            Rms surface as fraction of full stroke; as configured by default.
+        grid
+            The sensor's grid, when it is known already; found on the frames by default.
+        whiten
+            False: the paper's plain estimator of ``"docrime"`` and ``"escape"``.
+        progress
+            Show a bar with the time left.
+
+        Returns
+        -------
+        CalibrationResult
+            ``matrix`` and ``grid`` are what :meth:`close_loop` needs.
+
+        Raises
+        ------
+        ConfigError
+            No such method.
+        TooFewFrames, CalibrationError
+            The data cannot constrain the matrix, or the sensor sees nothing.
+        Aborted
+            Stopped by Ctrl-C.
+        """
+        from escape_hw.runtime.procedures import calibrate_by
+
+        procedure = calibrate_by(self, method, frames=frames, poke=poke, grid=grid, whiten=whiten)
+        return self.run(procedure, progress=progress)
+
+    def find_registration(self, matrix: InteractionMatrix, grid: SubApertureGrid) -> RegistrationEstimate:
+        """Where the mirror sits on the sensor, from a measured matrix (SPRINT); nothing moves.
+
+        ``calibrate("escape")`` does this as well, and its error bars are the better ones: a matrix no
+        longer tells how vibration and turbulence move all slopes together, so that the error bars
+        found here are too small where they matter.
+
+        Parameters
+        ----------
+        matrix
+            A measured matrix, by push-pull or DO-CRIME.
+        grid
+            The grid it was measured on.
+
+        Raises
+        ------
+        CalibrationError
+            The matrix holds no signal.
+        IncompatibleProduct
+            Matrix and model have different actuators or sub-apertures.
+        """
+        from escape_hw.calibration.sprint import sprint
+
+        settings = self.config.calibration
+        modes = min(settings.sprint_modes, matrix.n_modes)
+        return sprint(matrix, self.model(grid), modes=modes, learning_rate=settings.learning_rate)
+
+    def take_model_psf(self, *, frames: int = 20, progress: bool = False) -> NDArray[np.float32]:
+        """The PSF of the flat mirror without turbulence, which Strehl ratios are measured against.
+
+        Parameters
+        ----------
+        frames
+            Science frames to average.
+        progress
+            Show a bar with the time left.
+
+        Returns
+        -------
+        ndarray of float32, ``(rows, columns)``
+            In counts.
+
+        Raises
+        ------
+        CalibrationError
+            The system has no science camera.
+        """
+        from escape_hw.runtime.procedures import model_psf
+
+        return self.run(model_psf(self, frames=frames), progress=progress)
+
+    def close_loop(
+        self,
+        matrix: InteractionMatrix,
+        grid: SubApertureGrid,
+        *,
+        gain: float | None = None,
+        leak: float | None = None,
+        dropped_modes: int | None = None,
+        frames: int = 5000,
+        model_psf: NDArray[np.float32] | None = None,
+        progress: bool = False,
+    ) -> LoopResult:
+        """Close the loop for a number of frames and open it again; the mirror ends flat.
+
+        Parameters
+        ----------
+        matrix, grid
+            From a calibration.
+        gain, leak, dropped_modes
+            Loop parameters; as configured by default.
+        frames
+            How long.
+        model_psf
+            From :meth:`take_model_psf`; with it the Strehl ratios are measured.
+        progress
+            Show a bar with the time left.
+
+        Returns
+        -------
+        LoopResult
+            ``stable`` is false when the loop was opened because it diverged.
+
+        Raises
+        ------
+        IncompatibleProduct
+            The matrix belongs to another mirror or grid.
+        Aborted
+            Stopped by Ctrl-C.
+        """
+        from escape_hw.calibration.closed_loop import closed_loop
+
+        procedure = closed_loop(
+            self, matrix, grid,
+            gain=gain, leak=leak, dropped_modes=dropped_modes, frames=frames, model_psf=model_psf,
+        )  # fmt: skip
+        return self.run(procedure, progress=progress)
+
+    def find_best_gain(
+        self,
+        matrix: InteractionMatrix,
+        grid: SubApertureGrid,
+        *,
+        gains: tuple[float, ...] | None = None,
+        frames: int = 1500,
+        model_psf: NDArray[np.float32] | None = None,
+        progress: bool = False,
+    ) -> tuple[float, list[LoopResult]]:
+        """The gain with the least residual or, given a model PSF, the highest Strehl ratio.
+
+        Parameters
+        ----------
+        matrix, grid
+            From a calibration.
+        gains
+            Gains to try; by default shares of the largest stable one.
+        frames
+            Frames per gain.
+        model_psf
+            From :meth:`take_model_psf`; with it gains are judged by the Strehl ratio.
+        progress
+            Show a bar with the time left.
+
+        Returns
+        -------
+        gain : float
+        runs : list of LoopResult
+            One run per gain that was tried.
+
+        Raises
+        ------
+        CalibrationError
+            No gain gives a stable loop.
+        Aborted
+            Stopped by Ctrl-C.
+        """
+        from escape_hw.calibration.closed_loop import best_gain
+
+        procedure = best_gain(self, matrix, grid, gains=gains, frames=frames, model_psf=model_psf)
+        return self.run(procedure, progress=progress)
 
 
 def open_system(

@@ -14,12 +14,14 @@ def _expose(intensity, photons, dark, read2, gain, offset, noise, start, sign, w
     for k in range(n):
         mean = intensity[k] * photons + dark
         value = mean + sign * noise[start + k] * np.sqrt(mean + read2)
+        full = value >= well
         value = min(value, well)
         count = value * gain[k] + offset[k]
         count = max(np.float32(0), count)
         level = np.int32(count + np.float32(0.5))
-        if level >= top:
-            level = top
+        level = min(level, np.int32(top))
+        # A pixel of low gain is full before the converter reaches its top.
+        if full or level == top:
             saturated += 1
         out[k] = level
     return saturated

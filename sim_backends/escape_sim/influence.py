@@ -108,7 +108,7 @@ class InfluenceFunctions:
     ) -> NDArray[np.float64]:
         """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
         along_x, along_y = self.factors(registration, sub_aperture_m, x_m, y_m)
-        return np.einsum("yat,xat->ayx", along_y, along_x)
+        return np.asarray(np.einsum("yat,xat->ayx", along_y, along_x))
 
 
 class MirrorSurface:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,9 @@ from escape_sim.slope_weights import slope_weights
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
+
+#: Relative doubt about the spots' motion: blur within the lenslets counts as motion too.
+_MOTION_DOUBT = 0.25
 
 
 def make_model(config: SystemConfig, grid: SubApertureGrid | None) -> ShackHartmannModel:
@@ -57,13 +61,15 @@ class ShackHartmannModel:
         self._pupil = pupil_geometry(config)
         if grid.valid.shape != (self._pupil.n_sub, self._pupil.n_sub):
             raise ValueError(
-                f"the grid has {grid.valid.shape} lenslets, the design {self._pupil.n_sub} x {self._pupil.n_sub}"
+                f"the grid has {grid.valid.shape} lenslets, "
+                f"the design {self._pupil.n_sub} x {self._pupil.n_sub}"
             )
         self._positions = actuator_positions(config)
         self._pitch = pitch_on_pupil(config)
         self._coupling = config.devices.dm.coupling
         self._metres = 2 * config.devices.dm.stroke_m
         self._rows, self._columns = np.nonzero(grid.valid)
+        self._config, self._grid = config, grid
         self._weights = slope_weights(config, grid, self._pupil)
 
     @property
@@ -102,6 +108,13 @@ class ShackHartmannModel:
             for axis in range(2):
                 out[axis] += np.einsum("kqa,kqa->ka", there, block[axis] @ here)
         return np.asarray(out.reshape(-1, self.n_act) * self._metres)
+
+    def variants(self) -> list[ShackHartmannModel]:
+        """The same sensor with spots that move by a quarter more than the slopes say."""
+        if not self._grid.motion_px:
+            return []
+        grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_DOUBT))
+        return [ShackHartmannModel(self._config, grid)]
 
     def _influence(self, width: float) -> InfluenceFunctions:
         return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)

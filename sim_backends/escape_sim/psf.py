@@ -41,9 +41,11 @@ class FocalPlane:
         self._field = np.empty((n, n), np.complex64)
         # Parseval: one alias period of the sampled pupil spans diameter_px * psf_px pixels.
         norm = 1 / (diameter_px * psf_px) ** 0.5
+        # The minus sign makes a positive slope of the path move the image to higher pixels, as the
+        # Shack-Hartmann sensor's spots.
         self._left, self._right = (
             np.asarray(
-                np.exp(2j * np.pi * np.outer(np.arange(m) - m // 2, samples) / psf_px) * norm, np.complex64
+                np.exp(-2j * np.pi * np.outer(np.arange(m) - m // 2, samples) / psf_px) * norm, np.complex64
             )
             for m in shape
         )

@@ -52,13 +52,13 @@ def field_pixels(n_pix: int, spot_px: float) -> int:
     return int(n_pix * spot_px)
 
 
-def first_pixels(centres_px: NDArray[np.float64], field: int) -> NDArray[np.intp]:
+def first_pixels(centres_px: NDArray[np.floating], field: int) -> NDArray[np.intp]:
     """First of the ``field`` pixels around each lenslet centre along one axis."""
-    return np.floor(centres_px - field / 2 + 1).astype(np.intp)
+    return np.asarray(np.floor(centres_px - field / 2 + 1), dtype=np.intp)
 
 
 def lenslet_transform(
-    centres_px: NDArray[np.float64], first_px: NDArray[np.intp], n_pix: int, field: int, spot_px: float
+    centres_px: NDArray[np.floating], first_px: NDArray[np.intp], n_pix: int, field: int, spot_px: float
 ) -> NDArray[np.complex128]:
     """Fourier matrices from the pupil samples of a lenslet to its camera pixels, along one axis.
 
@@ -84,7 +84,7 @@ def lenslet_transform(
     samples = (np.arange(n_pix) - (n_pix - 1) / 2) / n_pix
     # The minus sign makes a positive slope of the path move the spot to higher pixels, as in OOPAO.
     phase = -2j * np.pi * samples[None, :, None] * pixels[:, None, :] / spot_px
-    return np.exp(phase) / np.sqrt(n_pix * spot_px)
+    return np.asarray(np.exp(phase) / np.sqrt(n_pix * spot_px), dtype=np.complex128)
 
 
 class ShackHartmannOptics:
@@ -143,8 +143,8 @@ class ShackHartmannOptics:
         )
         if not inside.all():
             raise ValueError(
-                f"{int((~inside).sum())} lit lenslets fall outside the region of {shape[1]} x {shape[0]} pixels; "
-                "enlarge the camera region or move the grid's origin"
+                f"{int((~inside).sum())} lit lenslets fall outside the region "
+                f"of {shape[1]} x {shape[0]} pixels; enlarge the camera region or move the grid's origin"
             )
         self.shape = shape
         self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)

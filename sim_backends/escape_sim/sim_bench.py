@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from itertools import pairwise
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -135,7 +136,7 @@ class SimBench:
         image = np.zeros((self.config.devices.wfs.region[3], self.config.devices.wfs.region[2]), np.float32)
         edges = np.linspace(start_s, end_s, steps + 1)
         opd = np.zeros(self.pupil.amplitude.shape, np.float32)
-        for a, b in zip(edges[:-1], edges[1:], strict=True):
+        for a, b in pairwise(edges):
             opd = self.optical_path(float(a), float(b))
             sensor.frame(opd + self._ncpa, image)
         return (image / np.float32(steps) if steps > 1 else image), opd
@@ -260,7 +261,10 @@ class SimBench:
             screen = self.config.devices.screen
             if screen is None:
                 raise ConfigError(f"system {self.config.system.name!r} has no [devices.screen] section")
-            rng = np.random.default_rng(self._plates_seed.spawn(number + 1)[number])
+            # A key of its own for each plate, so that the order of use does not matter.
+            key = (*self._plates_seed.spawn_key, number)
+            seed = np.random.SeedSequence(self._plates_seed.entropy, spawn_key=key)
+            rng = np.random.default_rng(seed)
             pixel = self.pupil.pixel_m
             phase = von_karman_screen(
                 _PLATE_PIXELS, pixel, screen.screens_r0_m[number], screen.outer_scale_m, rng

@@ -81,18 +81,24 @@ class _Views:
         self._spot = spot
         self._blocks, self._along = {}, {}
         field = field_pixels(p, spot)
+        # The windows stay on the grid as it was found; the lenslets stand where the references,
+        # averaged over the whole run, put the lattice.
+        (y_first, y_pitch), (x_first, x_pitch) = _lattice(grid)
         for step in STEPS:
             i, j = rows + step[0], columns + step[1]
             exists = (i >= 0) & (i < n) & (j >= 0) & (j < n)
             i, j = np.clip(i, 0, n - 1), np.clip(j, 0, n - 1)
             self._blocks[step] = blocks[i, j] * exists[:, None, None]
             self._along[step] = tuple(
-                self._transform(grid.origin_px[axis] + number * grid.pitch_px, at, p, field)
-                for axis, number, at in ((1, i, self._rows_at), (0, j, self._columns_at))
+                self._transform(first + number * pitch, at, p, field)
+                for first, pitch, number, at in (
+                    (y_first, y_pitch, i, self._rows_at),
+                    (x_first, x_pitch, j, self._columns_at),
+                )
             )
 
     def _transform(
-        self, centre: NDArray[np.float64], at: NDArray[np.intp], p: int, field: int
+        self, centre: NDArray[np.floating], at: NDArray[np.intp], p: int, field: int
     ) -> NDArray[np.complex128]:
         """Fourier matrices ``(n_valid, p, size)``, zero where the lenslet's image does not reach."""
         first = first_pixels(centre, field)
@@ -124,3 +130,13 @@ class _Views:
                 fy, fx = self._along[step]
                 back = np.matmul(np.matmul(fy, lever * e.conj()), fx.transpose(0, 2, 1))
                 out[step][axis] += -2 * np.imag(amplitude * back)
+
+
+def _lattice(grid: SubApertureGrid) -> tuple[tuple[float, float], tuple[float, float]]:
+    """First centre and pitch of the lenslets along rows and along columns, references included."""
+    rows, columns = np.nonzero(grid.valid)
+    out = []
+    for axis, number in ((1, rows), (0, columns)):
+        pitch, first = np.polyfit(number, grid.references_px[:, axis].astype(float), 1)
+        out.append((grid.origin_px[axis] + float(first), grid.pitch_px + float(pitch)))
+    return out[0], out[1]

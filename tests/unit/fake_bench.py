@@ -60,7 +60,7 @@ class FakeProcedures:
         self.benches: list[FakeBench] = []
 
     def _calibrate(self, bench: FakeBench, name: str, **options: Any):
-        self.calls.append((name, options))
+        self.calls.append((name, {key: value for key, value in options.items() if value is not None}))
         bench.screen_seen[name] = bench.screen.state.inserted
         try:
             yield from steps(name)
@@ -99,7 +99,7 @@ class FakeProcedures:
         yield from steps("gain")
         return 0.35, [replace(fake.loop(matrix.method), gain=g) for g in (0.25, 0.35, 0.45)]
 
-    def measure_model_psf(self, bench: FakeBench):
+    def measure_model_psf(self, bench: FakeBench, **options: Any):
         bench.screen_seen["model_psf"] = bench.screen.state.inserted
         yield from steps("model PSF")
         self.hook("model_psf")

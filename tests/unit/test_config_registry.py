@@ -97,3 +97,19 @@ def test_nothing_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.metadata, "entry_points", entries())
     with pytest.raises(ConfigError, match="is escape-hw itself installed in this environment"):
         registry.device_factory("sim-alpao")
+
+
+def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_OWN", {})
+    with pytest.raises(ConfigError, match="no device driver 'bench-mirror' is installed"):
+        registry.device_factory("bench-mirror")
+    for number in (1, 2):
+        factory = lambda name, config, shared, number=number: number  # noqa: E731
+        registry.register_device("bench-mirror", factory)
+        assert registry.device_factory("bench-mirror") is factory
+    assert "bench-mirror" in registry.available(registry.DEVICES)
+    assert "bench-mirror" not in registry.available(registry.MODELS)
+    with pytest.raises(ConfigError, match="did you mean 'bench-mirror'"):
+        registry.device_factory("bench-miror")
+    with pytest.raises(ConfigError, match="'sim-alpao' is offered by an installed package"):
+        registry.register_device("sim-alpao", factory)

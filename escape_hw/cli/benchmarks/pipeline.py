@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 from escape_hw.api.benchmark import BenchmarkRow, alternate
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.cli.benchmarks.peer import ABSENT, name, pyrtc
+from escape_hw.pipeline.integrator import LeakyIntegrator
 from escape_hw.pipeline.slopes import SlopeExtractor
 
 
 def run() -> list[BenchmarkRow]:
     """All rows of the stage."""
     # RAZOR's grid with whole pixels (the peer knows no others), and a large one.
-    return [_slopes(n_sub, pitch) for n_sub, pitch in ((10, 8), (24, 16), (40, 8))]
+    rows = [_slopes(n_sub, pitch) for n_sub, pitch in ((10, 8), (24, 16), (40, 8))]
+    return rows + [_integrator(modes, slopes) for modes, slopes in ((97, 200), (94, 900), (1200, 2512))]
 
 
 def spots(n_sub: int, pitch: int, seed: int = 0) -> NDArray[np.uint16]:
@@ -70,6 +72,51 @@ def _peer_slopes(
 
     def call() -> NDArray[np.float32]:
         kernel(image, out, reference, np.float32(0), np.float32(pitch), weights, 0, 0, pitch)
+        return out
+
+    return call
+
+
+def _integrator(n_modes: int, n_slopes: int) -> BenchmarkRow:
+    rng = np.random.default_rng(0)
+    matrix = rng.standard_normal((n_modes, n_slopes)).astype(np.float32) / np.float32(n_slopes)
+    slopes = rng.standard_normal(n_slopes).astype(np.float32)
+    start = rng.standard_normal(n_modes).astype(np.float32)
+    gain, leak = 0.3, 0.01
+    ours = LeakyIntegrator(matrix, gain, leak)
+    peer = _peer_integrator(matrix, slopes, start, gain, leak)
+    note = ABSENT
+    if peer is not None:
+        ours.applied(start)
+        worst = float(np.abs(ours(slopes) - peer()).max() / np.abs(start).max())
+        note = f"largest difference {worst:.1e}" if worst < 1e-5 else f"DISAGREES by {worst:.1e}"
+    ours_s, peer_s = alternate(lambda: ours(slopes), peer)
+    return BenchmarkRow(
+        f"pipeline: integrator {n_modes} x {n_slopes}",
+        ours_s * 1e6,
+        None if peer_s is None else peer_s * 1e6,
+        name("leaky_integrator_numba"),
+        "us",
+        "lower",
+        note,
+    )
+
+
+def _peer_integrator(
+    matrix: NDArray[np.float32],
+    slopes: NDArray[np.float32],
+    start: NDArray[np.float32],
+    gain: float,
+    leak: float,
+) -> Callable[[], NDArray[np.float32]] | None:
+    module = pyrtc("loop")
+    if module is None:
+        return None
+    kernel, scaled, out = module.leaky_integrator_numba, np.float32(gain) * matrix, np.zeros_like(start)
+    keep, n_modes = np.float32(leak), len(start)
+
+    def call() -> NDArray[np.float32]:
+        kernel(slopes, scaled, start, out, keep, n_modes)
         return out
 
     return call

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from escape_hw.api.procedure import Progress
-from escape_hw.cli.progress import ProgressView, time_left
+from escape_hw.runtime.progress import ProgressView, time_left
 
 
 def shown(terminal: bool, quiet: bool = False) -> str:
@@ -29,10 +29,14 @@ def test_bars_show_stage_counts_and_time_left():
 
 def test_lines_elsewhere_are_few():
     lines = shown(terminal=False).splitlines()
-    assert lines == [
-        "push-pull: 1 of 100 frames, 1 min 29 s left",
-        "DO-CRIME: 1 of 100 frames, 1 min 29 s left",
-    ]
+    assert lines == ["push-pull: 1 of 100 frames", "DO-CRIME: 1 of 100 frames"]
+
+
+def test_lines_tell_the_time_left_once_it_can_be_known():
+    stream = io.StringIO()
+    with ProgressView(Console(file=stream, width=120)) as view:
+        view(Progress("DO-CRIME", 2, 200, elapsed_s=0.9))
+    assert stream.getvalue() == "DO-CRIME: 2 of 200 frames, 1 min 29 s left\n"
 
 
 def test_quiet_shows_nothing():

@@ -17,7 +17,7 @@ _LINE_PERIOD_S = 10.0
 
 
 class ProgressView:
-    """Shows a procedure's progress: bars on a terminal, now and then a line elsewhere."""
+    """Shows a procedure's progress: bars on a terminal or in a notebook, now and then a line elsewhere."""
 
     def __init__(self, console: Console, quiet: bool = False) -> None:
         self._console, self._quiet = console, quiet
@@ -28,7 +28,7 @@ class ProgressView:
 
     def __enter__(self) -> Self:
         """Begin to draw."""
-        if not self._quiet and self._console.is_terminal:
+        if not self._quiet and (self._console.is_terminal or self._console.is_jupyter):
             self._bars = RichProgress(
                 SpinnerColumn(),
                 TextColumn("{task.description}"),
@@ -72,7 +72,7 @@ class ProgressView:
             self._task,
             total=progress.total,
             completed=progress.done,
-            left=time_left(progress.remaining_s),
+            left=_left(progress),
             metrics="  ".join(f"{name} {value:.3g}" for name, value in list(progress.metrics.items())[:3]),
         )
 
@@ -81,12 +81,17 @@ class ProgressView:
         if progress.stage == self._stage and now - self._last_line < _LINE_PERIOD_S:
             return
         self._stage, self._last_line = progress.stage, now
-        left = time_left(progress.remaining_s)
+        left = _left(progress)
         self._console.print(
             f"{progress.stage}: {progress.done} of {progress.total} {progress.unit}s"
             + (f", {left}" if left else ""),
             highlight=False,
         )
+
+
+def _left(progress: Progress) -> str:
+    """The time left; not after a first step, which may have compiled or warmed up something."""
+    return time_left(progress.remaining_s) if progress.done > 1 else ""
 
 
 def time_left(seconds: float) -> str:

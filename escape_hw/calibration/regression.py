@@ -1,0 +1,73 @@
+"""Sufficient statistics of a linear regression of slopes on pokes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(slots=True, eq=False)
+class RegressionSums:
+    """Sums over frames, in memory that does not grow with their number.
+
+    ``cross`` is the sum of slopes times pokes ``(n_slopes, n_modes)``, ``gram`` that of pokes times
+    pokes, ``power`` that of slopes times slopes: ``(n_slopes, n_slopes)``, or its diagonal
+    ``(n_slopes,)`` where correlations between slopes are not asked for.
+    """
+
+    cross: NDArray[np.float64]
+    gram: NDArray[np.float64]
+    power: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+    pokes: NDArray[np.float64]
+    count: int = 0
+
+    @classmethod
+    def zeros(cls, n_slopes: int, n_modes: int, *, correlations: bool) -> RegressionSums:
+        """Empty sums."""
+        return cls(
+            np.zeros((n_slopes, n_modes)),
+            np.zeros((n_modes, n_modes)),
+            np.zeros((n_slopes, n_slopes) if correlations else n_slopes),
+            np.zeros(n_slopes),
+            np.zeros(n_modes),
+        )
+
+    def add(self, slopes: NDArray[np.float32], pokes: NDArray[np.float32]) -> RegressionSums:
+        """Add rows ``(n, n_slopes)`` and ``(n, n_modes)``.
+
+        Single precision carries the products within a block (as the slopes themselves do), double
+        precision the sums over blocks.
+        """
+        self.cross += slopes.T @ pokes
+        self.gram += pokes.T @ pokes
+        self.power += slopes.T @ slopes if self.power.ndim == 2 else np.einsum("ts,ts->s", slopes, slopes)
+        self.slopes += slopes.sum(axis=0)
+        self.pokes += pokes.sum(axis=0)
+        self.count += len(slopes)
+        return self
+
+    def centred(self) -> RegressionSums:
+        """The same sums about the means of slopes and pokes."""
+        n = max(self.count, 1)
+        square = np.outer(self.slopes, self.slopes) if self.power.ndim == 2 else np.square(self.slopes)
+        return RegressionSums(
+            self.cross - np.outer(self.slopes, self.pokes) / n,
+            self.gram - np.outer(self.pokes, self.pokes) / n,
+            self.power - square / n,
+            np.zeros_like(self.slopes),
+            np.zeros_like(self.pokes),
+            self.count,
+        )
+
+    def solve(self) -> NDArray[np.float64]:
+        """Least-squares matrix ``(n_slopes, n_modes)``."""
+        return np.asarray(np.linalg.solve(self.gram, self.cross.T).T)
+
+    def residual_power(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum of residuals times residuals for the least-squares matrix, of the shape of ``power``."""
+        if self.power.ndim == 1:
+            return np.asarray(self.power - np.einsum("sm,sm->s", self.cross, matrix))
+        return np.asarray(self.power - self.cross @ matrix.T)

@@ -1,0 +1,91 @@
+"""Procedures as an operator asks for them: by method, with the light each of them needs."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.procedure import Procedure
+from escape_hw.api.results import CalibrationResult
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.bench import Bench
+from escape_hw.errors import ConfigError
+from escape_hw.runtime.records import without_turbulence
+
+#: The calibration methods, by the names that the command line knows as well.
+METHODS = ("push-pull", "docrime", "escape")
+
+
+def calibrate_by(
+    bench: Bench,
+    method: str = "escape",
+    *,
+    frames: int | None = None,
+    poke: float | None = None,
+    grid: SubApertureGrid | None = None,
+    whiten: bool = True,
+) -> Procedure[CalibrationResult]:
+    """A calibration by the name of its method.
+
+    Push-pull needs a source: the phase screen, where the bench moves one, is out of the beam
+    meanwhile. The other two take the light as it is.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    method
+        One of :data:`METHODS`.
+    frames
+        Frames to measure with (push-pull: per push and per pull); as configured by default.
+    poke
+        Rms surface as fraction of full stroke; as configured by default.
+    grid
+        The sensor's grid, when it is known already.
+    whiten
+        False: the paper's plain estimator of ``docrime`` and ``escape``.
+
+    Raises
+    ------
+    ConfigError
+        No such method; nothing moved.
+    TooFewFrames, CalibrationError, Aborted
+        See :func:`~escape_hw.calibration.push_pull.push_pull`,
+        :func:`~escape_hw.calibration.docrime.docrime`, :func:`~escape_hw.calibration.escape.escape`.
+    """
+    # Imported when used: these bring compilers along, and a bench opens without them.
+    if method == "push-pull":
+        from escape_hw.calibration.push_pull import push_pull
+
+        with without_turbulence(bench):
+            return (yield from push_pull(bench, frames=frames, poke=poke, grid=grid))
+    if method == "docrime":
+        from escape_hw.calibration.docrime import docrime
+
+        return (yield from docrime(bench, frames=frames, poke=poke, grid=grid, whiten=whiten))
+    if method == "escape":
+        from escape_hw.calibration.escape import escape
+
+        return (yield from escape(bench, frames=frames, poke=poke, grid=grid, whiten=whiten))
+    raise ConfigError(f"calibration method '{method}' is unknown; it is one of {', '.join(METHODS)}")
+
+
+def model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32]]:
+    """The PSF to measure Strehl ratios against, with the turbulence out of the beam meanwhile.
+
+    Parameters
+    ----------
+    bench
+        An open bench with a science camera.
+    frames
+        Science frames to average.
+
+    Raises
+    ------
+    CalibrationError
+        The system has no science camera.
+    """
+    from escape_hw.calibration.closed_loop import measure_model_psf
+
+    with without_turbulence(bench):
+        return (yield from measure_model_psf(bench, frames=frames))

@@ -1,0 +1,99 @@
+"""Every example runs as a reader would run it, and says what it should."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run(name: str, folder: Path, *arguments: str) -> str:
+    """Standard output of an example that must end well, run in an empty folder."""
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / name), *arguments],
+        cwd=folder, capture_output=True, text=True, timeout=240, check=False,
+        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.stdout
+
+
+def number(pattern: str, text: str) -> float:
+    match = re.search(pattern, text)
+    assert match, f"{pattern!r} is not in: {text}"
+    return float(match.group(1))
+
+
+def test_every_example_is_tested() -> None:
+    tested = set(re.findall(r'run\(\s*"([a-z_]+\.py)"', Path(__file__).read_text()))
+    assert {path.name for path in EXAMPLES.glob("*.py")} == tested
+
+
+def test_poke_an_actuator(tmp_path: Path) -> None:
+    out = run("poke_an_actuator.py", tmp_path)
+    assert "untouched by the guard: True" in out
+    assert "asked for 5.0, the mirror got 0.8" in out
+    assert "refused: dm: actuator 48 is nan" in out
+    assert 0.1 < number(r"largest slope: ([\d.]+) pixels", out) < 2.0
+    picture = out.splitlines()[-24:]
+    rows = [number for number, line in enumerate(picture) if "@" in line]
+    assert rows, "the map shows no peak"
+    assert 6 <= min(rows) <= max(rows) <= 14  # the middle, less 0.7 sub-apertures of shift
+
+
+def test_grab_frames(tmp_path: Path) -> None:
+    out = run("grab_frames.py", tmp_path, "kept.npz")
+    assert "100 frames of 400 x 400 pixels" in out
+    assert number(r"measured ([\d.]+) Hz", out) == pytest.approx(400.0, abs=1.0)
+    with np.load(tmp_path / "kept.npz") as kept:
+        assert kept["frames"].shape == (100, 400, 400)
+        assert kept["frames"].dtype == np.uint16
+        assert (np.diff(kept["index"]) >= 1).all()
+        assert (np.diff(kept["arrived_s"]) > 0).all()
+
+
+def test_calibrate(tmp_path: Path) -> None:
+    out = run("calibrate.py", tmp_path)
+    assert "SPRINT converged" in out
+    assert number(r"median ([\d.]+)\n", out) > 10
+    for method in ("DO-CRIME", "ESCAPE"):
+        assert number(rf"{method} against push-pull: .*correlation ([\d.]+)", out) > 0.95
+    assert number(r"shift_x: +(-?[\d.]+)", out) == pytest.approx(-16.0, abs=1.0)
+    assert number(r"shift_y: +(-?[\d.]+)", out) == pytest.approx(-71.0, abs=1.0)
+    assert number(r"rotation: +(-?[\d.]+)", out) == pytest.approx(-0.77, abs=0.05)
+    assert number(r"radial_scaling: +(-?[\d.]+)", out) == pytest.approx(2.9, abs=0.15)
+
+
+def test_close_the_loop(tmp_path: Path) -> None:
+    out = run("close_the_loop.py", tmp_path, "kept.fits")
+    assert (tmp_path / "kept.fits").is_file()
+    assert "kept.fits: escape, 94 modes" in out
+    assert "stable" in out
+    for way in ("peak", "otf", "encircled"):
+        # Without correction it is below one percent (D/r0 = 22).
+        assert 5 < number(rf"Strehl ratio, {way}: ([\d.]+) ±", out) < 100
+
+
+def test_own_procedure(tmp_path: Path) -> None:
+    out = run("own_procedure.py", tmp_path)
+    response = [float(value) for value in re.findall(r"response ([\d.]+)", out)]
+    assert len(response) == 9
+    assert response[0] == 1.0
+    assert all(0.9 < value < 1.2 for value in response)
+
+
+def test_own_device(tmp_path: Path) -> None:
+    out = run("own_device.py", tmp_path)
+    outcomes = re.findall(r"^ *(\w+)  check_", out, re.MULTILINE)
+    assert len(outcomes) > 15
+    assert set(outcomes) <= {"passed", "skipped"}
+    assert outcomes.count("passed") > 15
+    assert "Acme 97: asked for 0.9, sent 0.500" in out

@@ -1,0 +1,169 @@
+"""The lenslet grid is found wherever it lies, and only where there is one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sensor_frames import N_PIX, WAVELENGTH, flat, pupil_amplitude, sensor
+
+from escape_hw.errors import CalibrationError
+from escape_hw.pipeline.grid import find_grid
+from escape_sim.screen import RotatingScreen, von_karman_screen
+
+PITCH_TOLERANCE = 1e-3
+ORIGIN_TOLERANCE = 0.1
+#: Lenslets, nominal pitch, region, beam radius in pupil radii.
+SENSORS = {
+    "bench": (24, 15.54, (400, 400), 1.48),
+    "uniform light": (24, 15.54, (400, 410), np.inf),
+    "narrow beam": (24, 15.54, (400, 400), 0.8),
+    "few lenslets": (6, 15.54, (130, 130), np.inf),
+    "odd number": (13, 15.54, (240, 235), 1.48),
+    "whole pixels": (10, 8.0, (110, 112), 1.48),
+}
+
+
+def find(frame, n_sub=24, nominal=15.54, **options):
+    return find_grid(
+        frame, n_sub=n_sub, nominal_pitch_px=nominal, **{"threshold": 20.0, "min_flux": 0.5, **options}
+    )
+
+
+def assert_found(grid, pitch, origin, tolerance=ORIGIN_TOLERANCE):
+    assert grid.pitch_px == pytest.approx(pitch, rel=PITCH_TOLERANCE)
+    assert grid.origin_px == pytest.approx(origin, abs=tolerance)
+
+
+@pytest.mark.parametrize("case", SENSORS)
+@pytest.mark.parametrize("seed", range(4))
+def test_pitch_and_origin_are_recovered(case, seed):
+    n_sub, nominal, shape, beam = SENSORS[case]
+    rng = np.random.default_rng(seed)
+    pitch = nominal * rng.uniform(0.98, 1.02)
+    optics, origin = sensor(n_sub, pitch, tuple(rng.uniform(-0.4, 0.4, 2) * nominal), shape, beam)
+    grid = find(flat(optics), n_sub, nominal)
+    assert_found(grid, pitch, origin)
+    assert not grid.references_px.any()
+
+
+def test_a_beam_beside_the_pupils_middle_does_not_renumber_the_lenslets():
+    optics, origin = sensor(24, 15.55, (3.2, -1.7), (400, 400))
+    # The brightest spot stands at a third of the radius from the middle, the dimmest has a sixth of it.
+    x = (np.arange(400) - 199.5) / (12 * 15.55)
+    light = np.exp(-2 * ((x[None, :] - 0.33) ** 2 + (x[:, None] + 0.2) ** 2) / 1.45**2)
+    assert_found(find(flat(optics) * light), 15.55, origin)
+
+
+@pytest.mark.parametrize("peak", [120.0, 250.0, 700.0])
+def test_hot_pixels_do_not_matter(peak):
+    optics, origin = sensor(24, 15.49, (-4.1, 2.6), (400, 400), 1.48)
+    frame = flat(optics, peak)
+    clean = find(frame)
+    rng = np.random.default_rng(1)
+    frame[rng.integers(0, 400, 12), rng.integers(0, 400, 12)] = 1023
+    # One in the corner, far outside the pupil.
+    frame[3, 5] = 1023
+    grid = find(frame)
+    assert_found(grid, 15.49, origin)
+    assert grid.counts == pytest.approx(clean.counts, rel=0.2)
+
+
+def test_noise_does_not_matter():
+    optics, origin = sensor(24, 15.6, (0.3, 5.2), (400, 400), 1.48)
+    rng = np.random.default_rng(2)
+    frame = flat(optics, 300.0)
+    # Far more than a mean of 200 frames has.
+    assert_found(find(rng.poisson(frame) + rng.normal(0, 5, frame.shape)), 15.6, origin)
+
+
+@pytest.mark.parametrize(("r0_m", "tolerance"), [(0.7e-3, ORIGIN_TOLERANCE), (0.307e-3, 0.2)])
+def test_the_mean_of_turbulent_frames_will_do(r0_m, tolerance):
+    # What remains is the mean tilt and focus of the turbulence over the frames.
+    optics, origin = sensor(24, 15.55, (3.2, -1.7), (400, 400), 1.48)
+    n, pixel = 24 * N_PIX, 6.75e-3 / (24 * N_PIX)
+    phase = von_karman_screen(2048, pixel, r0_m, 30e-3, np.random.default_rng(3))
+    plate = RotatingScreen(phase * np.float32(WAVELENGTH / (2 * np.pi)), pixel, 28e-3, pupil_amplitude(n) > 0)
+    total = np.zeros((400, 400), np.float32)
+    for k in range(60):
+        opd = np.zeros((n, n), np.float32)
+        plate.add(k * 2.93e-3, opd)
+        optics.frame(opd, total)
+    assert_found(find(total * (600 / total.max())), 15.55, origin, tolerance)
+
+
+def test_mean_references_are_the_mean_spots():
+    optics, origin = sensor(24, 15.55, (3.2, -1.7), (400, 400), 1.48)
+    n = 24 * N_PIX
+    # A weak astigmatism: its slopes grow linearly, with opposite signs along x and y.
+    line = (np.arange(n) - (n - 1) / 2) / (n / 2)
+    opd = np.asarray(0.3e-6 * (line[None, :] ** 2 - line[:, None] ** 2), dtype=np.float32)
+    image = optics.frame(opd)
+    image *= 700 / image.max()
+    grid = find(image, references="mean")
+    rows, columns = np.nonzero(grid.valid)
+    # d(opd)/dx over one lenslet in waves times lambda/d in pixels.
+    slope = 2 * 0.3e-6 * (2 / 24) / WAVELENGTH * 2.3
+    want = slope * np.stack([(columns - 11.5) / 12, -(rows - 11.5) / 12], axis=1)
+    assert grid.origin_px == pytest.approx(origin, abs=ORIGIN_TOLERANCE)
+    assert np.vdot(grid.references_px, want) / np.vdot(want, want) == pytest.approx(1, abs=0.1)
+    # The pixels that the windows cut off make up the rest.
+    assert np.std(grid.references_px - want) < 0.03
+    assert np.std(want) > 0.06
+
+
+def test_valid_sub_apertures_follow_the_light():
+    optics, _ = sensor(24, 15.55, (0.0, 0.0), (400, 400), 1.48)
+    frame = flat(optics)
+    half, most = find(frame, min_flux=0.5), find(frame, min_flux=0.2)
+    assert half.n_valid < most.n_valid
+    assert (most.valid | ~half.valid).all()
+    assert (half.flux[half.valid] >= 0.5).all()
+    line = np.arange(24) - 11.5
+    assert (np.hypot(line[:, None], line)[half.valid] < 12.5).all()
+    # Twice the light makes twice the counts and the same grid.
+    bright = find(2 * frame, threshold=40.0)
+    assert bright.counts == pytest.approx(2 * half.counts, rel=1e-5)
+    assert (bright.valid == half.valid).all()
+
+
+@pytest.mark.parametrize("level", [0.0, 19.0])
+def test_no_light_is_an_error(level):
+    with pytest.raises(CalibrationError, match="no light above the threshold"):
+        find(np.full((400, 400), level, np.float32))
+
+
+def noise() -> np.ndarray:
+    return np.abs(np.random.default_rng(4).normal(0, 15, (400, 400)))
+
+
+def uniform() -> np.ndarray:
+    return np.full((400, 400), 300.0)
+
+
+def one_hot_pixel() -> np.ndarray:
+    frame = np.zeros((400, 400))
+    frame[201, 190] = 1023
+    return frame
+
+
+def one_spot() -> np.ndarray:
+    line = np.arange(400) - 200
+    return 900 * np.exp(-(line[:, None] ** 2 + line**2) / 30**2)
+
+
+@pytest.mark.parametrize("make", [noise, uniform, one_hot_pixel, one_spot])
+def test_light_without_a_lattice_is_an_error(make):
+    with pytest.raises(CalibrationError):
+        find(make().astype(np.float32))
+
+
+@pytest.mark.parametrize("ratio", [1 / 3, 0.5, 0.9, 0.95, 1.04, 1.06, 1.1, 1.2, 1.5, 2.0, 3.0])
+def test_a_wrong_design_pitch_is_an_error(ratio):
+    optics, _ = sensor(24, 15.55, (3.2, -1.7), (400, 400), 1.48)
+    with pytest.raises(CalibrationError, match=r"sensor\.pitch_px"):
+        find(flat(optics), nominal=15.55 * ratio)
+
+
+def test_an_unknown_choice_of_references_is_an_error():
+    with pytest.raises(ValueError, match="references"):
+        find(uniform(), references="middle")

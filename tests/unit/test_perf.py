@@ -1,0 +1,137 @@
+"""``escape perf``: rows, timing in turns, stages found by entry points."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+import subprocess
+import sys
+import time
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+from escape_hw.api.benchmark import BenchmarkRow, alternate
+from escape_hw.cli import perf
+from escape_hw.cli.benchmarks import docrime, peer, pipeline
+from escape_hw.errors import ConfigError
+
+
+def row(ours=2.0, peer_figure=6.0, better="lower"):
+    return BenchmarkRow("stage: what", ours, peer_figure, "peer 1.0", "us", better, "note")
+
+
+def fake_stage() -> list[BenchmarkRow]:
+    return [row()]
+
+
+@pytest.fixture
+def stages(monkeypatch):
+    points = [EntryPoint(name, f"{__name__}:fake_stage", perf.GROUP) for name in ("second", "first")]
+    monkeypatch.setattr(perf, "entry_points", lambda group: points)
+
+
+def test_the_ratio_says_how_many_times_better():
+    assert row().ratio == 3.0
+    assert row(better="higher").ratio == pytest.approx(1 / 3)
+    assert row(peer_figure=None).ratio is None
+    assert row().to_dict() == {
+        "stage": "stage: what",
+        "ours": 2.0,
+        "peer": 6.0,
+        "peer_name": "peer 1.0",
+        "unit": "us",
+        "better": "lower",
+        "note": "note",
+        "ratio": 3.0,
+    }
+
+
+def test_two_functions_are_timed_in_turn():
+    calls = []
+
+    def call(name, seconds):
+        calls.append(name)
+        time.sleep(seconds)
+
+    ours, theirs = alternate(lambda: call("a", 0.004), lambda: call("b", 0.012), seconds=0.05, rounds=3)
+    assert 0.004 <= ours < 0.012 <= theirs
+    turns = [c for k, c in enumerate(calls) if k == 0 or calls[k - 1] != c]
+    assert "".join(turns).endswith("ababab")
+    assert alternate(lambda: call("a", 0.001), None, seconds=0.01)[1] is None
+
+
+def test_stages_run_in_order_and_by_name(stages):
+    assert list(perf.available()) == ["first", "second"]
+    assert len(perf.measure()) == 2
+    assert len(perf.measure(["second"])) == 1
+
+
+def test_an_unknown_stage_is_refused_before_anything_runs(stages):
+    with pytest.raises(ConfigError, match=r"'third'.*first, second"):
+        perf.measure(["first", "third"])
+
+
+def test_the_document_is_strict_json(stages):
+    document = json.loads(json.dumps(perf.document(perf.measure(["first"])), allow_nan=False))
+    assert document["schema"] == 1
+    assert document["simulated"] is True
+    assert set(document["rows"][0]) >= {"stage", "ours", "peer", "peer_name", "ratio", "unit"}
+
+
+def test_the_stages_are_declared(request):
+    text = (request.config.rootpath / "pyproject.toml").read_text()
+    for name in ("docrime", "optics", "pipeline", "sprint"):
+        assert f"\n{name} = " in text.split('"escape.benchmarks"]')[1].split("\n[")[0]
+
+
+def test_a_missing_peer_is_a_row_without_a_figure(monkeypatch):
+    monkeypatch.setattr(pipeline, "pyrtc", lambda module: None)
+    monkeypatch.setattr(pipeline, "alternate", lambda ours, theirs: (1e-6, None) if theirs is None else 1 / 0)
+    rows = pipeline.run()
+    assert rows
+    for one in rows:
+        assert one.peer is None
+        assert one.ratio is None
+        assert "not installed" in one.note
+        assert math.isfinite(one.ours)
+
+
+def test_the_core_does_not_import_the_peer():
+    code = (
+        "import sys, escape_hw.cli.perf\n"
+        "from escape_hw.cli.benchmarks import docrime, pipeline\n"
+        "print(sorted({'pyrtc', 'OOPAO', 'escape_sim'} & set(sys.modules)))"
+    )
+    env = {"PYTHONPATH": ":".join(p for p in sys.path if p)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, timeout=120)
+    assert done.stdout == "[]\n", done.stderr
+
+
+def test_the_frames_of_the_docrime_stage_answer_one_frame_later(monkeypatch):
+    monkeypatch.setattr(docrime, "_N_FRAMES", 1500)
+    data = docrime.make_run(None)
+    x, y = data.pokes[:-1].astype(float), data.slopes[1:].astype(float)
+    assert data.error(np.linalg.solve(x.T @ x, x.T @ y).T) < 0.2
+    assert data.error(docrime.whole(data)) < 0.2
+    assert np.allclose(docrime.whole(data), docrime.streaming(data), rtol=0, atol=1e-4)
+
+
+def test_turbulence_of_the_docrime_stage_has_unit_rms_and_falls_steeply():
+    slow = docrime.frozen_flow(np.random.default_rng(0))
+    assert slow.std() == pytest.approx(1.0)
+    power = (np.abs(np.fft.rfft(slow * np.hanning(len(slow))[:, None], axis=0)) ** 2).mean(axis=1)
+    f = np.arange(len(power)) / len(slow)
+    band = (f > 0.05) & (f < 0.2)
+    slope = np.polyfit(np.log(f[band]), np.log(power[band]), 1)[0]
+    assert slope == pytest.approx(-11 / 3, abs=0.2)
+
+
+def test_the_peers_name_carries_its_version_where_it_is_installed():
+    try:
+        want = f"pyrtcao {importlib.metadata.version('pyrtcao')}: kernel"
+    except importlib.metadata.PackageNotFoundError:
+        want = "pyrtcao: kernel"
+    assert peer.name("kernel") == want

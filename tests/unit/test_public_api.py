@@ -1,0 +1,193 @@
+"""What scripts get from ``import escape_hw``: the names, and an open system's methods on the twin."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import escape_hw
+from escape_hw.errors import Aborted, ConfigError, IncompatibleProduct
+
+#: Enough for the 30 modes that the tests calibrate.
+FEW = ("basis.n_modes=30", "calibration.sprint_modes=30", "loop.dropped_modes=2")
+FRAMES = 300
+
+
+def imported_for_type_checkers() -> dict[str, str]:
+    """Public name -> module, as the block that only type checkers read has it."""
+    tree = ast.parse(Path(escape_hw.__file__).read_text())
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    return {
+        name.name: str(line.module)
+        for line in block.body
+        if isinstance(line, ast.ImportFrom)
+        for name in line.names
+    }
+
+
+def test_type_checkers_and_the_interpreter_see_the_same_names() -> None:
+    seen = imported_for_type_checkers()
+    whole = {name for name, home in escape_hw._HOME.items() if home == f"escape_hw.{name}"}
+    assert whole == {"errors", "testing"}
+    assert {name: home for name, home in escape_hw._HOME.items() if name not in whole} == {
+        name: home for name, home in seen.items() if name not in whole
+    }
+    assert set(seen) == set(escape_hw.__all__) - {"__version__"}
+
+
+def test_errors_and_configuration_do_not_load_the_numerics() -> None:
+    code = (
+        "import escape_hw, sys, json\n"
+        "escape_hw.errors.Aborted, escape_hw.open_system, escape_hw.System\n"
+        "print(json.dumps(sorted(sys.modules)))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = {name.partition(".")[0] for name in json.loads(run.stdout)}
+    assert not loaded & {"astropy", "matplotlib", "numba", "OOPAO", "rich", "scipy", "typer"}
+
+
+@pytest.mark.parametrize(
+    ("method", "procedure"),
+    [
+        ("close_loop", "closed_loop"),
+        ("find_best_gain", "best_gain"),
+        ("take_model_psf", "measure_model_psf"),
+        ("find_sensor", "find_sensor"),
+    ],
+)
+def test_methods_and_procedures_have_the_same_defaults(method: str, procedure: str) -> None:
+    ours = inspect.signature(getattr(escape_hw.System, method)).parameters
+    theirs = inspect.signature(getattr(escape_hw, procedure)).parameters
+    for name, parameter in ours.items():
+        if name not in ("self", "progress"):
+            assert parameter.default == theirs[name].default, name
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[escape_hw.System]:
+    with escape_hw.open_system("razor-shwfs", seed=5, set=FEW) as system:
+        yield system
+
+
+@pytest.fixture(scope="module")
+def found(bench: escape_hw.System) -> escape_hw.CalibrationResult:
+    return bench.calibrate("escape", frames=FRAMES)
+
+
+def test_escape_recovers_the_planted_registration(
+    bench: escape_hw.System, found: escape_hw.CalibrationResult
+) -> None:
+    assert found.matrix.method == "escape"
+    assert found.registration is not None
+    assert found.registration.converged
+    planted = bench.config.twin.registration.to_registration().to_array()
+    error = np.abs(found.registration.registration.to_array() - planted)
+    assert (error < [5.0, 5.0, 0.2, 1.0, 1.0]).all()
+    assert found.measured is not None
+    again = bench.find_registration(found.measured, found.grid).registration.to_array()
+    assert (np.abs(again - planted) < [5.0, 5.0, 0.2, 1.0, 1.0]).all()
+
+
+@pytest.mark.parametrize("whiten", [True, False])
+def test_a_method_is_the_procedure_of_that_name(whiten: bool) -> None:
+    measured = []
+    calls: list[Callable[[escape_hw.System], escape_hw.CalibrationResult]] = [
+        lambda bench: bench.calibrate("docrime", frames=FRAMES, poke=0.01, whiten=whiten),
+        lambda bench: bench.run(escape_hw.docrime(bench, frames=FRAMES, poke=0.01, whiten=whiten)),
+    ]
+    for call in calls:
+        with escape_hw.open_system("razor-shwfs", seed=6, set=FEW) as system:
+            measured.append(call(system))
+    assert np.array_equal(measured[0].matrix.data, measured[1].matrix.data)
+    assert measured[0].matrix.metrics["poke"] == 0.01
+    assert measured[0].matrix.method == ("docrime-whitened" if whiten else "docrime")
+
+
+def test_push_pull_takes_the_turbulence_out_and_puts_it_back(bench: escape_hw.System) -> None:
+    assert bench.screen is not None
+    seen: list[bool] = []
+    set_screen = bench.screen._set
+    bench.screen._set = lambda want: (seen.append(want.inserted), set_screen(want))[1]  # type: ignore[method-assign]
+    try:
+        result = bench.calibrate("push-pull", frames=1)
+    finally:
+        del bench.screen._set
+    assert seen == [False, True]
+    assert bench.screen.state.inserted
+    assert result.matrix.method == "push-pull"
+    registration = bench.find_registration(result.matrix, result.grid)
+    assert registration.converged
+    assert registration.registration.shift_y == pytest.approx(-71.0, abs=5.0)
+
+
+def test_loop_strehl_and_best_gain(bench: escape_hw.System, found: escape_hw.CalibrationResult) -> None:
+    model = bench.take_model_psf(frames=3)
+    assert bench.screen is not None
+    assert bench.screen.state.inserted
+    run = bench.close_loop(found.matrix, found.grid, gain=0.3, frames=400, model_psf=model)
+    assert run.stable
+    assert run.strehl is not None
+    # Thirty modes leave the core barely above the halo, and the sensor lost next to nothing.
+    assert 0.005 < run.strehl.peak.value < 1.0
+    assert run.lost_frames < 5
+    assert not bench.dm.shape.any(), "the mirror must end flat"
+    gain, runs = bench.find_best_gain(found.matrix, found.grid, gains=(0.05, 0.3), frames=200)
+    assert [each.gain for each in runs] == [0.05, 0.3]
+    assert gain == 0.3
+    with pytest.raises(IncompatibleProduct):
+        bench.close_loop(
+            found.matrix, bench.run(escape_hw.find_sensor(_narrower(bench), frames=20)).grid, frames=1
+        )
+
+
+def _narrower(bench: escape_hw.System) -> Any:
+    """The same bench asking for brighter sub-apertures: another grid."""
+    config = bench.config
+    sensor = config.sensor.model_copy(update={"min_flux": 0.9})
+    other = escape_hw.System(
+        config.model_copy(update={"sensor": sensor}), bench.dm, bench.wfs, bench.science, bench.screen
+    )
+    return other
+
+
+def test_an_unknown_method_moves_nothing(bench: escape_hw.System) -> None:
+    before = bench.dm.sent_count
+    with pytest.raises(ConfigError, match=r"'pushpull' is unknown; it is one of push-pull, docrime, escape"):
+        bench.calibrate("pushpull")
+    assert bench.dm.sent_count == before
+
+
+def test_progress_goes_to_standard_error(bench: escape_hw.System, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.run(escape_hw.find_sensor(bench, frames=5))
+    assert capsys.readouterr() == ("", "")
+    bench.run(escape_hw.find_sensor(bench, frames=5), progress=True)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "find the lenslet grid: 1 of 5 frames" in err
+
+
+def test_an_abort_flattens_the_mirror_and_keeps_what_was_measured(bench: escape_hw.System) -> None:
+    stop = threading.Event()
+
+    def after_a_while(progress: escape_hw.Progress) -> None:
+        if progress.done > FRAMES // 2:
+            stop.set()
+
+    procedure = escape_hw.docrime(bench, frames=100 * FRAMES)
+    with pytest.raises(Aborted) as caught:
+        bench.run(procedure, observers=(after_a_while,), abort=stop)
+    assert not bench.dm.shape.any()
+    partial = caught.value.partial
+    assert isinstance(partial, escape_hw.CalibrationResult)
+    assert partial.partial
+    assert FRAMES // 2 < partial.frames < 100 * FRAMES
