@@ -30,7 +30,8 @@ class ShwfsResult:
     """Push-pull, DO-CRIME and ESCAPE on one Shack-Hartmann bench, each with its loop.
 
     ``loops`` are the runs at each matrix's own best gain, ``scans`` the runs that found it, both by
-    label; ``sky_time`` holds error curves over a few random plants; ``partial`` is true when the operator stopped it early.
+    label; ``sky_time`` holds error curves over a few random plants; ``partial`` is true when the
+    operator stopped it early.
     """
 
     calibrations: dict[str, CalibrationResult] = field(default_factory=dict)
