@@ -88,8 +88,8 @@ def extractor(bench: Bench, grid: SubApertureGrid) -> SlopeExtractor:
     centres, half = grid.centres_px(), grid.pitch_px / 2
     if (centres < half - 1).any() or (centres > np.array(shape[::-1]) - half).any():
         raise IncompatibleProduct(
-            f"the lenslet grid reaches beyond the camera's region of {region.width} x {region.height} pixels; "
-            "it was found on another region, so measure again"
+            "the lenslet grid reaches beyond the camera's region of "
+            f"{region.width} x {region.height} pixels; it was found on another region, so measure again"
         )
     if bench.dark is not None and bench.dark.shape != shape:
         raise CalibrationError(
