@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 
 @dataclass(slots=True, eq=False)
@@ -44,8 +45,9 @@ class RegressionSums:
         self.cross += slopes.T @ pokes
         self.gram += pokes.T @ pokes
         self.power += slopes.T @ slopes if self.power.ndim == 2 else np.einsum("ts,ts->s", slopes, slopes)
-        self.slopes += slopes.sum(axis=0)
-        self.pokes += pokes.sum(axis=0)
+        ones = np.ones(len(slopes), np.float32)
+        self.slopes += ones @ slopes
+        self.pokes += ones @ pokes
         self.count += len(slopes)
         return self
 
@@ -64,7 +66,15 @@ class RegressionSums:
 
     def solve(self) -> NDArray[np.float64]:
         """Least-squares matrix ``(n_slopes, n_modes)``."""
-        return np.asarray(np.linalg.solve(self.gram, self.cross.T).T)
+        return np.asarray(cho_solve(self._factor(), self.cross.T, check_finite=False).T)
+
+    def inverse_diagonal(self) -> NDArray[np.float64]:
+        """Diagonal of the inverse of ``gram`` ``(n_modes,)``."""
+        whole = cho_solve(self._factor(), np.eye(len(self.gram)), check_finite=False)
+        return np.asarray(np.diag(whole))
+
+    def _factor(self) -> tuple[NDArray[np.float64], bool]:
+        return cho_factor(self.gram, check_finite=False)  # type: ignore[no-any-return]
 
     def residual_power(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum of residuals times residuals for the least-squares matrix, of the shape of ``power``."""

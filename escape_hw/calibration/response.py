@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_toeplitz, toeplitz
+from scipy.linalg import cho_factor, cho_solve, solve_toeplitz, toeplitz
 
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.telemetry import Telemetry
@@ -138,10 +138,10 @@ def _strongest_lag(
 
 def _matrix(slopes: NDArray[np.float32], pokes: NDArray[np.float32]) -> NDArray[np.float32]:
     """Least squares ``(n_modes, n_slopes)``."""
-    gram = (pokes.T @ pokes).astype(np.float64)
+    gram = pokes.T @ pokes
     # Half a short run may hold fewer frames than modes; a little damping keeps the matrix finite.
     gram[np.diag_indices_from(gram)] += 1e-2 * np.trace(gram) / len(gram)
-    return np.linalg.solve(gram, pokes.T @ slopes).astype(np.float32)
+    return np.asarray(cho_solve(cho_factor(gram, check_finite=False), pokes.T @ slopes, check_finite=False))
 
 
 def _regress(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,13 +72,14 @@ class Recorder:
         self.n_slopes = n_slopes
         self._rows = np.zeros((rows, n_slopes + n_modes), np.float32)
         self._present = np.ones(rows, np.bool_)
+        self._slots: list[tuple[NDArray[np.float32], ...]] = []
         #: Rows in use, and those of them that were there at the last :meth:`keep`.
         self.filled = self.kept = 0
 
     @property
-    def room(self) -> int:
-        """Rows that are free."""
-        return len(self._rows) - self.filled
+    def full(self) -> bool:
+        """Whether there is no room for another frame."""
+        return self.filled == len(self._present)
 
     @property
     def fresh(self) -> int:
@@ -86,23 +87,39 @@ class Recorder:
         return int(np.count_nonzero(self._present[self.kept : self.filled]))
 
     def take(self, slopes: NDArray[np.floating], pokes: NDArray[np.floating]) -> int:
-        """Put in consecutive frames ``(n, n_slopes)``, ``(n, n_modes)``; returns how many there was room for."""
-        k, n = self.filled, min(len(slopes), self.room)
+        """Put in consecutive frames ``(n, n_slopes)``, ``(n, n_modes)``.
+
+        Returns
+        -------
+        int
+            How many there was room for.
+        """
+        k, n = self.filled, min(len(slopes), len(self._present) - self.filled)
         self._rows[k : k + n, : self.n_slopes] = slopes[:n]
         self._rows[k : k + n, self.n_slopes :] = pokes[:n]
         self.filled += n
         return n
 
-    def take_one(self, slopes: NDArray[np.floating], poke: NDArray[np.floating]) -> bool:
-        """Put in one frame, for which there must be room; false, and not taken, if it is not finite."""
-        row = self._rows[self.filled]
-        row[: self.n_slopes] = slopes
-        row[self.n_slopes :] = poke
+    def take_one(self, slopes: NDArray[np.floating], poke: NDArray[np.floating]) -> int:
+        """Put in one frame ``(n_slopes,)``, ``(n_modes,)``, for which there must be room.
+
+        Returns
+        -------
+        int
+            How many more there is room for; -1 if the frame is not finite, and so was not taken.
+        """
+        if not self._slots:
+            rows = self._rows
+            self._slots = list(zip(rows, rows[:, : self.n_slopes], rows[:, self.n_slopes :], strict=True))
+        k = self.filled
+        row, its_slopes, its_poke = self._slots[k]
+        its_slopes[...] = slopes
+        its_poke[...] = poke
         # A sum of squares is finite when all numbers are, and takes a tenth of the time to ask.
-        if not math.isfinite(row.dot(row)):
-            return False
-        self.filled += 1
-        return True
+        if not isfinite(row.dot(row)):
+            return -1
+        self.filled = k = k + 1
+        return len(self._slots) - k
 
     def lose_one(self) -> None:
         """Put in a lost frame, for which there must be room; something must stand before it."""
@@ -128,7 +145,7 @@ class Recorder:
 
     def resize(self, rows: int) -> None:
         """Give the buffer another number of rows, at least those in use."""
-        old, used = self.telemetry(), self.filled
+        old, used, self._slots = self.telemetry(), self.filled, []
         self._rows = np.zeros((rows, old.rows.shape[1]), np.float32)
         self._present = np.ones(rows, np.bool_)
         self._rows[:used], self._present[:used] = old.rows, old.present

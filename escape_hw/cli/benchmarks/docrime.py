@@ -125,8 +125,8 @@ def whole(data: Run) -> NDArray[np.float64]:
 def streaming(data: Run) -> NDArray[np.float64]:
     """Our estimator frame by frame, beside a running camera."""
     estimator = DocrimeEstimator(_N_SLOPES, _N_MODES, correlations=False)
-    for k in range(_N_FRAMES):
-        estimator.partial_fit(k, data.slopes[k], data.pokes[k])
+    for k, (slopes, poke) in enumerate(zip(data.slopes, data.pokes, strict=True)):
+        estimator.partial_fit(k, slopes, poke)
     return estimator.solve().matrix
 
 
