@@ -122,7 +122,8 @@ def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> T
     parts = [slice(0, middle), slice(middle, now.size)]
     weights, covariances = [], []
     for here, there in (parts, parts[::-1]):
-        w, c = _regress(slopes, pokes @ _matrix(slopes[here], shifted(pokes, now[here], best)), now, lags, there)
+        matrix = _matrix(slopes[here], shifted(pokes, now[here], best))
+        w, c = _regress(slopes, pokes @ matrix, now, lags, there)
         weights.append(w)
         covariances.append(c)
     mean = np.mean(weights, axis=0)
@@ -132,7 +133,7 @@ def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> T
 def _strongest_lag(
     slopes: NDArray[np.float32], pokes: NDArray[np.float32], now: NDArray[np.intp], lags: int
 ) -> int:
-    few = np.ascontiguousarray(slopes[:, ::2])
+    few = np.ascontiguousarray(slopes[:, ::3])
     return int(np.argmax([np.square(few.T @ shifted(pokes, now, lag)).sum() for lag in range(lags)]))
 
 

@@ -29,6 +29,8 @@ def test_blocks_add_up_to_least_squares_with_an_intercept(offset):
     answer = np.linalg.lstsq(design, slopes.astype(float), rcond=None)[0]
     matrix = centred.solve()
     assert matrix == pytest.approx(answer[:-1].T, abs=1e-4)
+    inverse = np.diag(np.linalg.inv((pokes - pokes.mean(0)).T.astype(float) @ (pokes - pokes.mean(0))))
+    assert centred.inverse_diagonal() == pytest.approx(inverse, rel=1e-4)
     residual = slopes - design @ answer
     assert centred.residual_power(matrix) == pytest.approx(residual.T @ residual, rel=1e-3, abs=2e-2)
 
