@@ -24,13 +24,20 @@ from escape_hw.calibration.sensor_setup import (
 from escape_hw.errors import Aborted, TooFewFrames
 from escape_hw.pipeline.slopes import SlopeExtractor
 
+Record = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DocrimeRun:
-    """A DO-CRIME run: the calibration, and the solution it came from."""
+    """A DO-CRIME run: the calibration, and the solution it came from.
+
+    ``record`` holds, when it was asked for, the frame indices ``(n,)``, slopes ``(n, n_slopes)`` and
+    pokes ``(n, n_modes)``.
+    """
 
     result: CalibrationResult
     solution: DocrimeSolution
+    record: Record | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -50,6 +57,7 @@ class _Session:
     light: LightWatch | None = None
     waiting: list[tuple[Frame, NDArray[np.float64]]] = field(default_factory=list)
     taken: int = 0
+    kept: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] | None = None
 
     def take(self, frame: Frame, poke: NDArray[np.float64]) -> None:
         self.taken += 1
@@ -94,6 +102,14 @@ class _Session:
         self.light(self.slopes_of.flux)
         self.motion.add(slopes)
         self.estimator.partial_fit(frame.index, slopes, poke)
+        if self.kept is not None:
+            self.kept.append((frame.index, slopes, poke))
+
+    def record(self) -> Record | None:
+        if self.kept is None:
+            return None
+        index, slopes, pokes = zip(*self.kept, strict=True)
+        return np.array(index, np.int64), np.stack(slopes), np.stack(pokes).astype(np.float32)
 
 
 def docrime_run(
@@ -103,8 +119,9 @@ def docrime_run(
     poke: float | None = None,
     whiten: bool = True,
     grid: SubApertureGrid | None = None,
+    record: bool = False,
 ) -> Procedure[DocrimeRun]:
-    """As :func:`docrime`, with the solution beside the matrix."""
+    """As :func:`docrime`, with the solution beside the matrix, and with the telemetry if asked for."""
     c = bench.config.calibration
     n_frames = c.frames if frames is None else some_frames(frames)
     poke = c.poke if poke is None else poke
@@ -120,6 +137,7 @@ def docrime_run(
     session = _Session(
         bench, c.whiten_order if whiten else 0, c.lags, m2c.shape[1], grid, min(SETUP_FRAMES, n_frames)
     )
+    session.kept = [] if record else None
     clipped, partial = 0, False
     report = Reporter("DO-CRIME", n_frames)
     try:
@@ -167,7 +185,7 @@ def docrime_run(
         mean_frame=session.mean_frame,
         notes=tuple(notes),
     )
-    return DocrimeRun(result, solution)
+    return DocrimeRun(result, solution, session.record())
 
 
 def docrime(

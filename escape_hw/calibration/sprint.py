@@ -221,7 +221,8 @@ def sprint(
         Iterations before giving up.
     covariance
         Covariance of the slopes' noise ``(n_slopes, n_slopes)`` up to a factor, where it is known:
-        turbulence moves neighbouring slopes together, and the error bars must know.
+        turbulence moves neighbouring slopes together, and the error bars must know. Without it they
+        learn of it from the scatter between modes, less precisely.
     priors
         Scatter of what the model does not know.
 
@@ -317,19 +318,24 @@ def _covariance(
 ) -> NDArray[np.float64]:
     """Sandwich covariance of the common parameters, in units of their own.
 
-    The middle holds the noise with its correlation between slopes, where it is known, and the
-    scatter of the scores from patch to patch of 2 x 2 sub-apertures as it is found, which includes
-    what the model still misses: neighbouring lenslets fall on the pixels in opposite ways, so that
-    much of it cancels within a patch. What is common to the whole pupil no scatter can show;
-    :data:`_FLOOR` stands for it.
+    The middle holds the noise with its correlation between slopes, where it is known, and else the
+    scatter of the scores from mode to mode, which shows what moved all slopes together while one
+    mode was measured. To it comes the scatter from patch to patch of 2 x 2 sub-apertures as it is
+    found, which includes what the model still misses: neighbouring lenslets fall on the pixels in
+    opposite ways, so that much of it cancels within a patch. What is common to the whole pupil no
+    scatter can show; :data:`_FLOOR` stands for it.
     """
     bread = np.linalg.inv(_reduced(system))
     scores = system.efficient()
-    by_slope = np.einsum("psm,sm->ps", scores, system.residual)
+    each = scores * system.residual
+    by_slope = each.sum(axis=2)
     by_patch = np.zeros((by_slope.shape[0], int(problem.patches.max()) + 1))
     np.add.at(by_patch.T, problem.patches, by_slope.T)
     meat = by_patch @ by_patch.T
-    if noise is not None:
+    if noise is None:
+        by_mode = each.sum(axis=1)
+        meat += by_mode @ by_mode.T
+    else:
         whole = noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
         meat += np.einsum("psm,st,qtm->pq", scores, whole, scores, optimize=True)
     found = bread @ meat @ bread

@@ -151,9 +151,8 @@ class System(Bench):
     def find_registration(self, matrix: InteractionMatrix, grid: SubApertureGrid) -> RegistrationEstimate:
         """Where the mirror sits on the sensor, from a measured matrix (SPRINT); nothing moves.
 
-        ``calibrate("escape")`` does this as well, and its error bars are the better ones: a matrix no
-        longer tells how vibration and turbulence move all slopes together, so that the error bars
-        found here are too small where they matter.
+        ``calibrate("escape")`` does this as well, and its error bars are the better ones: it still
+        knows how the turbulence moves slopes together, which a matrix tells only roughly.
 
         Parameters
         ----------

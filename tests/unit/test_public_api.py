@@ -119,15 +119,19 @@ def test_push_pull_takes_the_turbulence_out_and_puts_it_back(bench: escape_hw.Sy
     set_screen = bench.screen._set
     bench.screen._set = lambda want: (seen.append(want.inserted), set_screen(want))[1]  # type: ignore[method-assign]
     try:
-        result = bench.calibrate("push-pull", frames=1)
+        result = bench.calibrate("push-pull", frames=3)
     finally:
         del bench.screen._set
     assert seen == [False, True]
     assert bench.screen.state.inserted
     assert result.matrix.method == "push-pull"
-    registration = bench.find_registration(result.matrix, result.grid)
-    assert registration.converged
-    assert registration.registration.shift_y == pytest.approx(-71.0, abs=5.0)
+    estimate = bench.find_registration(result.matrix, result.grid)
+    assert estimate.converged
+    planted = bench.config.twin.registration.to_registration()
+    error = estimate.registration.to_array() - planted.to_array()
+    assert np.abs(error[:2]).max() < 10.0
+    # Vibration moves all slopes of a column together; error bars that forget it are 20 times too small.
+    assert np.abs(error / estimate.sigma).max() < 5.0
 
 
 def test_loop_strehl_and_best_gain(bench: escape_hw.System, found: escape_hw.CalibrationResult) -> None:
