@@ -161,6 +161,11 @@ def closed_loop(
     seconds = max((bench.wfs.now_ns() - started) * 1e-9, 1e-9)
     ratio: StrehlEstimate | None = None
     notes = ["the loop diverged and was opened"] if record.diverged else []
+    if science is not None:
+        # The first frame or two after closing do not count.
+        expected = int((seconds - _CLOSING_S) * science.settings.frame_rate_hz) - 2
+        if len(record.science) < expected / 2:
+            notes.append(f"only {len(record.science)} of about {expected} frames came from {science.name}")
     if science is not None and model_psf is not None and record.science and not record.diverged:
         try:
             ratio = strehl(np.array(record.science, dtype=np.float32), model_psf)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
+from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, SprintIteration
 from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
@@ -241,6 +242,30 @@ def sprint(
     ValueError
         A learning rate outside (0, 1].
     """
+    steps = sprint_steps(
+        matrix, model, modes=modes, learning_rate=learning_rate, start=start,
+        max_iterations=max_iterations, covariance=covariance, priors=priors,
+    )  # fmt: skip
+    while True:
+        try:
+            next(steps)
+        except StopIteration as done:
+            estimate: RegistrationEstimate = done.value
+            return estimate
+
+
+def sprint_steps(
+    matrix: InteractionMatrix,
+    model: SyntheticModel,
+    *,
+    modes: NDArray[np.intp] | int | None = None,
+    learning_rate: float = 1.0,
+    start: Registration | None = None,
+    max_iterations: int = 25,
+    covariance: NDArray[np.float64] | None = None,
+    priors: Priors | None = None,
+) -> Procedure[RegistrationEstimate]:
+    """As :func:`sprint`, iteration by iteration, so that it can be watched and stopped."""
     if not 0 < learning_rate <= 1:
         raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
     columns = _columns(matrix, modes)
@@ -259,7 +284,10 @@ def sprint(
     state = problem.start(start or Registration())
     history: list[SprintIteration] = []
     settled = False
+    report = Reporter("SPRINT", max_iterations, "iteration")
     for _ in range(max_iterations):
+        if progress := report.step():
+            yield progress
         system = problem.linearise(state)
         step = np.linalg.solve(system.matrix, system.right)
         if not np.isfinite(step).all():
@@ -369,8 +397,8 @@ def _estimate(
     )
     if explained < _EXPLAINED * max(expected, 0.0) or np.vdot(model, problem.data) <= 0:
         warnings.append(
-            f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves {max(expected, 0.0):.0%} "
-            "to explain; wrong layout, flip or basis, or a registration beyond capture"
+            f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves "
+            f"{max(expected, 0.0):.0%} to explain; wrong layout, flip or basis, or a registration beyond capture"
         )
     sigma = np.sqrt(np.diag(covariance))
     worst = int(np.argmax(sigma[1:6] / _LARGEST))

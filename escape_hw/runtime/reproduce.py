@@ -90,11 +90,15 @@ def _calibrate(bench: Bench, frames: int, result: ShwfsResult) -> Procedure[None
     if result.partial:
         return
     found = yield from calibrate_by(bench, "escape", frames=frames)
+    result.partial = found.partial
+    if found.partial:
+        # Stopped before SPRINT: what there is is a DO-CRIME matrix.
+        result.calibrations["DO-CRIME"] = found
+        return
     measured = measured_part(found)
     if measured is not None:
         result.calibrations["DO-CRIME"] = measured
     result.calibrations["ESCAPE"] = found
-    result.partial = found.partial
 
 
 def _close_loops(bench: Bench, loop_frames: int, result: ShwfsResult) -> Procedure[None]:
