@@ -11,16 +11,67 @@ from escape_hw.api.frames import Frame
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
+from escape_hw.errors import CalibrationError, ConfigError
 
 #: Spots move and blur by more than their centres of gravity show: what the window and the threshold
 #: cut off, and the turbulence within each lenslet. Found on a twin with known optics (docs/decisions).
 MOTION_FACTOR = 1.2
+#: So many frames in a row with half of the sub-apertures dark mean that the light has gone ...
+DARK_FRAMES = 25
+#: ... and dark is a sub-aperture with less than this share of its usual light.
+DARK_SHARE = 0.02
+
+
+def some_frames(frames: int, name: str = "frames") -> int:
+    """The number of frames, if there is at least one.
+
+    Raises
+    ------
+    ConfigError
+        There is none.
+    """
+    if frames < 1:
+        raise ConfigError(f"{name} is {frames}; it must be at least 1")
+    return frames
+
+
+class LightWatch:
+    """Notices that the sensor has gone dark: slopes of nothing are noise, or zero, which looks perfect.
+
+    Parameters
+    ----------
+    device
+        Name of the camera, for the message.
+    grid
+        Tells how much light is usual.
+    """
+
+    def __init__(self, device: str, grid: SubApertureGrid) -> None:
+        self._device = device
+        self._least = DARK_SHARE * grid.counts * grid.flux[grid.valid]
+        self._dark = 0
+
+    def __call__(self, flux: NDArray[np.float32]) -> None:
+        """Look at the flux of every sub-aperture in one frame ``(n_valid,)``.
+
+        Raises
+        ------
+        CalibrationError
+            No light for :data:`DARK_FRAMES` frames in a row.
+        """
+        self._dark = self._dark + 1 if 2 * np.count_nonzero(flux > self._least) < flux.size else 0
+        if self._dark >= DARK_FRAMES:
+            raise CalibrationError(
+                f"{self._device}: no light on most sub-apertures for {self._dark} frames in a row; "
+                "check the source, the beam stop and the exposure"
+            )
 
 
 class Motion:
     """Running rms motion of the spots."""
 
     def __init__(self, n_slopes: int) -> None:
+        self.n_slopes = n_slopes
         self._n = 0
         self._sum = np.zeros(n_slopes)
         self._squares = np.zeros(n_slopes)

@@ -15,12 +15,13 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import LoopResult, StrehlEstimate
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import next_frame
+from escape_hw.calibration.acquire import LightWatch, next_frame, some_frames
 from escape_hw.calibration.sensor_setup import extractor
-from escape_hw.errors import Aborted, CalibrationError, IncompatibleProduct
+from escape_hw.errors import Aborted, CalibrationError, ConfigError, IncompatibleProduct
 from escape_hw.pipeline.integrator import LeakyIntegrator, gain_limit
 from escape_hw.pipeline.reconstructor import reconstructor
-from escape_hw.pipeline.strehl import strehl
+from escape_hw.pipeline.slopes import SlopeExtractor
+from escape_hw.pipeline.strehl import has_light, strehl
 
 #: Seconds after closing during which the science frames do not count.
 _CLOSING_S = 0.3
@@ -53,8 +54,9 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
     Raises
     ------
     CalibrationError
-        The system has no science camera.
+        The system has no science camera, or it sees no light.
     """
+    some_frames(frames)
     science = bench.science
     if science is None:
         raise CalibrationError("this system has no science camera to take a PSF with")
@@ -71,7 +73,12 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
                 yield report(done + 1)
     finally:
         science.stop()
-    return (total / frames).astype(np.float32)
+    image = (total / frames).astype(np.float32)
+    if not has_light(image):
+        raise CalibrationError(
+            f"{science.name}: no light on the science camera; check the source, the beam stop and the region"
+        )
+    return image
 
 
 def closed_loop(
@@ -110,20 +117,30 @@ def closed_loop(
 
     Raises
     ------
+    ConfigError
+        A gain, leak or number of frames that means nothing; nothing moved.
     IncompatibleProduct
-        The matrix belongs to another mirror or grid.
+        The matrix belongs to another mirror, grid or camera region; nothing moved.
+    CalibrationError
+        The matrix cannot be inverted, or the sensor went dark.
     """
     c = bench.config.loop
     gain = c.gain if gain is None else gain
     leak = c.leak if leak is None else leak
     dropped = c.dropped_modes if dropped_modes is None else dropped_modes
+    some_frames(frames)
+    if not (0 < gain < math.inf and 0 <= leak <= 1):
+        raise ConfigError(f"gain is {gain} and leak {leak}; the gain must be positive, the leak in [0, 1]")
     if matrix.m2c.shape[0] != bench.dm.info.n_act or matrix.n_slopes != grid.n_slopes:
         raise IncompatibleProduct(
             f"the matrix is for {matrix.m2c.shape[0]} actuators and {matrix.n_slopes} slopes; "
             f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
         )
+    if not np.array_equal(matrix.valid, grid.valid):
+        raise IncompatibleProduct("the matrix and the grid mark different sub-apertures as valid")
     stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
     control = LeakyIntegrator(reconstructor(matrix.data, scale=stroke, dropped_modes=dropped), gain, leak)
+    slopes_of = extractor(bench, grid)
     record, partial = _Record(), False
     science = bench.science if model_psf is not None else None
     bench.dm.flatten()
@@ -134,7 +151,7 @@ def closed_loop(
     if science is not None:
         science.stop()
     try:
-        yield from _run(bench, matrix, grid, control, frames, science is not None, record, stage)
+        yield from _run(bench, matrix, slopes_of, control, frames, science is not None, record, stage)
     except Aborted:
         partial = True
     finally:
@@ -167,14 +184,14 @@ def closed_loop(
 def _run(
     bench: Bench,
     matrix: InteractionMatrix,
-    grid: SubApertureGrid,
+    slopes_of: SlopeExtractor,
     control: LeakyIntegrator,
     frames: int,
     watch: bool,
     record: _Record,
     stage: str,
 ) -> Procedure[None]:
-    slopes_of = extractor(bench, grid)
+    light = LightWatch(bench.wfs.name, slopes_of.grid)
     to_modes = np.linalg.pinv(matrix.m2c)
     # Reflection doubles the surface; modes have unit rms surface.
     metres = 2 * bench.dm.info.stroke_m
@@ -187,6 +204,7 @@ def _run(
         modes = control(slopes_of(frame.data))
         sent = bench.dm.send(matrix.m2c @ modes)
         record.latency.append(time.perf_counter_ns() - began)
+        light(slopes_of.flux)
         if not sent.guard.untouched:
             control.applied(to_modes @ sent.sent)
         record.frames, record.last, record.command = done + 1, frame, sent.sent
@@ -280,7 +298,7 @@ def _peak(runs: list[LoopResult]) -> float:
     With fewer than four runs, or where the parabola has no top, the best run's gain.
     """
     gains = np.array([run.gain for run in runs])
-    merits = np.array([_merit(run) for run in runs])
+    merits = _merits(runs)
     best = float(gains[int(np.argmax(merits))])
     if gains.size < 4:
         return best
@@ -290,7 +308,7 @@ def _peak(runs: list[LoopResult]) -> float:
     return float(np.clip(-slope / (2 * bend), gains.min(), gains.max()))
 
 
-def _merit(run: LoopResult) -> float:
-    if run.strehl is not None:
-        return run.strehl.peak.value
-    return -run.residual_rms_nm
+def _merits(runs: list[LoopResult]) -> NDArray[np.float64]:
+    """Strehl ratios, or (as soon as one run has none) residuals: never one beside the other."""
+    ratios = [run.strehl.peak.value for run in runs if run.strehl is not None]
+    return np.array(ratios if len(ratios) == len(runs) else [-run.residual_rms_nm for run in runs])

@@ -12,7 +12,7 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import Motion, measured_matrix, next_frame
+from escape_hw.calibration.acquire import LightWatch, Motion, measured_matrix, next_frame, some_frames
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator, DocrimeSolution
 from escape_hw.calibration.sensor_setup import (
     SETUP_FRAMES,
@@ -24,13 +24,20 @@ from escape_hw.calibration.sensor_setup import (
 from escape_hw.errors import Aborted, TooFewFrames
 from escape_hw.pipeline.slopes import SlopeExtractor
 
+Record = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DocrimeRun:
-    """A DO-CRIME run: the calibration, and the solution it came from."""
+    """A DO-CRIME run: the calibration, and the solution it came from.
+
+    ``record`` holds, when it was asked for, the frame indices ``(n,)``, slopes ``(n, n_slopes)`` and
+    pokes ``(n, n_modes)``.
+    """
 
     result: CalibrationResult
     solution: DocrimeSolution
+    record: Record | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -47,8 +54,10 @@ class _Session:
     slopes_of: SlopeExtractor | None = None
     estimator: DocrimeEstimator | None = None
     motion: Motion | None = None
+    light: LightWatch | None = None
     waiting: list[tuple[Frame, NDArray[np.float64]]] = field(default_factory=list)
     taken: int = 0
+    kept: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] | None = None
 
     def take(self, frame: Frame, poke: NDArray[np.float64]) -> None:
         self.taken += 1
@@ -71,7 +80,7 @@ class _Session:
             setup = setup_from_frames(self.bench, mean)
             self.grid, self.mean_frame = setup.grid, setup.mean_frame
         self.slopes_of = extractor(self.bench, self.grid)
-        self.motion = Motion(self.grid.n_slopes)
+        self.motion, self.light = Motion(self.grid.n_slopes), LightWatch(self.bench.wfs.name, self.grid)
         self.estimator = DocrimeEstimator(
             self.grid.n_slopes, self.n_modes, order=self.estimator_order, lags=self.lags
         )
@@ -87,11 +96,20 @@ class _Session:
         return grid if self.mean_frame is None else self.motion.references(grid)
 
     def _feed(self, frame: Frame, poke: NDArray[np.float64]) -> None:
-        if self.slopes_of is None or self.motion is None or self.estimator is None:
+        if self.slopes_of is None or self.motion is None or self.light is None or self.estimator is None:
             raise RuntimeError("frames were fed before the sensor was set up")
         slopes = self.slopes_of(frame.data)
+        self.light(self.slopes_of.flux)
         self.motion.add(slopes)
         self.estimator.partial_fit(frame.index, slopes, poke)
+        if self.kept is not None:
+            self.kept.append((frame.index, slopes, poke))
+
+    def record(self) -> Record | None:
+        if self.kept is None:
+            return None
+        index, slopes, pokes = zip(*self.kept, strict=True)
+        return np.array(index, np.int64), np.stack(slopes), np.stack(pokes).astype(np.float32)
 
 
 def docrime_run(
@@ -101,12 +119,14 @@ def docrime_run(
     poke: float | None = None,
     whiten: bool = True,
     grid: SubApertureGrid | None = None,
+    record: bool = False,
 ) -> Procedure[DocrimeRun]:
-    """As :func:`docrime`, with the solution beside the matrix."""
+    """As :func:`docrime`, with the solution beside the matrix, and with the telemetry if asked for."""
     c = bench.config.calibration
-    n_frames = frames or c.frames
+    n_frames = c.frames if frames is None else some_frames(frames)
+    poke = c.poke if poke is None else poke
     m2c = modal_basis(bench)
-    amplitude = poke_amplitudes(bench, m2c, poke or c.poke)
+    amplitude = poke_amplitudes(bench, m2c, poke)
     needed = _least_frames(m2c.shape[1], c.whiten_order if whiten else 0, c.lags)
     if n_frames < needed:
         raise TooFewFrames(
@@ -117,6 +137,7 @@ def docrime_run(
     session = _Session(
         bench, c.whiten_order if whiten else 0, c.lags, m2c.shape[1], grid, min(SETUP_FRAMES, n_frames)
     )
+    session.kept = [] if record else None
     clipped, partial = 0, False
     report = Reporter("DO-CRIME", n_frames)
     try:
@@ -147,7 +168,7 @@ def docrime_run(
     matrix = measured_matrix(
         bench, session.grid, m2c, solution.matrix, solution.sigma,
         "docrime-whitened" if whiten else "docrime",
-        frames=solution.frames, lost_frames=solution.lost_frames, poke=float(poke or c.poke),
+        frames=solution.frames, lost_frames=solution.lost_frames, poke=float(poke),
         clipped=clipped, delay_frames=response.delay, whitening_order=solution.whitener.size - 1,
     )  # fmt: skip
     notes = []
@@ -164,7 +185,7 @@ def docrime_run(
         mean_frame=session.mean_frame,
         notes=tuple(notes),
     )
-    return DocrimeRun(result, solution)
+    return DocrimeRun(result, solution, session.record())
 
 
 def docrime(
@@ -199,10 +220,12 @@ def docrime(
 
     Raises
     ------
+    ConfigError
+        A number of frames or a poke that means nothing; nothing moved.
     TooFewFrames
         Too few frames for the number of modes; nothing moved.
     CalibrationError
-        No spots, no response, or pokes that do not span the modes.
+        No spots, no light, no response, or pokes that do not span the modes.
     Aborted
         Stopped before a matrix could be solved.
     """

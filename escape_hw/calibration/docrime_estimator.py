@@ -86,7 +86,8 @@ class DocrimeEstimator:
         self._filled = 0
         self._data: Telemetry | None = None
         self._last_index: int | None = None
-        self._absorbed = 0
+        # Rows on the time line, on which long gaps are cut short; the first frame stands at row 0.
+        self._row, self._absorbed = -1, -1
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
         self._tracker: ResponseTracker | None = None
@@ -122,8 +123,10 @@ class DocrimeEstimator:
             raise ValueError(f"frame {index}: slopes or poke are not finite")
         if self._last_index is not None and index <= self._last_index:
             raise ValueError(f"frame index went from {self._last_index} to {index}; it must rise")
-        k = self._filled
-        self._index[k], self._slopes[k], self._pokes[k] = index, slopes, poke
+        k, step = self._filled, 1 if self._last_index is None else index - self._last_index
+        self._row += min(step, self._longest_gap() + 1)
+        self.lost_frames += step - 1
+        self._index[k], self._slopes[k], self._pokes[k] = self._row, slopes, poke
         self._last_index, self._filled = index, k + 1
         if self._filled >= self._room():
             self._absorb()
@@ -150,19 +153,27 @@ class DocrimeEstimator:
         if not math.isfinite(np.vdot(slopes, slopes) + np.vdot(pokes, pokes)):
             raise ValueError("slopes or pokes are not finite")
         before = index[:1] - 1 if self._last_index is None else [self._last_index]
-        if n and (np.diff(index, prepend=before) <= 0).any():
+        steps = np.diff(index, prepend=before)
+        if (steps <= 0).any():
             raise ValueError("frame indices must rise")
+        rows = self._row + np.cumsum(np.minimum(steps, self._longest_gap() + 1))
         done = 0
         while done < n:
             take, k = min(self._room() - self._filled, n - done), self._filled
-            self._index[k : k + take] = index[done : done + take]
+            self._index[k : k + take] = rows[done : done + take]
+            self.lost_frames += int(steps[done : done + take].sum()) - take
             self._slopes[k : k + take] = slopes[done : done + take]
             self._pokes[k : k + take] = pokes[done : done + take]
             done += take
             self._last_index, self._filled = int(index[done - 1]), k + take
+            self._row = int(rows[done - 1])
             if self._filled >= (BURN_IN if self._response is None else 250):
                 self._absorb()
         return self
+
+    def _longest_gap(self) -> int:
+        """A gap longer than the memory of filter and response separates the stretches for good."""
+        return 2 * (self.order + self.lags)
 
     def _room(self) -> int:
         return BURN_IN if self._response is None else BLOCK
@@ -209,14 +220,10 @@ class DocrimeEstimator:
         n, self._filled = self._filled, 0
         fresh = Telemetry.from_frames(self._index[:n], self._slopes[:n], self._pokes[:n])
         self.frames += n
-        self.lost_frames += fresh.n_lost
         start = 0
         if self._data is not None:
-            gap = int(self._index[0]) - self._absorbed - 1
-            self.lost_frames += gap
             start = 0 if self._response is None else self._data.present.size
-            # A gap longer than the memory of filter and response separates the stretches for good.
-            fresh = self._data.followed_by(fresh, min(gap, 2 * (self.order + self.lags)))
+            fresh = self._data.followed_by(fresh, int(self._index[0]) - self._absorbed - 1)
         self._absorbed = int(self._index[n - 1])
         if self._response is None:
             self._fit(fresh)

@@ -9,7 +9,7 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import Motion, measured_matrix, next_frame
+from escape_hw.calibration.acquire import LightWatch, Motion, measured_matrix, next_frame, some_frames
 from escape_hw.calibration.sensor_setup import extractor, find_sensor, modal_basis, poke_amplitudes
 from escape_hw.errors import Aborted, CalibrationError
 from escape_hw.pipeline.slopes import SlopeExtractor
@@ -80,13 +80,18 @@ def push_pull(
 
     Raises
     ------
+    ConfigError
+        A number of frames or a poke that means nothing; nothing moved.
     CalibrationError
-        No spots, or no response.
+        No spots, no light, or no response.
     Aborted
         Stopped before the first mode was measured.
     """
     c = bench.config.calibration
-    n_frames = frames or c.push_pull_frames
+    n_frames = c.push_pull_frames if frames is None else some_frames(frames)
+    poke = c.push_pull_poke if poke is None else poke
+    m2c = modal_basis(bench)
+    amplitude = poke_amplitudes(bench, m2c, poke)
     try:
         bench.dm.flatten()
         mean_frame = None
@@ -94,19 +99,17 @@ def push_pull(
             setup = yield from find_sensor(bench)
             grid, mean_frame = setup.grid, setup.mean_frame
         slopes_of = extractor(bench, grid)
-        m2c = modal_basis(bench)
-        amplitude = poke_amplitudes(bench, m2c, poke or c.push_pull_poke)
         skip = yield from settling_frames(bench, slopes_of, m2c[:, 0] * amplitude[0] * 3)
         start = bench.wfs.status()
         columns: list[NDArray[np.float64]] = []
         errors: list[NDArray[np.float64]] = []
         partial = False
-        motion = Motion(grid.n_slopes)
+        motion, light = Motion(grid.n_slopes), LightWatch(bench.wfs.name, grid)
         report = Reporter("push-pull", m2c.shape[1], "mode")
         try:
             for mode in range(m2c.shape[1]):
                 column, error = _one_mode(
-                    bench, slopes_of, m2c[:, mode], amplitude[mode], skip, n_frames, motion
+                    bench, slopes_of, m2c[:, mode], amplitude[mode], skip, n_frames, motion, light
                 )
                 columns.append(column)
                 errors.append(error)
@@ -123,7 +126,7 @@ def push_pull(
     lost = status.lost - start.lost
     matrix = measured_matrix(
         bench, grid, m2c[:, : len(columns)], np.stack(columns, 1), np.stack(errors, 1), "push-pull",
-        frames=delivered, lost_frames=lost, poke=float(poke or c.push_pull_poke), settling_frames=skip,
+        frames=delivered, lost_frames=lost, poke=float(poke), settling_frames=skip,
     )  # fmt: skip
     return CalibrationResult(
         matrix, motion.of(grid), delivered, lost,
@@ -139,6 +142,7 @@ def _one_mode(
     skip: int,
     frames: int,
     motion: Motion,
+    light: LightWatch,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Column and its standard errors for one mode, each ``(n_slopes,)``."""
     means, variances, sent = [], [], []
@@ -148,9 +152,11 @@ def _one_mode(
         sent.append(float(report.sent @ shape / (shape @ shape)))
         for _ in range(skip):
             next_frame(bench)
-        stack = np.array([slopes_of(next_frame(bench).data) for _ in range(frames)], dtype=np.float64)
-        for slopes in stack:
-            motion.add(slopes.astype(np.float32))
+        stack = np.empty((frames, motion.n_slopes))
+        for row in stack:
+            row[:] = slopes = slopes_of(next_frame(bench).data)
+            motion.add(slopes)
+            light(slopes_of.flux)
         means.append(stack.mean(axis=0))
         variances.append(
             stack.var(axis=0, ddof=1) / frames if frames > 1 else np.full(stack.shape[1], np.nan)

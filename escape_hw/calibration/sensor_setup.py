@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import some_frames
 from escape_hw.calibration.modes import karhunen_loeve, unit_rms, zonal
-from escape_hw.errors import CalibrationError, ConfigError
+from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 from escape_hw.pipeline.grid import find_grid
 from escape_hw.pipeline.slopes import SlopeExtractor
 
@@ -73,9 +74,27 @@ def setup_from_frames(
 
 
 def extractor(bench: Bench, grid: SubApertureGrid) -> SlopeExtractor:
-    """Slopes of this bench's camera on a grid."""
+    """Slopes of this bench's camera on a grid.
+
+    Raises
+    ------
+    IncompatibleProduct
+        The grid leaves the camera's region.
+    CalibrationError
+        The dark frame is of another region.
+    """
     region = bench.wfs.settings.region
     shape = (region.height, region.width)
+    centres, half = grid.centres_px(), grid.pitch_px / 2
+    if (centres < half - 1).any() or (centres > np.array(shape[::-1]) - half).any():
+        raise IncompatibleProduct(
+            f"the lenslet grid reaches beyond the camera's region of {region.width} x {region.height} pixels; "
+            "it was found on another region, so measure again"
+        )
+    if bench.dark is not None and bench.dark.shape != shape:
+        raise CalibrationError(
+            f"the dark frame has shape {bench.dark.shape}, the camera delivers {shape}; measure it again"
+        )
     dark = bench.dark if bench.dark is not None else np.full(shape, grid.background, np.float32)
     return SlopeExtractor(grid, shape, dark=dark, threshold=threshold_counts(bench))
 
@@ -90,6 +109,7 @@ def find_sensor(
     CalibrationError
         No spots where the design says there should be.
     """
+    some_frames(frames)
     total = np.zeros((), np.float64)
     report = Reporter("find the lenslet grid", frames)
     for done in range(frames):
@@ -111,6 +131,7 @@ def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.flo
         raise CalibrationError(
             "this system has no beam stop under control; block the beam by hand and set bench.dark"
         )
+    some_frames(frames)
     total = np.zeros((), np.float64)
     report = Reporter("dark frame", frames)
     before = bench.screen.state.blocked

@@ -19,7 +19,10 @@ _SystemOption = Annotated[str, typer.Option("--system", help="System to run on."
 def shwfs(
     system: _SystemOption = _SYSTEM,
     frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")] = 10_000,
-    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 5000,
+    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 30_000,
+    plants: Annotated[
+        int, typer.Option("--plants", min=0, help="Random plants for the curve of error against frames.")
+    ] = 4,
     out: options.Out = None,
     set: options.Set = None,
     seed: options.Seed = None,
@@ -33,7 +36,7 @@ def shwfs(
         from escape_hw.runtime.reproduce_keep import keep_shwfs
 
         def start(bench: Any) -> Any:
-            return reproduce_shwfs(bench, frames=frames, loop_frames=loop_frames)
+            return reproduce_shwfs(bench, frames=frames, loop_frames=loop_frames, plants=plants)
 
         result, document = _run(one, _paper_case(system, set, seed, mode), "shwfs", out, start, keep_shwfs)
         _show_shwfs(one, result, document)
@@ -62,6 +65,50 @@ def table1(
         result, document = _run(one, _paper_case(system, set, seed, mode), "table1", out, start, keep_table1)
         _show_registration(one, result.calibrations, document)
         _show_end(one, document)
+
+
+@app.command("sky-time")
+def sky_time(
+    system: _SystemOption = _SYSTEM,
+    plants: Annotated[int, typer.Option("--plants", min=2, help="Random plants.")] = 20,
+    frames: Annotated[
+        list[int] | None, typer.Option("--frames", min=1, help="Frames to take the errors at; repeatable.")
+    ] = None,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Parallel processes.")] = 2,
+    set: options.Set = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Error of the registration against frames, plain and whitened, with the Cramer-Rao bound."""
+    with session("reproduce sky-time", json=json, quiet=quiet) as one:
+        from escape_hw.config.load import load_system
+        from escape_hw.io import documents
+        from escape_hw.runtime import sky_time as campaign
+
+        config = load_system(system, overrides=set or [], mode="sim")
+        counts = sorted(frames or campaign.FRAMES)
+        procedure = campaign.sky_time(
+            system, plants=plants, frames=counts, overrides=set or [], workers=workers
+        )
+        curves, stop = one.attempt(procedure)
+        if stop is not None:
+            raise stop
+        head = documents.head("reproduce sky-time", config.system.name, True, config.system.seed)
+        one.show(_curves_table(campaign.rows(curves)))
+        least = ", ".join(f"{name}: {n or 'none of these'}" for name, n in curves["fewest_frames"].items())
+        one.show(f"fewest frames that meet the goal in every parameter: {least}")
+        one.result({**head, **curves}, met=curves["fewest_frames"]["whitened"] is not None)
+
+
+def _curves_table(rows: Any) -> Any:
+    from rich.table import Table
+
+    from escape_hw.api.registration import PARAMETERS, UNITS
+
+    table = Table("estimator", "frames", *(f"{p} [{UNITS[p]}]" for p in PARAMETERS), title="rms error (chi2)")
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def _paper_case(

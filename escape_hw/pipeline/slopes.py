@@ -164,6 +164,14 @@ class SlopeExtractor:
         self._light = np.empty(grid.n_valid, np.float32)
         self._place_windows()
 
+    @property
+    def flux(self) -> NDArray[np.float32]:
+        """Light above the threshold in each window of the last frame ``(n_valid,)``, in counts.
+
+        Overwritten by the next frame, unless that one was given a flux array of its own.
+        """
+        return self._light
+
     def _place_windows(self) -> None:
         """Windows in the form that :func:`centres_of_gravity` wants."""
         centres = self.grid.centres_px()

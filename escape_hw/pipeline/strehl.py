@@ -22,6 +22,15 @@ def without_background(image: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(image - np.median(image[border]), dtype=np.float64)
 
 
+def has_light(image: NDArray[np.floating]) -> bool:
+    """True when something stands clearly above the scatter of the image's border."""
+    border = np.ones(image.shape, dtype=bool)
+    border[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
+    rim = image[border]
+    # Of the 16,384 pixels of a dark image the brightest stands out by about four times the scatter.
+    return bool(np.max(image) - np.median(rim) > 10 * np.std(rim))
+
+
 def centre_of(image: NDArray[np.float64]) -> tuple[float, float]:
     """Sub-pixel position (row, column) of the peak: a parabola through it and its neighbours."""
     row, column = (int(v) for v in np.unravel_index(np.argmax(image), image.shape))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.bench import Bench
 from escape_hw.errors import Aborted
 from escape_hw.runtime.procedures import calibrate_by, model_psf
+from escape_hw.runtime.sky_time import sky_time
 
 #: The paper's two runs: 20 seconds and 3 minutes at 500 Hz.
 SHORT_FRAMES, LONG_FRAMES = 10_000, 100_000
@@ -28,12 +30,14 @@ class ShwfsResult:
     """Push-pull, DO-CRIME and ESCAPE on one Shack-Hartmann bench, each with its loop.
 
     ``loops`` are the runs at each matrix's own best gain, ``scans`` the runs that found it, both by
-    label; ``partial`` is true when the operator stopped it early.
+    label; ``sky_time`` holds error curves over a few random plants; ``partial`` is true when the
+    operator stopped it early.
     """
 
     calibrations: dict[str, CalibrationResult] = field(default_factory=dict)
     loops: dict[str, LoopResult] = field(default_factory=dict)
     scans: dict[str, list[LoopResult]] = field(default_factory=dict)
+    sky_time: dict[str, Any] | None = None
     partial: bool = False
 
 
@@ -46,7 +50,7 @@ class Table1Result:
 
 
 def reproduce_shwfs(
-    bench: Bench, *, frames: int = SHORT_FRAMES, loop_frames: int = 5000
+    bench: Bench, *, frames: int = SHORT_FRAMES, loop_frames: int = 5000, plants: int = 0
 ) -> Procedure[ShwfsResult]:
     """Calibrate with and without a source and close the loop with every matrix.
 
@@ -61,12 +65,17 @@ def reproduce_shwfs(
         Frames of the DO-CRIME measurement.
     loop_frames
         Frames of each final closed-loop run.
+    plants
+        Random plants for the curve of error against frames; none by default. They run on twins of
+        their own, whatever the bench is.
     """
     result = ShwfsResult()
     try:
         yield from _calibrate(bench, frames, result)
         if not result.partial:
             yield from _close_loops(bench, loop_frames, result)
+        if plants and not result.partial:
+            result.sky_time = yield from sky_time(bench.config.system.name, plants=plants)
     except Aborted:
         result.partial = True
     return result

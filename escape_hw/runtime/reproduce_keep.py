@@ -52,6 +52,7 @@ def keep_shwfs(
         "criteria": checks,
         "labels": labels,
         "partial": result.partial,
+        **({"sky_time": result.sky_time} if result.sky_time else {}),
         **record.tail(wall_seconds),
     }
     return finish(folder, document)

@@ -158,10 +158,18 @@ def test_lost_frames_bias_nothing(lost):
     assert np.mean(chi2) == pytest.approx(1, abs=0.15)
 
 
-def test_a_long_gap_separates_two_runs():
+@pytest.mark.parametrize("at", [300, 1300, 1999])
+def test_a_long_gap_separates_two_runs(at):
     slopes, pokes, truth = run(6, frames=2400)
     index = np.arange(2400)
-    index[1300:] += 10**6
+    # Weeks at 500 frames per second; memory must not grow with them.
+    index[at:] += 10**9
     s = solve(slopes, pokes, index=index)
-    assert s.lost_frames == 10**6
-    assert np.mean(((s.matrix - truth) / s.sigma) ** 2) == pytest.approx(1, abs=0.3)
+    assert s.lost_frames == 10**9
+    assert s.frames == 2400
+    assert np.mean(split(s, truth)[1] ** 2) == pytest.approx(1, abs=0.3)
+    one = DocrimeEstimator(N_SLOPES, N_MODES, order=ORDER, lags=LAGS)
+    for k in range(2400):
+        one.partial_fit(int(index[k]), slopes[k], pokes[k])
+    assert one.solve().matrix == pytest.approx(s.matrix, abs=1e-4)
+    assert one.lost_frames == 10**9

@@ -1,0 +1,178 @@
+"""Sky time: the error of the registration against the frames spent, over random plants on a twin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.calibration.acquire import measured_matrix
+from escape_hw.calibration.bound import registration_bound
+from escape_hw.calibration.docrime import docrime_run
+from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.sprint import sprint
+from escape_hw.errors import CalibrationError, TooFewFrames
+from escape_hw.runtime.system import open_system
+
+#: Half ranges of the random plants, in the units of the registration.
+RANGES = np.array([100.0, 100.0, 2.0, 4.0, 4.0])
+#: The accuracy asked for: rms errors in the same units.
+GOAL = np.array([1.0, 1.0, 0.02, 0.1, 0.1])
+#: Frames at which the errors are taken.
+FRAMES = (220, 300, 500, 1000)
+ESTIMATORS = ("plain", "whitened")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlantErrors:
+    """Errors and stated standard errors of one plant, ``(n_estimators, n_frames, 5)``; NaN if refused.
+
+    ``bound`` is the Cramer-Rao bound at the largest number of frames ``(5,)``.
+    """
+
+    errors: NDArray[np.float64]
+    sigmas: NDArray[np.float64]
+    bound: NDArray[np.float64]
+
+
+def random_plant(number: int) -> Registration:
+    """The registration of plant ``number``: uniform within :data:`RANGES`."""
+    return Registration.from_array(np.random.default_rng(1000 + number).uniform(-1, 1, 5) * RANGES)
+
+
+def plant_overrides(plant: Registration) -> list[str]:
+    """Overrides that plant a registration in a twin."""
+    return [f"twin.registration.{name}={value!r}" for name, value in plant.to_dict().items()]
+
+
+def run_plant(
+    system: str, number: int, frames: Sequence[int] = FRAMES, overrides: Sequence[str] = ()
+) -> PlantErrors:
+    """Record one run on one plant and estimate its registration from its first frames.
+
+    The estimators get frames, indices and the commands sent; the plant is only compared at the end.
+    """
+    plant = random_plant(number)
+    errors = np.full((len(ESTIMATORS), len(frames), 5), np.nan)
+    sigmas, bound = errors.copy(), np.full(5, np.nan)
+    with open_system(system, set=[*overrides, *plant_overrides(plant)], seed=number + 1) as bench:
+        c = bench.config.calibration
+        run = bench.run(docrime_run(bench, frames=max(frames), record=True))
+        if run.record is None:
+            raise RuntimeError("the run was not recorded")
+        index, slopes, pokes = run.record
+        grid, m2c = run.result.grid, run.result.matrix.m2c
+        model = bench.model(grid)
+        for e, order in enumerate((0, c.whiten_order)):
+            for f, count in enumerate(frames):
+                estimator = DocrimeEstimator(slopes.shape[1], pokes.shape[1], order=order, lags=c.lags)
+                try:
+                    solution = estimator.extend(index[:count], slopes[:count], pokes[:count]).solve()
+                    matrix = measured_matrix(bench, grid, m2c, solution.matrix, solution.sigma, ESTIMATORS[e])
+                    found = sprint(matrix, model, modes=c.sprint_modes, covariance=solution.covariance)
+                except (TooFewFrames, CalibrationError):
+                    continue
+                errors[e, f] = found.registration.to_array() - plant.to_array()
+                sigmas[e, f] = found.sigma
+                if order and count == max(frames):
+                    bound = registration_bound(matrix, solution.covariance, model, found.registration)
+    return PlantErrors(errors, sigmas, bound)
+
+
+def sky_time(
+    system: str,
+    *,
+    plants: int = 20,
+    frames: Sequence[int] = FRAMES,
+    overrides: Sequence[str] = (),
+    workers: int = 2,
+) -> Procedure[dict[str, Any]]:
+    """Run a campaign over random plants in parallel processes.
+
+    Parameters
+    ----------
+    system
+        Name or path of a system; its twins are used.
+    plants
+        How many random plants.
+    frames
+        Numbers of frames at which to take the errors, rising.
+    overrides
+        Configuration overrides, ``section.key=value`` each.
+    workers
+        Parallel processes.
+
+    Returns
+    -------
+    dict
+        See :func:`summary`.
+    """
+    report = Reporter("sky time", plants, "plant")
+    done: list[PlantErrors] = []
+    with ProcessPoolExecutor(workers) as pool:
+        jobs = [pool.submit(run_plant, system, n, tuple(frames), tuple(overrides)) for n in range(plants)]
+        try:
+            for job in as_completed(jobs):
+                done.append(job.result())
+                yield report(len(done))
+        finally:
+            for job in jobs:
+                job.cancel()
+    return summary(done, frames)
+
+
+def summary(plants: Sequence[PlantErrors], frames: Sequence[int]) -> dict[str, Any]:
+    """Rms errors, normalised chi-squared and bound against frames, ready for JSON and for the report.
+
+    ``fewest_frames`` is, per estimator, the least number of frames at which every parameter meets
+    :data:`GOAL`; ``None`` where none does.
+    """
+    errors = np.stack([p.errors for p in plants])
+    sigmas = np.stack([p.sigmas for p in plants])
+    met = np.isfinite(errors).all(axis=(0, 3)) & np.all(np.sqrt(np.mean(errors**2, axis=0)) <= GOAL, axis=2)
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    chi2 = np.mean(np.square(errors / sigmas), axis=0)
+    bound = np.sqrt(np.nanmean(np.square(np.stack([p.bound for p in plants])), axis=0))
+    scale = np.sqrt(max(frames) / np.asarray(frames, dtype=float))
+    fewest: dict[str, int | None] = {}
+    for e, name in enumerate(ESTIMATORS):
+        enough = [int(n) for f, n in enumerate(frames) if met[e, f]]
+        fewest[name] = min(enough) if enough else None
+    return {
+        "plants": len(plants),
+        "frames": [int(n) for n in frames],
+        "estimators": {
+            name: {p: _plain(rms[e, :, k]) for k, p in enumerate(PARAMETERS)}
+            for e, name in enumerate(ESTIMATORS)
+        },
+        "chi2": {
+            name: {p: _plain(chi2[e, :, k]) for k, p in enumerate(PARAMETERS)}
+            for e, name in enumerate(ESTIMATORS)
+        },
+        "bound": {p: _plain(bound[k] * scale) for k, p in enumerate(PARAMETERS)},
+        "goal": {p: float(GOAL[k]) for k, p in enumerate(PARAMETERS)},
+        "fewest_frames": fewest,
+    }
+
+
+def _plain(values: NDArray[np.float64]) -> list[float | None]:
+    return [float(v) if np.isfinite(v) else None for v in values]
+
+
+def rows(curves: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """The curves as rows of text: estimator, frames, rms errors, and chi-squared in brackets."""
+    for name, by_parameter in curves["estimators"].items():
+        for i, count in enumerate(curves["frames"]):
+            cells = []
+            for p in PARAMETERS:
+                error, chi2 = by_parameter[p][i], curves["chi2"][name][p][i]
+                cells.append("refused" if error is None else f"{error:.3g} ({chi2:.2g})")
+            yield (name, str(count), *cells)
+    for i, count in enumerate(curves["frames"]):
+        yield ("bound", str(count), *(f"{curves['bound'][p][i]:.3g}" for p in PARAMETERS))

@@ -1,0 +1,173 @@
+"""The fast model's matrix is the derivative of what the optics and the centre of gravity really do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from escape_hw.api.registration import Registration
+from escape_hw.config.load import load_system
+from escape_hw.pipeline.slopes import windows
+from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.influence import InfluenceFunctions
+from escape_sim.model import ShackHartmannModel, nominal_grid
+from escape_sim.shack_hartmann import ShackHartmannOptics
+from escape_sim.slope_weights import STEPS, slope_weights
+
+MOVED = Registration(35.0, -22.0, 1.3, 1.5, -2.0)
+#: Commands of the finite differences: spots move by a few hundredths of a pixel.
+STEP = 2e-3
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_system("razor-shwfs")
+
+
+class Truth:
+    """Frames by the twin's optics and slopes by a centre of gravity written out in NumPy."""
+
+    def __init__(self, config, grid, cut=0.0):
+        self.config, self.grid, self.cut = config, grid, cut
+        self.pupil = pupil_geometry(config)
+        width, height = config.devices.wfs.region[2:]
+        self.shape = (height, width)
+        self.optics = ShackHartmannOptics(
+            self.pupil.n_sub, self.pupil.n_pix, config.system.wavelength_m, grid.pitch_px,
+            config.sensor.spot_px, grid.origin_px, self.shape, self.pupil.amplitude,
+        )  # fmt: skip
+        self.boxes = windows(grid.centres_px(), grid.pitch_px, self.shape)
+
+    def slopes(self, opd):
+        light = np.maximum(self.optics.frame(opd.astype(np.float32)).astype(float) - self.cut, 0.0)
+        out = np.empty((2, self.grid.n_valid))
+        for k, (top, end, left, right) in enumerate(self.boxes):
+            part = light[top:end, left:right]
+            total = part.sum()
+            out[:, k] = (
+                part.sum(0) @ np.arange(left, right) / total,
+                part.sum(1) @ np.arange(top, end) / total,
+            )
+        return out.ravel()
+
+    def tilt(self, x_px, y_px):
+        """Path that moves all spots by so many pixels."""
+        per_metre = self.config.system.wavelength_m / self.pupil.sub_aperture_m / self.config.sensor.spot_px
+        x = self.pupil.coordinates_m * per_metre
+        return x_px * x[None, :] + y_px * x[:, None]
+
+    def column(self, surface, around=0.0):
+        # Reflection doubles the surface.
+        opd = STEP * 2 * self.config.devices.dm.stroke_m * surface
+        return (self.slopes(around + opd) - self.slopes(around - opd)) / (2 * STEP)
+
+
+def surfaces(config, registration, width=1.0):
+    pupil = pupil_geometry(config)
+    influence = InfluenceFunctions(
+        actuator_positions(config), pitch_on_pupil(config), config.devices.dm.coupling, width
+    )
+    x = pupil.coordinates_m
+    return influence.surfaces(registration, pupil.sub_aperture_m, x, x)
+
+
+def worst(matrix, truth):
+    """Largest error relative to the largest response of the same actuators."""
+    return np.abs(matrix - truth).max() / np.abs(truth).max()
+
+
+@pytest.mark.parametrize(("registration", "width"), [(Registration(), 1.0), (MOVED, 1.1)])
+def test_the_matrix_equals_finite_differences(config, registration, width):
+    grid = nominal_grid(config)
+    truth = Truth(config, grid)
+    some = np.arange(0, 97, 4)
+    shapes = surfaces(config, registration, width)
+    want = np.stack([truth.column(shapes[a]) for a in some], axis=1)
+    matrix = ShackHartmannModel(config, grid).zonal_matrix(registration, width)
+    assert matrix.shape == (grid.n_slopes, 97)
+    assert worst(matrix[:, some], want) < 1e-3
+
+
+def test_a_grid_off_the_pixels_changes_the_matrix_as_the_optics_do(config):
+    centred = nominal_grid(config)
+    grid = replace(
+        centred, pitch_px=15.61, origin_px=(centred.origin_px[0] + 0.41, centred.origin_px[1] - 1.3)
+    )
+    truth, some = Truth(config, grid), np.arange(2, 97, 12)
+    shapes = surfaces(config, MOVED)
+    want = np.stack([truth.column(shapes[a]) for a in some], axis=1)
+    assert worst(ShackHartmannModel(config, grid).zonal_matrix(MOVED)[:, some], want) < 1e-3
+    # The grid matters by more than that.
+    assert worst(ShackHartmannModel(config, centred).zonal_matrix(MOVED)[:, some], want) > 5e-3
+
+
+def with_counts(config):
+    """A grid that knows how bright it is, and the threshold in the units of the optics."""
+    grid = replace(nominal_grid(config), counts=3600.0)
+    pupil = pupil_geometry(config)
+    n, p = pupil.n_sub, pupil.n_pix
+    light = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
+    bright = np.percentile(light[light > 0], 95)
+    return grid, config.sensor.threshold * 1023 / 3600.0 * bright
+
+
+def test_a_threshold_is_respected(config):
+    grid, cut = with_counts(config)
+    truth, some = Truth(config, grid, cut), np.arange(1, 97, 8)
+    shapes = surfaces(config, MOVED)
+    want = np.stack([truth.column(shapes[a]) for a in some], axis=1)
+    found = ShackHartmannModel(config, grid).zonal_matrix(MOVED)[:, some]
+    # Median over slopes: where a pixel crosses the threshold within the step, the difference has a kink.
+    error = np.linalg.norm(found - want, axis=1) / np.linalg.norm(want, axis=1)
+    assert np.median(error) < 2e-3
+    assert np.linalg.norm(found - want) < 0.015 * np.linalg.norm(want)
+    plain = ShackHartmannModel(config, nominal_grid(config)).zonal_matrix(MOVED)[:, some]
+    assert np.linalg.norm(plain - want) > 0.1 * np.linalg.norm(want)
+
+
+def test_motion_averages_over_where_the_spots_are(config):
+    grid, cut = with_counts(config)
+    grid = replace(grid, motion_px=0.5)
+    truth, shape = Truth(config, grid, cut), surfaces(config, MOVED)[48]
+    nodes, shares = np.polynomial.hermite_e.hermegauss(5)
+    shares = shares / shares.sum()
+    want = sum(
+        wx * wy * truth.column(shape, truth.tilt(0.5 * dx, 0.5 * dy))
+        for dx, wx in zip(nodes, shares, strict=True)
+        for dy, wy in zip(nodes, shares, strict=True)
+    )
+    found = ShackHartmannModel(config, grid).zonal_matrix(MOVED)[:, 48]
+    assert np.linalg.norm(found - want) < 5e-3 * np.linalg.norm(want)
+    still = ShackHartmannModel(config, replace(grid, motion_px=0.0)).zonal_matrix(MOVED)[:, 48]
+    assert np.linalg.norm(still - want) > 0.01 * np.linalg.norm(want)
+
+
+def test_weights_sum_to_the_response_to_tilts_and_ignore_piston(config):
+    grid, pupil = nominal_grid(config), pupil_geometry(config)
+    weights = slope_weights(config, grid, pupil)
+    assert set(weights) == set(STEPS)
+    truth = Truth(config, grid)
+    rows, columns = np.nonzero(grid.valid)
+    for x_px, y_px in ((1.0, 0.0), (0.3, -0.8)):
+        opd = truth.tilt(x_px, y_px)
+        blocks = opd.reshape(24, 8, 24, 8).transpose(0, 2, 1, 3)
+        found = np.zeros((2, grid.n_valid))
+        for (down, right), block in weights.items():
+            i, j = np.clip(rows + down, 0, 23), np.clip(columns + right, 0, 23)
+            found += np.einsum("akqp,kqp->ak", block, blocks[i, j])
+        want = (truth.slopes(0.01 * opd) - truth.slopes(-0.01 * opd)) / 0.02
+        assert worst(found.ravel(), want) < 1e-3
+        # Windows cut the spots' wings off: a centre of gravity shows less than the spot moves.
+        assert 0.7 < np.median(found[0]) / x_px < 1
+    largest = np.abs(weights[0, 0]).sum(axis=(2, 3)).max()
+    for block in weights.values():
+        # Each lenslet's own piston moves nothing, for the lenslets' light does not interfere.
+        assert np.abs(block.sum(axis=(2, 3))).max() < 1e-6 * largest
+
+
+def test_a_grid_of_another_size_is_refused(config):
+    grid = nominal_grid(config)
+    with pytest.raises(ValueError, match="23"):
+        ShackHartmannModel(config, replace(grid, valid=grid.valid[:23, :23]))

@@ -1,0 +1,102 @@
+"""SPRINT's normal equations against the Jacobian written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from escape_hw.calibration.misfit import normal_equations
+
+N_COMMON, N_SLOPES, N_ACT, N_MODES = 7, 11, 6, 5
+
+
+@pytest.fixture(scope="module")
+def case():
+    rng = np.random.default_rng(0)
+    return {
+        "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
+        "slopes_gain": rng.standard_normal((N_SLOPES, N_ACT)),
+        "slopes_width": rng.standard_normal((N_SLOPES, N_ACT)),
+        "modes": rng.standard_normal((N_ACT, N_MODES)),
+        "model": rng.standard_normal((N_SLOPES, N_MODES)),
+        "residual": rng.standard_normal((N_SLOPES, N_MODES)),
+        "precision": rng.uniform(0.5, 3, N_COMMON + 2 * N_ACT + N_SLOPES),
+        "offset": rng.standard_normal(N_COMMON + 2 * N_ACT + N_SLOPES),
+    }
+
+
+def jacobian(c):
+    """Derivatives of the matrix by every unknown ``(n_slopes * n_modes, n_unknowns)``."""
+    columns = list(c["common"])
+    for zonal in (c["slopes_gain"], c["slopes_width"]):
+        columns += [np.outer(zonal[:, a], c["modes"][a]) for a in range(N_ACT)]
+    for s in range(N_SLOPES):
+        one = np.zeros((N_SLOPES, N_MODES))
+        one[s] = c["model"][s]
+        columns.append(one)
+    return np.stack([column.ravel() for column in columns], axis=1)
+
+
+def test_the_system_is_that_of_the_dense_jacobian(case):
+    j = jacobian(case)
+    system = normal_equations(**case)
+    assert system.matrix == pytest.approx(j.T @ j + np.diag(case["precision"]), abs=1e-10)
+    assert system.right == pytest.approx(
+        j.T @ case["residual"].ravel() - case["precision"] * case["offset"], abs=1e-10
+    )
+    assert system.n_common == N_COMMON
+
+
+def test_its_solution_is_the_penalised_least_squares(case):
+    system = normal_equations(**case)
+    # Priors as additional data: each unknown measured once, with its prior's precision.
+    root = np.sqrt(case["precision"])
+    design = np.concatenate([jacobian(case), np.diag(root)])
+    data = np.concatenate([case["residual"].ravel(), -root * case["offset"]])
+    want = np.linalg.lstsq(design, data, rcond=None)[0]
+    assert np.linalg.solve(system.matrix, system.right) == pytest.approx(want, abs=1e-9)
+
+
+def test_the_callers_arrays_stay_as_they_were(case):
+    before = {name: values.copy() for name, values in case.items()}
+    normal_equations(**case).efficient()
+    assert all(np.array_equal(case[name], before[name]) for name in case)
+
+
+def test_efficient_derivatives_are_what_random_effects_cannot_imitate(case):
+    system = normal_equations(**case)
+    j, k = jacobian(case), N_COMMON
+    common, random = j[:, :k], j[:, k:]
+    prior = np.diag(case["precision"][k:])
+    imitation = np.linalg.solve(random.T @ random + prior, random.T @ common)
+    want = (common - random @ imitation).T.reshape(k, N_SLOPES, N_MODES)
+    assert system.efficient() == pytest.approx(want, abs=1e-10)
+
+
+def test_without_priors_they_are_orthogonal_to_every_random_effect(case):
+    # A vague prior binds nothing: what remains is the projection.
+    vague = {**case, "precision": np.full_like(case["precision"], 1e-9)}
+    vague["modes"] = np.random.default_rng(1).standard_normal((N_ACT, 40))
+    rng = np.random.default_rng(2)
+    for name in ("model", "residual"):
+        vague[name] = rng.standard_normal((N_SLOPES, 40))
+    vague["common"] = rng.standard_normal((N_COMMON, N_SLOPES, 40))
+    left = normal_equations(**vague).efficient()
+    for a in range(N_ACT):
+        for zonal in (vague["slopes_gain"], vague["slopes_width"]):
+            effect = np.outer(zonal[:, a], vague["modes"][a])
+            assert np.einsum("psm,sm->p", left, effect) == pytest.approx(np.zeros(N_COMMON), abs=1e-6)
+    assert np.einsum("psm,sm->ps", left, vague["model"]) == pytest.approx(
+        np.zeros((N_COMMON, N_SLOPES)), abs=1e-6
+    )
+
+
+def test_information_on_the_common_parameters_is_that_of_the_efficient_derivatives(case):
+    # Schur complement of the system == efficient scores' squares plus what the priors add.
+    system, k = normal_equations(**case), N_COMMON
+    a, b, c = system.matrix[:k, :k], system.matrix[:k, k:], system.matrix[k:, k:]
+    reduced = a - b @ np.linalg.solve(c, b.T)
+    imitation = np.linalg.solve(c, b.T)
+    left = system.efficient().reshape(k, -1)
+    priors = imitation.T @ (case["precision"][k:, None] * imitation) + np.diag(case["precision"][:k])
+    assert left @ left.T + priors == pytest.approx(reduced, abs=1e-9)
