@@ -52,6 +52,8 @@ class Bench:
         stream that a twin derives from the same seed.
     dark
         Dark frame of the sensor's camera in counts, once it was measured or set.
+    flat
+        Relative response of its pixels (mean 1), once it was set.
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class Bench:
         self.config = config
         self.dm, self.wfs, self.science, self.screen = dm, wfs, science, screen
         self.dark: NDArray[np.float32] | None = None
+        self.flat: NDArray[np.float32] | None = None
         self._threads: threadpool_limits | None = None
         stream = zlib.crc32(b"escape_hw.bench")
         self.rng = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(stream,)))

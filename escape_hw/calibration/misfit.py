@@ -43,8 +43,8 @@ class Priors:
 class NormalEquations:
     """Gauss-Newton system of one linearisation, in units of the data's standard errors.
 
-    The unknowns are, in order: the common parameters (gain, five of the registration, width,
-    shape), actuator gains, actuator widths, slope gains.
+    The unknowns are, in order: the common parameters (gain, five of the registration, width, shape,
+    shares of the model's variants, sampling positions), actuator gains, actuator widths, slope gains.
     """
 
     matrix: NDArray[np.float64]

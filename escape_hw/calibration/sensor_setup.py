@@ -62,6 +62,8 @@ def setup_from_frames(
     sensor = bench.config.sensor
     background = background_level(mean_frame, sensor.spot_px) if bench.dark is None else 0.0
     clean = mean_frame - (background if bench.dark is None else bench.dark)
+    if bench.flat is not None:
+        clean = clean / bench.flat
     grid = find_grid(
         clean.astype(np.float32),
         n_sub=sensor.n_sub,
@@ -88,15 +90,15 @@ def extractor(bench: Bench, grid: SubApertureGrid) -> SlopeExtractor:
     centres, half = grid.centres_px(), grid.pitch_px / 2
     if (centres < half - 1).any() or (centres > np.array(shape[::-1]) - half).any():
         raise IncompatibleProduct(
-            f"the lenslet grid reaches beyond the camera's region of {region.width} x {region.height} pixels; "
-            "it was found on another region, so measure again"
+            "the lenslet grid reaches beyond the camera's region of "
+            f"{region.width} x {region.height} pixels; it was found on another region, so measure again"
         )
     if bench.dark is not None and bench.dark.shape != shape:
         raise CalibrationError(
             f"the dark frame has shape {bench.dark.shape}, the camera delivers {shape}; measure it again"
         )
     dark = bench.dark if bench.dark is not None else np.full(shape, grid.background, np.float32)
-    return SlopeExtractor(grid, shape, dark=dark, threshold=threshold_counts(bench))
+    return SlopeExtractor(grid, shape, dark=dark, flat=bench.flat, threshold=threshold_counts(bench))
 
 
 def find_sensor(

@@ -118,6 +118,10 @@ class OOPAOModel:
             out[:, start : start + _BATCH] = self._slopes(mirror, part) - self._slopes(mirror, -part)
         return out * (self._dm.stroke_m / (2 * STEP_M))
 
+    def variants(self) -> list[OOPAOModel]:
+        """None: spots at rest leave nothing in doubt, see :class:`SyntheticModel`."""
+        return []
+
     def _slopes(self, mirror: Any, paths_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Spot positions ``(n_slopes, n)`` in camera pixels for mirror shapes ``(n_act, n)``."""
         n = paths_m.shape[1]
