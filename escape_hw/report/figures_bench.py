@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from escape_hw.api.results import LoopResult, StrehlEstimate, TemporalResponse
@@ -193,6 +193,7 @@ def residual_strip(loops: Mapping[str, LoopResult]) -> Figure:
     style.tidy(axes).set(xlabel="bench time [s]", ylabel="residual wavefront [nm rms]")
     # The wavefront before closing is ten times larger; a linear scale would show nothing else.
     axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter(ScalarFormatter())
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.margins(x=0.01)

@@ -116,7 +116,8 @@ def test_page_shows_everything(page):
     for word in (
         "SIMULATED", "SPRINT convergence", "Stacked closed-loop PSFs", "Interaction matrices", "Sky time",
         "Residual wavefront", "last mirror command", "Mean sensor frame", "best gain", "a missed one",
-        "α SHORT", "planted", "Signal-to-noise", "Temporal response", "Configuration", "&lt;script&gt;alert(1)",
+        "α SHORT", "planted", "Signal-to-noise", "Temporal response", "Configuration",
+        "&lt;script&gt;alert(1)",
     ):  # fmt: skip
         assert word in page, word
     assert page.count("<figure>") == 11
