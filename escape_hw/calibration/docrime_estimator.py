@@ -20,6 +20,7 @@ from escape_hw.calibration.response import (
     fit_response,
     usable_rows,
 )
+from escape_hw.calibration.significance import require_response, spread
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.whitening import apply_filter, prediction_error_filter
 from escape_hw.errors import CalibrationError, TooFewFrames
@@ -91,6 +92,7 @@ class DocrimeEstimator:
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
         self._tracker: ResponseTracker | None = None
+        self._spread = 1.0
         self._sums = RegressionSums.zeros(n_slopes, n_modes, correlations=correlations)
         self.frames = self.lost_frames = 0
 
@@ -199,8 +201,10 @@ class DocrimeEstimator:
         _require_excitation(sums.gram)
         matrix = sums.solve()
         covariance = sums.residual_power(matrix) / (sums.count - self.n_modes - self.lags)
+        if covariance.ndim == 2 and self.order:
+            require_response(sums.gram, matrix, covariance, self.lags)
         covariance = covariance if covariance.ndim == 2 else np.diag(covariance)
-        variance = np.maximum(np.diag(covariance), 0.0)
+        variance = np.maximum(np.diag(covariance), 0.0) * self._spread
         sigma = np.sqrt(np.outer(variance, np.diag(np.linalg.inv(sums.gram))))
         scale = self._tracker.scale()
         return DocrimeSolution(
@@ -263,7 +267,24 @@ class DocrimeEstimator:
             residuals, usable = self._residuals(few, difference, response)
             whitener = prediction_error_filter(residuals, usable, self.order)
             response = fit_response(data, whitener, self.lags)
+        else:
+            self._spread = self._plain_spread(few, difference, response)
         self._whitener, self._response = whitener, response
+
+    def _plain_spread(
+        self, few: Telemetry, difference: NDArray[np.float64], response: TemporalResponse
+    ) -> float:
+        """Factor on the plain estimator's variance; the differences must show that there is a response."""
+        slopes, pokes, now = filtered(few, difference, self.lags)
+        seen = apply_filter(pokes, response.weights, now)
+        sums = RegressionSums.zeros(slopes.shape[1], self.n_modes, correlations=True)
+        matrix = sums.add(slopes, seen).centred().solve()
+        left = slopes - seen @ matrix.T.astype(np.float32)
+        covariance = left.T @ left / (len(left) - self.n_modes - self.lags)
+        require_response(sums.gram, matrix, covariance * spread(left, seen, now, self.lags), self.lags)
+        residuals, usable = self._residuals(few, difference, response)
+        at = np.flatnonzero(usable)
+        return spread(residuals[at], apply_filter(few.pokes, response.weights, at), at, self.lags)
 
     def _residuals(
         self, data: Telemetry, whitener: NDArray[np.float64], response: TemporalResponse
@@ -288,3 +309,4 @@ def _require_excitation(gram: NDArray[np.floating]) -> None:
         raise CalibrationError(
             "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
         )
+

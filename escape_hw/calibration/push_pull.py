@@ -9,7 +9,7 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import LightWatch, Motion, measured_matrix, next_frame, some_frames
+from escape_hw.calibration.acquire import LightWatch, Motion, go_to, measured_matrix, next_frame, some_frames
 from escape_hw.calibration.sensor_setup import extractor, find_sensor, modal_basis, poke_amplitudes
 from escape_hw.errors import Aborted, CalibrationError
 from escape_hw.pipeline.slopes import SlopeExtractor
@@ -29,8 +29,8 @@ def settling_frames(bench: Bench, slopes_of: SlopeExtractor, command: NDArray[np
         The sensor does not respond to the mirror.
     """
     reference = np.mean([slopes_of(next_frame(bench).data) for _ in range(10)], axis=0)
-    bench.dm.send(command)
     try:
+        go_to(bench.dm, command)
         steps = np.array([slopes_of(next_frame(bench).data) - reference for _ in range(_STEP_FRAMES)])
     finally:
         bench.dm.flatten()
@@ -147,8 +147,8 @@ def _one_mode(
     """Column and its standard errors for one mode, each ``(n_slopes,)``."""
     means, variances, sent = [], [], []
     for sign in (1.0, -1.0):
-        report = bench.dm.send(sign * amplitude * shape)
-        # What the guard cut off was not poked: the amplitude is that of the shape really sent.
+        report = go_to(bench.dm, sign * amplitude * shape)
+        # What the limits took off was not poked: the amplitude is that of the shape really sent.
         sent.append(float(report.sent @ shape / (shape @ shape)))
         for _ in range(skip):
             next_frame(bench)
