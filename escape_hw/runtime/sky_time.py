@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -126,10 +127,8 @@ def sky_time(
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
         results = pool.imap_unordered(_job, jobs)
         while len(done) < plants:
-            try:
+            with contextlib.suppress(multiprocessing.TimeoutError):
                 done.append(results.next(timeout=_PATIENCE_S))
-            except multiprocessing.TimeoutError:
-                pass
             if report.due():
                 yield report(len(done))
     return summary(done, frames)
