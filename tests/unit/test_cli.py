@@ -477,3 +477,7 @@ def test_show_compare_report(escape, document, im, tmp_path):
     # The run's log, shown in the report, has grown since; the figures are the same to the byte.
     assert (moved / "report.html").read_text().split("<h2>Origin")[0] == before.split("<h2>Origin")[0]
     assert document("show", moved)[1]["command"] == "calibrate"
+    # A calibration alone has no image to draw.
+    code, _, err = escape("report", moved, "--picture", tmp_path / "picture.png")
+    assert code == 2
+    assert "holds no matrix or no closed-loop image" in err
