@@ -12,7 +12,14 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import LightWatch, Motion, measured_matrix, next_frame, reachable, some_frames
+from escape_hw.calibration.acquire import (
+    LightWatch,
+    Motion,
+    measured_matrix,
+    next_frame,
+    reachable,
+    some_frames,
+)
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator, DocrimeSolution
 from escape_hw.calibration.sensor_setup import (
     SETUP_FRAMES,

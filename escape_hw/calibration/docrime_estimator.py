@@ -309,4 +309,3 @@ def _require_excitation(gram: NDArray[np.floating]) -> None:
         raise CalibrationError(
             "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
         )
-

@@ -52,9 +52,7 @@ def require_response(
         )
 
 
-def spread(
-    noise: NDArray[np.floating], seen: NDArray[np.floating], at: NDArray[np.intp], lags: int
-) -> float:
+def spread(noise: NDArray[np.floating], seen: NDArray[np.floating], at: NDArray[np.intp], lags: int) -> float:
     """Factor on the variance of a regression whose noise is not white.
 
     A poke that shows in several frames meets nearly the same turbulence in all of them:

@@ -369,7 +369,8 @@ def _estimate(
     )
     if explained < _EXPLAINED * max(expected, 0.0) or np.vdot(model, problem.data) <= 0:
         warnings.append(
-            f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves {max(expected, 0.0):.0%} "
+            f"the model explains {max(explained, 0.0):.0%} of the matrix "
+            f"where noise leaves {max(expected, 0.0):.0%} "
             "to explain; wrong layout, flip or basis, or a registration beyond capture"
         )
     sigma = np.sqrt(np.diag(covariance))
