@@ -140,6 +140,25 @@ class DeformableMirror(Device):
             return SendReport(safe, self.now_ns(), report)
 
     @final
+    def allowed_share(self, command: ArrayLike) -> float:
+        """Largest factor, at most 1, with which a shape breaks no limit by itself (slew apart).
+
+        A measurement that must know the form of what it sends scales by it, instead of having
+        single actuators cut off. Sends nothing.
+
+        Parameters
+        ----------
+        command
+            ``(n_act,)`` real numbers, fractions of full stroke.
+
+        Raises
+        ------
+        CommandRejected
+            Malformed or not finite.
+        """
+        return self._checked().allowed_share(command)
+
+    @final
     def flatten(self) -> None:
         """Ramp to the flat shape in steps of at most :data:`RAMP_STEP`; legal whenever open.
 

@@ -80,6 +80,12 @@ class Reporter:
         self.stage, self.total, self.unit = stage, total, unit
         self._start = time.monotonic()
         self._next = self._start
+        self._done = 0
+
+    def step(self, **metrics: float) -> Progress | None:
+        """Count one step; the progress to yield when one is due, else ``None``."""
+        self._done += 1
+        return self(self._done, **metrics) if self.due() else None
 
     def due(self) -> bool:
         """True when the next progress may be yielded."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.frames import Frame
 from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.mirror import DeformableMirror, SendReport
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
 from escape_hw.errors import CalibrationError, ConfigError
@@ -108,6 +109,45 @@ class Motion:
         stretch = float((weight[:, None] * lever * (mean - shift)).sum() / (weight[:, None] * lever**2).sum())
         lattice = shift + stretch * lever
         return replace(grid, references_px=(grid.references_px + lattice).astype(np.float32))
+
+
+def reachable(dm: DeformableMirror, shape: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The command nearest to a shape that the mirror may take at once, on the way there.
+
+    The shape is scaled to obey the limits, and the way to it cut short by the slew limit, so what is
+    sent stays in the span of the modes that shape and present shape are made of. The guard would cut
+    off single actuators, and the rest would pass for a response of the modes.
+
+    Parameters
+    ----------
+    dm
+        The mirror.
+    shape
+        ``(n_act,)``.
+    """
+    now, target = dm.shape, shape * dm.allowed_share(shape)
+    slew, furthest = dm.limits.max_slew, float(np.abs(target - now).max(initial=0.0))
+    if slew is None or furthest <= slew:
+        return target
+    return np.asarray(now + (target - now) * (slew / furthest))
+
+
+def go_to(dm: DeformableMirror, shape: NDArray[np.float64]) -> SendReport:
+    """Take a shape, scaled to obey the limits, in as many commands as the slew limit asks for.
+
+    Returns
+    -------
+    SendReport
+        Of the last command; its ``sent`` is the shape that the mirror has.
+    """
+    while True:
+        before = dm.shape
+        report = dm.send(reachable(dm, shape))
+        if not np.any(report.sent != before) or dm.limits.max_slew is None:
+            return report
+        left = shape * dm.allowed_share(shape) - report.sent
+        if float(np.abs(left).max(initial=0.0)) <= 1e-9:
+            return report
 
 
 def next_frame(bench: Bench) -> Frame:

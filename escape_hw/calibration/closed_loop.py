@@ -21,7 +21,7 @@ from escape_hw.errors import Aborted, CalibrationError, ConfigError, Incompatibl
 from escape_hw.pipeline.integrator import LeakyIntegrator, gain_limit
 from escape_hw.pipeline.reconstructor import reconstructor
 from escape_hw.pipeline.slopes import SlopeExtractor
-from escape_hw.pipeline.strehl import has_light, strehl
+from escape_hw.pipeline.strehl import has_light, strehl, without_background
 
 #: Seconds after closing during which the science frames do not count.
 _CLOSING_S = 0.3
@@ -30,7 +30,7 @@ _SATURATED = 0.2
 #: ... for this many frames in a row.
 _SATURATED_FRAMES = 50
 #: Shares of the stable limit that the search for the best gain tries.
-GAIN_SHARES = (0.15, 0.25, 0.35, 0.45, 0.55, 0.65)
+GAIN_SHARES = (0.25, 0.35, 0.45, 0.55, 0.65, 0.75)
 #: Delay assumed for the gain's limit when the matrix does not carry a measured one.
 _USUAL_DELAY = 2.0
 
@@ -73,7 +73,7 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
                 yield report(done + 1)
     finally:
         science.stop()
-    image = (total / frames).astype(np.float32)
+    image = _clean(total / frames)
     if not has_light(image):
         raise CalibrationError(
             f"{science.name}: no light on the science camera; check the source, the beam stop and the region"
@@ -161,6 +161,11 @@ def closed_loop(
     seconds = max((bench.wfs.now_ns() - started) * 1e-9, 1e-9)
     ratio: StrehlEstimate | None = None
     notes = ["the loop diverged and was opened"] if record.diverged else []
+    if science is not None:
+        # The first frame or two after closing do not count.
+        expected = int((seconds - _CLOSING_S) * science.settings.frame_rate_hz) - 2
+        if len(record.science) < expected / 2:
+            notes.append(f"only {len(record.science)} of about {expected} frames came from {science.name}")
     if science is not None and model_psf is not None and record.science and not record.diverged:
         try:
             ratio = strehl(np.array(record.science, dtype=np.float32), model_psf)
@@ -174,7 +179,7 @@ def closed_loop(
         stable=not record.diverged and _steady(residual),
         residual_rms_nm=float(np.sqrt(np.mean(np.square(settled)))) if settled.size else math.nan,
         strehl=ratio, latency_us=_percentiles(record.latency),
-        psf=np.mean(record.science, axis=0).astype(np.float32) if record.science else None,
+        psf=_clean(np.mean(record.science, axis=0)) if record.science else None,
         model_psf=model_psf, residual_nm=residual[:: max(1, residual.size // 2000)],
         last_command=record.command, last_frame=None if record.last is None else record.last.data,
         partial=partial, notes=tuple(notes),
@@ -219,6 +224,10 @@ def _run(
                 record.science.append(image.data)
         if report.due():
             yield report(done + 1, residual_nm=record.residual[-1], gain=float(control.gain))
+
+
+def _clean(image: NDArray[np.floating]) -> NDArray[np.float32]:
+    return without_background(image).astype(np.float32)
 
 
 def _steady(residual: NDArray[np.float32]) -> bool:

@@ -12,7 +12,14 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import LightWatch, Motion, measured_matrix, next_frame, some_frames
+from escape_hw.calibration.acquire import (
+    LightWatch,
+    Motion,
+    measured_matrix,
+    next_frame,
+    reachable,
+    some_frames,
+)
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator, DocrimeSolution
 from escape_hw.calibration.sensor_setup import (
     SETUP_FRAMES,
@@ -148,19 +155,20 @@ def docrime_run(
         correlations,
     )  # fmt: skip
     session.kept = [] if record else None
-    clipped, partial = 0, False
+    shortened, partial = 0, False
     report = Reporter("DO-CRIME", n_frames)
     try:
         bench.dm.flatten()
         try:
             for done in range(n_frames):
                 frame = next_frame(bench)
-                sent = bench.dm.send(m2c @ (amplitude * bench.rng.uniform(-1.0, 1.0, m2c.shape[1])))
-                clipped += sent.guard.clipped
-                # What was really sent, not what was asked for: a clipped poke is still a known poke.
-                session.take(frame, to_modes @ sent.sent)
+                wanted = m2c @ (amplitude * bench.rng.uniform(-1.0, 1.0, m2c.shape[1]))
+                allowed = reachable(bench.dm, wanted)
+                shortened += not np.array_equal(wanted, allowed)
+                # What was really sent, not what was asked for: a shortened poke is still a known poke.
+                session.take(frame, to_modes @ bench.dm.send(allowed).sent)
                 if report.due():
-                    yield report(done + 1, clipped=float(clipped))
+                    yield report(done + 1, shortened=float(shortened))
         except Aborted:
             partial = True
     finally:
@@ -179,7 +187,7 @@ def docrime_run(
         bench, session.grid, m2c, solution.matrix, solution.sigma,
         "docrime-whitened" if whiten else "docrime",
         frames=solution.frames, lost_frames=solution.lost_frames, poke=float(poke),
-        clipped=clipped, delay_frames=response.delay, whitening_order=solution.whitener.size - 1,
+        shortened=shortened, delay_frames=response.delay, whitening_order=solution.whitener.size - 1,
     )  # fmt: skip
     notes = []
     if float(np.median(matrix.snr())) < 1:

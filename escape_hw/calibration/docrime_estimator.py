@@ -15,12 +15,14 @@ from scipy.linalg import lapack
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.regression import RegressionSums
 from escape_hw.calibration.response import (
+    SLOPES,
     ResponseTracker,
     autocovariance,
     filtered,
     fit_response,
     usable_rows,
 )
+from escape_hw.calibration.significance import require_response, spread
 from escape_hw.calibration.telemetry import Recorder, Telemetry
 from escape_hw.calibration.whitening import apply_filter, prediction_error_filter
 from escape_hw.errors import CalibrationError, TooFewFrames
@@ -87,6 +89,7 @@ class DocrimeEstimator:
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
         self._tracker: ResponseTracker | None = None
+        self._spread = 1.0
         self._sums = RegressionSums.zeros(n_slopes, n_modes, correlations=correlations)
         self.frames = self.lost_frames = 0
 
@@ -196,9 +199,13 @@ class DocrimeEstimator:
         sums = self._sums.centred()
         _require_excitation(sums.gram)
         matrix = sums.solve()
-        covariance = sums.residual_power(matrix) / (sums.count - self.n_modes - self.lags)
+        freedom = sums.count - self.n_modes - self.lags
+        if self.order:
+            rows, power = sums.sample(matrix)
+            require_response(sums.gram, rows, power / freedom, self.lags)
+        covariance = sums.residual_power(matrix) / freedom
         covariance = covariance if covariance.ndim == 2 else np.diag(covariance)
-        variance = np.maximum(np.diag(covariance), 0.0)
+        variance = np.maximum(np.diag(covariance), 0.0) * self._spread
         sigma = np.outer(np.sqrt(variance), np.sqrt(sums.inverse_diagonal()))
         scale = self._tracker.scale()
         return DocrimeSolution(
@@ -253,13 +260,32 @@ class DocrimeEstimator:
             return
         _require_excitation(data.pokes.T @ data.pokes)
         # Differences tell the response well even where the plain estimator is asked for.
-        difference, few = np.array([1.0, -1.0]), data.thinned(_FEW_SLOPES)
+        difference, few = np.array([1.0, -1.0]), data.thinned(_FEW_SLOPES if self.order else SLOPES)
         response, whitener = fit_response(few, difference, self.lags), np.ones(1)
         if self.order:
             residuals, usable = self._residuals(few, difference, response)
             whitener = prediction_error_filter(residuals, usable, self.order)
             response = fit_response(data, whitener, self.lags)
+        else:
+            self._spread = self._plain_spread(few, difference, response)
         self._whitener, self._response = whitener, response
+
+    def _plain_spread(
+        self, few: Telemetry, difference: NDArray[np.float64], response: TemporalResponse
+    ) -> float:
+        """Factor on the plain estimator's variance; the differences must show that there is a response."""
+        block = filtered(few, difference, self.lags)
+        slopes, seen, now = block.slopes, block.pokes_through(response.weights), block.now
+        sums = RegressionSums.zeros(slopes.shape[1], self.n_modes, correlations=True)
+        matrix = sums.add(slopes, seen).centred().solve()
+        left = slopes - seen @ matrix.T.astype(np.float32)
+        covariance = left.T @ left / (len(left) - self.n_modes - self.lags)
+        require_response(sums.gram, matrix, covariance * spread(left, seen, now, self.lags), self.lags)
+        residuals, usable = self._residuals(few, difference, response)
+        at = np.flatnonzero(usable)
+        return spread(
+            residuals[at], apply_filter(few.rows, response.weights, at, few.n_slopes), at, self.lags
+        )
 
     def _residuals(
         self, data: Telemetry, whitener: NDArray[np.float64], response: TemporalResponse

@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.model import SyntheticModel
-from escape_hw.api.procedure import Procedure
+from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix
 from escape_hw.calibration.docrime import docrime_run
-from escape_hw.calibration.sprint import sprint
+from escape_hw.calibration.sprint import sprint_steps
+from escape_hw.errors import Aborted
 
 #: Half steps for the propagation of the registration's errors, in its units.
 _STEPS = (1.0, 1.0, 0.05, 0.1, 0.1)
@@ -96,7 +97,8 @@ def escape(
     -------
     CalibrationResult
         ``matrix`` is pseudo-synthetic, ``measured`` the DO-CRIME matrix behind it, ``registration``
-        what SPRINT found; ``registration.converged`` says whether to trust it.
+        what SPRINT found; ``registration.converged`` says whether to trust it. Stopped early,
+        ``matrix`` is the DO-CRIME matrix, ``partial`` is true and ``registration`` is ``None``.
 
     Raises
     ------
@@ -105,13 +107,19 @@ def escape(
     """
     run = yield from docrime_run(bench, frames=frames, poke=poke, grid=grid, whiten=whiten)
     measured, c = run.result, bench.config.calibration
-    estimate = sprint(
-        measured.matrix,
-        bench.model(measured.grid),
-        modes=min(c.sprint_modes, measured.matrix.n_modes),
-        learning_rate=c.learning_rate,
-        covariance=run.solution.covariance,
-    )
+    if measured.partial:
+        return measured
+    try:
+        yield Reporter("synthetic model", 1, "model")(0)
+        estimate = yield from sprint_steps(
+            measured.matrix,
+            bench.model(measured.grid),
+            modes=min(c.sprint_modes, measured.matrix.n_modes),
+            learning_rate=c.learning_rate,
+            covariance=run.solution.covariance,
+        )
+    except Aborted:
+        return replace(measured, partial=True)
     made = synthesise(bench, measured.grid, estimate, measured.matrix.m2c)
     metrics = {**measured.matrix.metrics, **made.matrix.metrics}
     return replace(

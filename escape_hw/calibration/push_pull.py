@@ -9,7 +9,7 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import LightWatch, Motion, measured_matrix, next_frame, some_frames
+from escape_hw.calibration.acquire import LightWatch, Motion, go_to, measured_matrix, next_frame, some_frames
 from escape_hw.calibration.sensor_setup import extractor, find_sensor, modal_basis, poke_amplitudes
 from escape_hw.errors import Aborted, CalibrationError
 from escape_hw.pipeline.slopes import SlopeExtractor
@@ -28,13 +28,13 @@ def settling_frames(bench: Bench, slopes_of: SlopeExtractor, command: NDArray[np
     CalibrationError
         The sensor does not respond to the mirror.
     """
-    reference = np.mean([slopes_of(next_frame(bench).data) for _ in range(10)], axis=0)
-    bench.dm.send(command)
+    report = Reporter("test step", _STEP_FRAMES)
+    reference = (yield from _slopes(bench, slopes_of, _STEP_FRAMES // 3, report)).mean(axis=0)
     try:
-        steps = np.array([slopes_of(next_frame(bench).data) - reference for _ in range(_STEP_FRAMES)])
+        go_to(bench.dm, command)
+        steps = (yield from _slopes(bench, slopes_of, _STEP_FRAMES, report)) - reference
     finally:
         bench.dm.flatten()
-    yield Reporter("test step", 1, "step")(1)
     end = steps[_STEP_FRAMES // 2 :]
     direction = end.mean(axis=0)
     response = steps @ direction / float(direction @ direction)
@@ -105,16 +105,14 @@ def push_pull(
         errors: list[NDArray[np.float64]] = []
         partial = False
         motion, light = Motion(grid.n_slopes), LightWatch(bench.wfs.name, grid)
-        report = Reporter("push-pull", m2c.shape[1], "mode")
+        report = Reporter("push-pull", m2c.shape[1] * 2 * (skip + n_frames))
         try:
             for mode in range(m2c.shape[1]):
-                column, error = _one_mode(
-                    bench, slopes_of, m2c[:, mode], amplitude[mode], skip, n_frames, motion, light
+                column, error = yield from _one_mode(
+                    bench, slopes_of, m2c[:, mode], amplitude[mode], skip, n_frames, motion, light, report
                 )
                 columns.append(column)
                 errors.append(error)
-                if report.due():
-                    yield report(mode + 1)
         except Aborted:
             if not columns:
                 raise
@@ -143,25 +141,38 @@ def _one_mode(
     frames: int,
     motion: Motion,
     light: LightWatch,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    report: Reporter,
+) -> Procedure[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Column and its standard errors for one mode, each ``(n_slopes,)``."""
     means, variances, sent = [], [], []
     for sign in (1.0, -1.0):
-        report = bench.dm.send(sign * amplitude * shape)
-        # What the guard cut off was not poked: the amplitude is that of the shape really sent.
-        sent.append(float(report.sent @ shape / (shape @ shape)))
-        for _ in range(skip):
-            next_frame(bench)
-        stack = np.empty((frames, motion.n_slopes))
-        for row in stack:
-            row[:] = slopes = slopes_of(next_frame(bench).data)
+        # What the limits took off was not poked: the amplitude is that of the shape really sent.
+        taken = go_to(bench.dm, sign * amplitude * shape).sent
+        sent.append(float(taken @ shape / (shape @ shape)))
+        stack = (yield from _slopes(bench, slopes_of, skip + frames, report, light))[skip:]
+        for slopes in stack:
             motion.add(slopes)
-            light(slopes_of.flux)
-        means.append(stack.mean(axis=0))
+        means.append(stack.mean(axis=0, dtype=np.float64))
         variances.append(
-            stack.var(axis=0, ddof=1) / frames if frames > 1 else np.full(stack.shape[1], np.nan)
+            stack.var(axis=0, ddof=1, dtype=np.float64) / frames
+            if frames > 1
+            else np.full(stack.shape[1], np.nan)
         )
     span = sent[0] - sent[1]
     if not span > 0:
         raise CalibrationError("a poke was clipped away entirely; lower calibration.push_pull_poke")
     return (means[0] - means[1]) / span, np.sqrt(variances[0] + variances[1]) / span
+
+
+def _slopes(
+    bench: Bench, slopes_of: SlopeExtractor, frames: int, report: Reporter, light: LightWatch | None = None
+) -> Procedure[NDArray[np.float32]]:
+    """Slopes of the next frames ``(frames, n_slopes)``; ``report`` counts them on."""
+    stack = np.empty((frames, slopes_of.grid.n_slopes), np.float32)
+    for row in stack:
+        row[:] = slopes_of(next_frame(bench).data)
+        if light is not None:
+            light(slopes_of.flux)
+        if progress := report.step():
+            yield progress
+    return stack

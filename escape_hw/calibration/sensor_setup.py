@@ -155,17 +155,23 @@ def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.flo
 def modal_basis(bench: Bench) -> NDArray[np.float64]:
     """Mode-to-command matrix ``(n_act, n_modes)`` that the configuration asks for.
 
+    Disabled actuators take no part: the modes are those of the others.
+
     Raises
     ------
     ConfigError
-        The basis does not fit the mirror.
+        The basis does not fit the mirror, or moves disabled actuators.
+    CalibrationError
+        More modes than the actuators that work can make.
     """
     basis, model = bench.config.basis, bench.model()
     surfaces, pupil, pixel = model.influence_functions()
     if surfaces.shape[0] != bench.dm.info.n_act:
         raise ConfigError(f"the model has {surfaces.shape[0]} actuators, the mirror {bench.dm.info.n_act}")
+    works = np.ones(surfaces.shape[0], dtype=bool)
+    works[list(bench.dm.limits.disabled)] = False
     if basis.kind == "zonal":
-        return zonal(surfaces, pupil, basis.n_modes)
+        return _spread_over(works, zonal(surfaces[works], pupil, basis.n_modes))
     if basis.kind == "file":
         # Imported here: astropy takes a second to load, and only this needs it.
         from escape_hw.io.fits import load_matrix
@@ -176,8 +182,20 @@ def modal_basis(bench: Bench) -> NDArray[np.float64]:
                 f"basis.file holds {m2c.shape[0]} actuators and {m2c.shape[1]} modes; "
                 f"{surfaces.shape[0]} and at least {basis.n_modes} are needed"
             )
+        if m2c[~works, : basis.n_modes].any():
+            raise ConfigError(
+                "the modes of basis.file move actuators that devices.dm.limits.disabled keeps at zero"
+            )
         return unit_rms(m2c[:, : basis.n_modes], surfaces, pupil)
-    return karhunen_loeve(surfaces, pupil, pixel, basis.n_modes, _OUTER_SCALE * bench.config.system.pupil_m)
+    outer_scale_m = _OUTER_SCALE * bench.config.system.pupil_m
+    return _spread_over(works, karhunen_loeve(surfaces[works], pupil, pixel, basis.n_modes, outer_scale_m))
+
+
+def _spread_over(works: NDArray[np.bool_], m2c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Modes of the actuators that work as modes of the whole mirror."""
+    whole = np.zeros((works.size, m2c.shape[1]))
+    whole[works] = m2c
+    return whole
 
 
 def poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
+from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, SprintIteration
 from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
@@ -30,6 +31,8 @@ _WIDTH_STEP = 0.05
 #: Width of the broad pedestal that influence functions may stand on, relative to their own.
 _PEDESTAL = 1.7
 _GAIN, _WIDTH, _SHAPE = 0, 6, 7
+#: Share of what noise leaves to explain that the model must explain to be believed.
+_EXPLAINED = 0.8
 #: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
 #: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
 _FLOOR = np.array([0.05, 0.05, 5e-4, 0.03, 0.012])
@@ -239,15 +242,41 @@ def sprint(
     ValueError
         A learning rate outside (0, 1].
     """
+    steps = sprint_steps(
+        matrix, model, modes=modes, learning_rate=learning_rate, start=start,
+        max_iterations=max_iterations, covariance=covariance, priors=priors,
+    )  # fmt: skip
+    while True:
+        try:
+            next(steps)
+        except StopIteration as done:
+            estimate: RegistrationEstimate = done.value
+            return estimate
+
+
+def sprint_steps(
+    matrix: InteractionMatrix,
+    model: SyntheticModel,
+    *,
+    modes: NDArray[np.intp] | int | None = None,
+    learning_rate: float = 1.0,
+    start: Registration | None = None,
+    max_iterations: int = 25,
+    covariance: NDArray[np.float64] | None = None,
+    priors: Priors | None = None,
+) -> Procedure[RegistrationEstimate]:
+    """As :func:`sprint`, iteration by iteration, so that it can be watched and stopped."""
     if not 0 < learning_rate <= 1:
         raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
     columns = _columns(matrix, modes)
     _check_fit(matrix, model)
+    if not np.isfinite(matrix.data[:, columns]).all():
+        raise CalibrationError("the interaction matrix is not finite; measure it again")
+    if not matrix.data[:, columns].any():
+        raise CalibrationError("the interaction matrix is zero; does the sensor see the mirror?")
     problem = _Problem(matrix, model, columns, priors or Priors())
     if not np.isfinite(problem.data).all():
-        raise CalibrationError(
-            "the interaction matrix or its standard errors are not finite; measure it again"
-        )
+        raise CalibrationError("the interaction matrix's standard errors are not finite; measure it again")
     if problem.measured_errors and float(matrix.snr()[columns].max()) < 0.1:
         raise CalibrationError(
             "the interaction matrix holds nothing but noise; use more frames or larger pokes"
@@ -255,9 +284,14 @@ def sprint(
     state = problem.start(start or Registration())
     history: list[SprintIteration] = []
     settled = False
+    report = Reporter("SPRINT", max_iterations, "iteration")
     for _ in range(max_iterations):
+        if progress := report.step():
+            yield progress
         system = problem.linearise(state)
         step = np.linalg.solve(system.matrix, system.right)
+        if not np.isfinite(step).all():
+            break
         spread = np.sqrt(np.abs(np.diag(np.linalg.inv(_reduced(system)))))[1:6]
         relative = np.abs(step[1:6]) / np.maximum(_SMALL, 0.02 * spread)
         history.append(_record(state, system, float(np.linalg.norm(step[1:6] / _LARGEST))))
@@ -274,6 +308,8 @@ def _columns(matrix: InteractionMatrix, modes: NDArray[np.intp] | int | None) ->
     if modes is None:
         return np.arange(matrix.n_modes)
     if isinstance(modes, int):
+        if modes < 1:
+            raise ValueError(f"modes is {modes}; at least one is needed")
         return choose_modes(matrix, min(modes, matrix.n_modes))
     columns = np.asarray(modes, dtype=np.intp)
     if columns.size == 0 or columns.min() < 0 or columns.max() >= matrix.n_modes:
@@ -359,9 +395,10 @@ def _estimate(
     expected = (
         1 - problem.data.size / float(np.square(problem.data).sum()) if problem.measured_errors else 1.0
     )
-    if explained < 0.5 * max(expected, 0.0) or np.vdot(model, problem.data) <= 0:
+    if explained < _EXPLAINED * max(expected, 0.0) or np.vdot(model, problem.data) <= 0:
         warnings.append(
-            f"the model explains {explained:.0%} of the matrix where noise leaves {max(expected, 0.0):.0%} "
+            f"the model explains {max(explained, 0.0):.0%} of the matrix "
+            f"where noise leaves {max(expected, 0.0):.0%} "
             "to explain; wrong layout, flip or basis, or a registration beyond capture"
         )
     sigma = np.sqrt(np.diag(covariance))

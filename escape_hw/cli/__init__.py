@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 
@@ -9,4 +10,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``escape``; ends the process with the command's exit code."""
     from escape_hw.cli.app import run
 
-    run(arguments)
+    try:
+        run(arguments)
+    except SystemExit as ended:
+        # Only where the process is ours alone, and somebody has pressed Ctrl-C and waits.
+        if arguments is None and ended.code == 130:
+            _leave_at_once(130)
+        raise
+
+
+def _leave_at_once(code: int) -> None:
+    """End the process without taking the interpreter apart, which takes a second with all loaded.
+
+    The devices are closed and the files written; what was registered to happen at exit happens.
+    """
+    import atexit
+    import logging
+    import os
+
+    atexit._run_exitfuncs()  # noqa: SLF001 - the only way to run them now
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)

@@ -55,7 +55,8 @@ def calibrate(
 
                 record = BenchRecord.of(bench)
                 result, stop = one.attempt(start(bench))
-            _finish(one, folder, record, result, accuracy)
+            with one.saving(stop):
+                _finish(one, folder, record, result, accuracy)
             if stop is not None:
                 raise stop
 

@@ -14,8 +14,9 @@ class Interrupts:
     """Turns SIGINT and SIGTERM into an orderly stop.
 
     While a procedure runs, the first one sets ``abort``, the second breaks in at once. While the
-    devices are being closed they are only counted, so that nothing keeps the mirror from its flat
-    shape. At any other time they break in at once. Does nothing outside the main thread.
+    devices are being closed, or an aborted run is saved, they change nothing: the mirror gets its
+    flat shape and the data their file. At any other time they break in at once. Does nothing outside
+    the main thread.
 
     Parameters
     ----------
@@ -26,7 +27,8 @@ class Interrupts:
     def __init__(self, tell: Callable[[str], None]) -> None:
         self.abort = threading.Event()
         self._tell = tell
-        self._in_procedure = self._closing = False
+        self._in_procedure = False
+        self._shielded = ""
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -55,15 +57,24 @@ class Interrupts:
 
     def begin_closing(self) -> None:
         """From here to :meth:`end_closing` nothing breaks in."""
-        self._closing = True
+        self._shielded = "the mirror is being flattened and the devices closed"
 
     def end_closing(self) -> None:
         """The devices are closed."""
-        self._closing = False
+        self._shielded = ""
+
+    @contextmanager
+    def saving(self) -> Iterator[None]:
+        """While what an aborted run measured is saved, which takes a moment, nothing breaks in."""
+        self._shielded = "what was measured is being saved"
+        try:
+            yield
+        finally:
+            self._shielded = ""
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._closing:
-            self._tell("already stopping: the mirror is being flattened and the devices closed")
+        if self._shielded:
+            self._tell(f"already stopping: {self._shielded}")
         elif self._in_procedure and not self.abort.is_set():
             self.abort.set()
             self._tell("stopping: the mirror is flattened and what was measured is saved")

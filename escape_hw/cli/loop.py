@@ -63,7 +63,8 @@ def loop(
                 refuse_simulated(product, bench, force)
                 record = BenchRecord.of(bench)
                 result, stop = one.attempt(_procedure(bench, product, frames, best, strehl))
-            _finish(one, folder, record, product, result)
+            with one.saving(stop):
+                _finish(one, folder, record, product, result)
             if stop is not None:
                 raise stop
 

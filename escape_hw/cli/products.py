@@ -95,6 +95,9 @@ def compare(
 
 def report(
     run: Annotated[Path, typer.Argument(help="Folder of a run.")],
+    picture: Annotated[
+        Path | None, typer.Option("--picture", metavar="FILE", help="Draw matrices and images as PNG, too.")
+    ] = None,
     json: options.Json = False,
 ) -> None:
     """Build report.html of a run again from its products."""
@@ -107,4 +110,10 @@ def report(
         old = read_result(run)
         one.show(f"report: {path}")
         document = head("report", old["system"], old["simulated"], old["seed"])
-        one.result({**document, "report": path})
+        document["report"] = path
+        if picture is not None:
+            from escape_hw.report.picture import write_picture
+
+            document["picture"] = write_picture(run, picture).absolute()
+            one.show(f"picture: {picture}")
+        one.result(document)

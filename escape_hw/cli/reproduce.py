@@ -133,7 +133,8 @@ def _run(
 
             record = BenchRecord.of(bench)
             result, stop = one.attempt(start(bench))
-        document = keep(folder, record, result, one.wall_seconds)
+        with one.saving(stop):
+            document = keep(folder, record, result, one.wall_seconds)
         one.result(document, met=all(entry["met"] for entry in document["criteria"]))
         if stop is not None:
             raise stop

@@ -8,7 +8,7 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -99,9 +99,16 @@ class Session:
             partial: Any = stop.partial
             return partial, stop
 
+    def saving(self, stop: Aborted | None) -> AbstractContextManager[None]:
+        """While a result is saved: after an abort, no further Ctrl-C keeps it from its file."""
+        return contextlib.nullcontext() if stop is None else self.interrupts.saving()
+
     @contextmanager
     def run_folder(self, config: SystemConfig, kind: str, out: Path | None) -> Iterator[RunFolder]:
         """The run's folder with its log and ``config.toml``, made before anything is opened."""
+        # What saves the result, too, is loaded before anything moves: who stops a run does not want
+        # to wait for a library, and would lose the data if one failed to load.
+        import escape_hw.runtime.keep  # noqa: F401
         from escape_hw.io.run_folder import RunFolder
 
         with RunFolder(config.system.name, kind, out) as folder:

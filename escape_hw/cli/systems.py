@@ -19,19 +19,17 @@ config_app = typer.Typer(help="Check, start and describe configurations.", no_ar
 def systems(json: options.Json = False) -> None:
     """List the systems that come with the package."""
     with session("systems", json=json) as one:
-        from rich.table import Table
-
+        from escape_hw.cli.views import rich_table
         from escape_hw.config.bundled import bundled_systems
         from escape_hw.config.load import load_system
         from escape_hw.io.documents import head
+        from escape_hw.report.tables import Table
 
         rows = [_about(load_system(name)) for name in bundled_systems()]
-        table = Table("system", "mode", "actuators", "modes", "description")
-        for row in rows:
-            table.add_row(
-                row["name"], row["mode"], str(row["n_act"]), str(row["n_modes"]), str(row["description"])
-            )
-        one.show(table)
+        headings = ("system", "mode", "actuators", "modes", "description")
+        keys = ("name", "mode", "n_act", "n_modes", "description")
+        cells = tuple(tuple(str(row[key]) for key in keys) for row in rows)
+        one.show(rich_table(Table(headings, cells, numeric=False)))
         one.result({**head("systems", None, None, None), "systems": rows})
 
 

@@ -46,7 +46,7 @@ def calibration_lines(result: CalibrationResult) -> list[str]:
     lines = [
         f"{matrix.method}: {matrix.n_modes} modes, {result.grid.n_valid} sub-apertures, "
         f"{result.frames} frames ({result.sky_seconds:.1f} s), {result.lost_frames} lost",
-        f"signal-to-noise ratio per mode: least {snr.min():.2g}, median {sorted(snr)[len(snr) // 2]:.2g}",
+        f"signal-to-noise ratio per mode: least {snr.min():.3g}, median {sorted(snr)[len(snr) // 2]:.3g}",
     ]
     if result.response is not None:
         lines.append(f"delay: {result.response.delay:.2f} frames")

@@ -17,6 +17,8 @@ _PITCH_RANGE = 0.03
 #: Least contrast of the light folded at the pitch. Spots under the strongest screen of the bench leave
 #: 0.85, spots that do not stand on the lattice below 0.2.
 _CONTRAST = 0.3
+#: Contrast that the noise of a dark camera does not reach: it makes up to 0.06.
+_NOISE_CONTRAST = 0.1
 #: Spots further off the lattice than this many median distances do not count.
 _OUTLIER = 5.0
 
@@ -50,12 +52,17 @@ def _contrast(light: NDArray[np.float64], pitch: float) -> float:
 
 def _check_lattice(light: NDArray[np.float64], pitch: float, nominal: float) -> None:
     """Raise unless the spots really stand one pitch apart."""
+    contrast = _contrast(light, pitch)
+    if contrast < _NOISE_CONTRAST:
+        raise CalibrationError(
+            "no spots on the wavefront sensor, nothing but noise or an even glow; "
+            "check source, beam stop, exposure and sensor.pitch_px"
+        )
     if abs(pitch / nominal - 1) > _PITCH_RANGE:
         raise CalibrationError(
             f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal}; "
             "check sensor.pitch_px and the binning"
         )
-    contrast = _contrast(light, pitch)
     # Spots two or three of the assumed pitches apart look regular too, at a harmonic.
     wider = max(_contrast(light, m * pitch) for m in (2, 3))
     if contrast < _CONTRAST or wider > contrast / 2:

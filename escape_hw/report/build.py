@@ -48,7 +48,7 @@ def render(run: RunContent) -> str:
         str(part)
         for part in (
             document["system"],
-            document.get("finished_utc") and f"{document['finished_utc']} UTC",
+            document.get("finished_utc") and f"{str(document['finished_utc'])[:19].replace('T', ' ')} UTC",
             f"seed {document['seed']}" if document.get("seed") is not None else None,
             document.get("software") and f"ESCAPE {document['software']}",
         )
@@ -73,13 +73,18 @@ def render(run: RunContent) -> str:
 
 def _facts(run: RunContent) -> dict[str, str]:
     found: dict[str, str] = {}
+    # A matrix and what was computed from it share their frames: one number for both.
+    shared: dict[str, list[str]] = {}
     for label, result in run.calibrations.items():
-        found[f"{label}: frames"] = f"{result.frames:,} ({result.sky_seconds:.1f} s)".replace(",", "\u2009")
-    for label, loop in run.loops.items():
-        if loop.strehl is not None:
-            found[f"{label}: Strehl, peak"] = tables.percent(loop.strehl.peak).strip()
+        text = f"{result.frames:,} ({result.sky_seconds:.1f} s)".replace(",", "\u2009")
+        shared.setdefault(text, []).append(label)
+    for text, labels in shared.items():
+        found[f"{' and '.join(labels)}: frames"] = text
     if run.document.get("wall_seconds") is not None:
         found["wall clock"] = f"{float(run.document['wall_seconds']):.0f} s"
+    for label, loop in run.loops.items():
+        if loop.strehl is not None:
+            found[f"{label}: Strehl ratio, peak"] = tables.percent(loop.strehl.peak).strip()
     return found
 
 
@@ -136,7 +141,9 @@ def _loops(run: RunContent) -> str:
     if any(loop.residual_nm.size for loop in run.loops.values()):
         parts.append(
             html.figure(
-                "residual", figures_bench.residual_strip(run.loops), "Residual wavefront seen by the sensor."
+                "residual",
+                figures_bench.residual_strip(run.loops),
+                "Residual wavefront seen by the sensor, from the closing of the loop on; logarithmic.",
             )
         )
     scans = run.document.get("scans") or {}
@@ -163,7 +170,8 @@ def _matrices(run: RunContent) -> str:
             html.figure(
                 "errors",
                 figures_matrix.errors_per_mode(matrices),
-                "Signal-to-noise ratio and standard error per mode of the measured matrices.",
+                "Signal-to-noise ratio and standard error per mode. The errors of a computed matrix are "
+                "those of its registration and its gain, which all slopes share.",
             )
         )
     remarks = [f"{label}: {note}" for label, result in run.calibrations.items() for note in result.notes]
@@ -175,7 +183,12 @@ def _sky_time(run: RunContent) -> str:
     if not curves:
         return ""
     drawing = figures_registration.error_curves(curves)
-    caption = "Error of the registration against the frames used, with the Cramér-Rao bound."
+    plants = f", rms over {curves['plants']} random plants" if "plants" in curves else ""
+    caption = f"Error of the registration against the frames used{plants}, with the Cramér-Rao bound."
+    fewest = curves.get("fewest_frames") or {}
+    if fewest:
+        met = ", ".join(f"{name} {count or 'none of these'}" for name, count in fewest.items())
+        caption += f" Fewest frames that meet every goal: {met}."
     return html.section("Sky time", html.figure("skytime", drawing, caption))
 
 
@@ -193,6 +206,10 @@ def _bench(run: RunContent) -> str:
     if loop is not None and layout is not None and loop.last_command.size == int(layout.sum()):
         drawing = figures_bench.mirror(loop.last_command, layout)
         parts.append(html.figure("mirror", drawing, f"The last mirror command of the {label} loop."))
+    response = next((r.response for r in run.calibrations.values() if r.response is not None), None)
+    if response is not None:
+        caption = "Temporal response of mirror and sensor, from the pokes themselves, with standard errors."
+        parts.append(html.figure("response", figures_bench.temporal_response(response), caption))
     return html.section("Bench", html.side_by_side(*parts))
 
 

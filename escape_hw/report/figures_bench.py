@@ -8,63 +8,95 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
-from escape_hw.api.results import LoopResult, StrehlEstimate
+from escape_hw.api.results import LoopResult, StrehlEstimate, TemporalResponse
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.report import style
 from escape_hw.report.tables import percent
 
 #: Half width of the PSF cut-outs in pixels, and decades of the log stretch.
 _HALF, _DECADES = 32, 3.5
+#: Width of the border that holds background only, in pixels.
+_BORDER = 4
 _PSF_MAP, _FRAME_MAP = "inferno", "magma"
 
 
 def stacked_psfs(loops: Mapping[str, LoopResult], psf_px: float | None = None) -> Figure:
     """The model PSF and one stacked closed-loop PSF per matrix (paper: stacked PSF figures).
 
-    Logarithmic stretch relative to the model's maximum; the three Strehl ratios stand below each
-    in the paper's order: peak, optical transfer function, encircled energy.
+    See :func:`draw_psfs`.
+    """
+    n = len(_with_images(loops)) + (_model_psf(loops) is not None)
+    figure = style.new_figure(0.9 + 2.3 * max(n, 1), 3.35)
+    draw_psfs(figure, loops, psf_px)
+    return figure
+
+
+def draw_psfs(
+    figure: FigureBase, loops: Mapping[str, LoopResult], psf_px: float | None = None, rows: int = 1
+) -> None:
+    """Draw the PSFs into a figure or a part of one.
+
+    Logarithmic stretch relative to the model's maximum, backgrounds taken out; the three Strehl
+    ratios stand below each in the paper's order: peak, optical transfer function, encircled energy.
 
     Parameters
     ----------
+    figure
+        Where to draw.
     loops
         Closed-loop runs by label; runs without an image are left out.
     psf_px
         lambda/D in pixels, for axes in lambda/D; pixels without it.
+    rows
+        Rows of panels.
     """
-    shown = {label: loop for label, loop in loops.items() if loop.psf is not None}
-    model = next((loop.model_psf for loop in shown.values() if loop.model_psf is not None), None)
-    n = len(shown) + (model is not None)
-    figure = style.new_figure(0.9 + 2.3 * max(n, 1), 3.35)
-    panels = list(figure.subplots(1, max(n, 1), squeeze=False)[0])
-    reference = (
-        _peak(model) if model is not None else max((_peak(s.psf) for s in shown.values()), default=1.0)
-    )
-    places = iter(panels)
-    if model is not None:
-        _psf_panel(next(places), model, reference, psf_px, "model", None)
-    for label, loop in shown.items():
-        _psf_panel(next(places), loop.psf, reference, psf_px, label, loop.strehl)
-    for panel in panels[1:]:
-        panel.set_yticklabels([])
+    shown, model = _with_images(loops), _model_psf(loops)
+    images = {label: _without_background(loop.psf) for label, loop in shown.items() if loop.psf is not None}
+    n = max(len(shown) + (model is not None), 1)
+    panels = figure.subplots(rows, -(-n // rows), squeeze=False)
+    perfect = None if model is None else _without_background(model)
+    bright = [perfect] if perfect is not None else list(images.values())
+    reference = max((float(image.max(initial=1e-12)) for image in bright), default=1.0)
+    places = iter(panels.ravel())
+    if perfect is not None:
+        _psf_panel(next(places), perfect, reference, psf_px, "model", None)
+    for label, image in images.items():
+        _psf_panel(next(places), image, reference, psf_px, label, shown[label].strehl)
+    for place in places:
+        place.set_visible(False)
     unit = "pixel" if psf_px is None else "λ/D"
-    panels[0].set_ylabel(f"offset [{unit}]", color=style.INK, fontsize=8.5)
-    style.colour_bar(figure, panels, _PSF_MAP, (-_DECADES, 0), "log₁₀ of flux / model maximum", 0.62)
-    return figure
+    for line in panels:
+        line[0].set_ylabel(f"offset [{unit}]", color=style.INK, fontsize=8.5)
+        for panel in line[1:]:
+            panel.set_yticklabels([])
+    shrink = 0.62 if rows == 1 else 1.0
+    style.colour_bar(
+        figure, list(panels.ravel()), _PSF_MAP, (-_DECADES, 0), "log₁₀ of flux / model maximum", shrink
+    )
+
+
+def _with_images(loops: Mapping[str, LoopResult]) -> dict[str, LoopResult]:
+    return {label: loop for label, loop in loops.items() if loop.psf is not None}
+
+
+def _model_psf(loops: Mapping[str, LoopResult]) -> NDArray[np.float32] | None:
+    return next((loop.model_psf for loop in loops.values() if loop.model_psf is not None), None)
 
 
 def _psf_panel(
     axes: Axes,
-    image: NDArray[np.float32] | None,
+    image: NDArray[np.float64],
     reference: float,
     psf_px: float | None,
     title: str,
     strehl: StrehlEstimate | None,
 ) -> None:
-    cut = _cut(np.zeros((2, 2)) if image is None else np.asarray(image, float))
+    cut = _cut(image)
     stretched = np.log10(np.maximum(cut / reference, 10.0**-_DECADES))
     half = cut.shape[0] / 2 / (psf_px or 1.0)
     axes.imshow(
@@ -77,6 +109,8 @@ def _psf_panel(
     )
     style.tidy(axes, grid=False).set_title(title, fontweight="bold", fontsize=10)
     axes.tick_params(length=2)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(5))
     if strehl is not None:
         rows = (("peak", strehl.peak), ("OTF", strehl.otf), ("encircled", strehl.encircled))
         below = "\n".join(f"{name:>9}  {percent(value)}" for name, value in rows)
@@ -85,8 +119,11 @@ def _psf_panel(
         axes.set_xlabel("without turbulence", fontsize=8.5, labelpad=5, color=style.MUTED)
 
 
-def _peak(image: NDArray[np.float32] | None) -> float:
-    return float(np.max(image, initial=1e-12)) if image is not None else 1.0
+def _without_background(image: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The image less the median of its border; on a logarithmic scale an offset would hide the halo."""
+    border = np.ones(image.shape, bool)
+    border[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
+    return np.asarray(image - np.median(image[border]), float)
 
 
 def _cut(image: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -150,9 +187,15 @@ def residual_strip(loops: Mapping[str, LoopResult]) -> Figure:
     axes = figure.subplots()
     for (label, loop), colour in zip(shown.items(), style.SERIES * 2, strict=False):
         seconds = np.linspace(0, loop.frames / loop.rate_hz, loop.residual_nm.size)
-        axes.plot(seconds, loop.residual_nm, color=colour, lw=0.9, label=_residual_label(label, loop))
+        axes.plot(
+            seconds, loop.residual_nm, color=colour, lw=0.8, alpha=0.85, label=_residual_label(label, loop)
+        )
     style.tidy(axes).set(xlabel="bench time [s]", ylabel="residual wavefront [nm rms]")
-    axes.set_ylim(bottom=0)
+    # The wavefront before closing is ten times larger; a linear scale would show nothing else.
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(ScalarFormatter())
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.margins(x=0.01)
     if shown:
         style.legend(axes, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0), borderaxespad=0.2)
@@ -161,6 +204,22 @@ def residual_strip(loops: Mapping[str, LoopResult]) -> Figure:
 
 def _residual_label(label: str, loop: LoopResult) -> str:
     return f"{label}: {loop.residual_rms_nm:.0f} nm" + ("" if loop.stable else " (unstable)")
+
+
+def temporal_response(response: TemporalResponse) -> Figure:
+    """Share of a command's effect that appears in each of the frames after it."""
+    figure = style.new_figure(4.4, 3.7)
+    axes = figure.subplots()
+    lags = np.arange(response.weights.size)
+    axes.bar(lags, 100 * response.weights, width=0.7, color=style.SERIES[0])
+    axes.errorbar(
+        lags, 100 * response.weights, 100 * response.sigma, fmt="none", ecolor=style.INK, capsize=3, lw=1.0
+    )
+    style.tidy(axes).set(xlabel="frames after the command", ylabel="share of the response [%]")
+    axes.axhline(0.0, color=style.MUTED, lw=0.7)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_title(f"mean delay {response.delay:.2f} frames", fontsize=9.5)
+    return figure
 
 
 def gain_scan(scans: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:

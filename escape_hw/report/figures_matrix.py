@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
@@ -23,17 +23,31 @@ def representative_modes(n_modes: int, count: int = 8) -> NDArray[np.int_]:
 def mode_maps(matrices: Mapping[str, InteractionMatrix], count: int = 8) -> Figure:
     """Slope maps of several matrices side by side (paper: IM comparison figure).
 
+    See :func:`draw_mode_maps`.
+    """
+    rows = min(count, max(matrix.n_modes for matrix in matrices.values()))
+    figure = style.new_figure(1.0 + 2.15 * len(matrices), 0.65 + 1.02 * rows)
+    draw_mode_maps(figure, matrices, count)
+    return figure
+
+
+def draw_mode_maps(figure: FigureBase, matrices: Mapping[str, InteractionMatrix], count: int) -> None:
+    """Draw slope maps of several matrices side by side into a figure or a part of one.
+
     One row per representative mode, one column per matrix; each cell holds the x and the y slopes.
     Every mode is divided by its rms, so that all share one scale.
 
     Parameters
     ----------
+    figure
+        Where to draw.
     matrices
         Matrices by the label of their column; a mode that a matrix lacks stays blank.
+    count
+        How many modes to show.
     """
     n_modes = max(matrix.n_modes for matrix in matrices.values())
     modes = representative_modes(n_modes, count)
-    figure = style.new_figure(1.0 + 2.15 * len(matrices), 0.65 + 1.02 * len(modes))
     axes = figure.subplots(len(modes), len(matrices), squeeze=False)
     for column, (label, matrix) in enumerate(matrices.items()):
         axes[0, column].set_title(label, color=style.INK, fontsize=10, pad=16, fontweight="bold")
@@ -51,7 +65,6 @@ def mode_maps(matrices: Mapping[str, InteractionMatrix], count: int = 8) -> Figu
     style.colour_bar(
         figure, list(axes.ravel()), style.DIVERGING, (-_LIMIT, _LIMIT), "slope / rms slope of the mode"
     )
-    return figure
 
 
 def _pair(matrix: InteractionMatrix, mode: int) -> NDArray[np.float64]:

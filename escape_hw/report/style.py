@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from numpy.typing import NDArray
 
 # Figures are made without pyplot: no global state, no windows, safe in any thread.
@@ -87,7 +87,7 @@ def paint(
 
 
 def colour_bar(
-    figure: Figure,
+    figure: FigureBase,
     axes: Sequence[Axes],
     name: str,
     limits: tuple[float, float],

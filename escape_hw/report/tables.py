@@ -109,5 +109,5 @@ def strehl_table(loops: Mapping[str, LoopResult]) -> Table:
         state = f"stable {loop.frames / loop.rate_hz:.0f} s" if loop.stable else "UNSTABLE"
         if loop.partial:
             state += ", aborted"
-        rows.append((label, *ratios, f"{loop.gain:.3g}", f"{loop.residual_rms_nm:.0f}", state))
+        rows.append((label, *ratios, f"{loop.gain:.3f}", f"{loop.residual_rms_nm:.0f}", state))
     return Table(headings, tuple(rows))

@@ -28,6 +28,10 @@ def check(text: str, met: bool) -> dict[str, Any]:
     return {"text": text, "met": bool(met)}
 
 
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
 def converged(label: str, estimate: RegistrationEstimate | None) -> dict[str, Any]:
     """SPRINT converged."""
     return check(f"{label}: SPRINT converged", estimate is not None and estimate.converged)
@@ -40,7 +44,7 @@ def recovered(label: str, estimate: RegistrationEstimate, planted: Registration)
     worst = float(pulls.max())  # NaN, from no error and no difference, counts as not met
     return check(
         f"{label}: planted registration recovered within {_LARGEST_PULL:g} standard errors "
-        f"(largest pull {worst:.1f}, {PARAMETERS[int(pulls.argmax())]})",
+        f"(largest pull {worst:.1f}, {_words(PARAMETERS[int(pulls.argmax())])})",
         worst <= _LARGEST_PULL,
     )
 
@@ -53,7 +57,7 @@ def agree(short: RegistrationEstimate, long: RegistrationEstimate) -> list[dict[
         allowed = PAPER_DIFFERENCES[name]
         checks.append(
             check(
-                f"SHORT and LONG agree in {name}: {difference:.3g} (paper: {allowed:g} {value.unit})",
+                f"SHORT and LONG agree in {_words(name)}: {difference:.3g} (paper: {allowed:g} {value.unit})",
                 difference <= allowed,
             )
         )
@@ -66,13 +70,13 @@ def loops(results: Mapping[str, LoopResult]) -> list[dict[str, Any]]:
     escape, baseline = results.get("ESCAPE"), results.get("push-pull")
     if escape is None or baseline is None or escape.strehl is None or baseline.strehl is None:
         return checks
-    for way in ("peak", "otf", "encircled"):
+    for way, name in (("peak", "peak"), ("otf", "OTF"), ("encircled", "encircled")):
         ours, theirs = getattr(escape.strehl, way), getattr(baseline.strehl, way)
         error = math.hypot(ours.sigma, theirs.sigma)
         difference = ours.value - theirs.value
         checks.append(
             check(
-                f"Strehl ({way}) of ESCAPE minus push-pull: {100 * difference:+.1f} ± {100 * error:.1f} %, "
+                f"Strehl ({name}) of ESCAPE minus push-pull: {100 * difference:+.1f} ± {100 * error:.1f} %, "
                 "not below zero by more than two standard errors",
                 difference >= -2 * error,
             )

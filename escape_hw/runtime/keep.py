@@ -58,14 +58,19 @@ def keep_loop(
 def finish(folder: RunFolder, document: Mapping[str, Any]) -> dict[str, Any]:
     """Write ``result.json``, build the report, and return the document with the products' paths.
 
+    An aborted run gets no report, which takes seconds: its operator waits. ``escape report`` makes it.
+
     Raises
     ------
     StorageError
         It cannot be written.
     """
-    folder.add("report", folder.file(REPORT))
-    folder.write_result(document)
-    write_report(folder.path)
+    if document.get("partial"):
+        folder.write_result(document)
+    else:
+        folder.add("report", folder.file(REPORT))
+        folder.write_result(document)
+        write_report(folder.path)
     return {
         **document,
         "folder": str(folder.path),

@@ -76,6 +76,12 @@ def keep_table1(
     labels, checks = {}, []
     estimates = {}
     for column, calibration in result.calibrations.items():
+        if calibration.registration is None:
+            # Stopped before SPRINT: what there is is a DO-CRIME matrix.
+            source = key_of(f"docrime {column}")
+            keep_calibration(folder, record, source, calibration)
+            labels[source] = {"label": f"DO-CRIME {column}"}
+            continue
         name = key_of(f"escape {column}")
         measured = measured_part(calibration)
         parents = {}

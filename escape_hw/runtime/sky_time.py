@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,8 @@ GOAL = np.array([1.0, 1.0, 0.02, 0.1, 0.1])
 #: Frames at which the errors are taken.
 FRAMES = (220, 300, 500, 1000)
 ESTIMATORS = ("plain", "whitened")
+#: How long an abort may wait for its turn.
+_PATIENCE_S = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +88,10 @@ def run_plant(
     return PlantErrors(errors, sigmas, bound)
 
 
+def _job(job: tuple[str, int, tuple[int, ...], tuple[str, ...]]) -> PlantErrors:
+    return run_plant(*job)
+
+
 def sky_time(
     system: str,
     *,
@@ -115,15 +122,15 @@ def sky_time(
     """
     report = Reporter("sky time", plants, "plant")
     done: list[PlantErrors] = []
-    with ProcessPoolExecutor(workers) as pool:
-        jobs = [pool.submit(run_plant, system, n, tuple(frames), tuple(overrides)) for n in range(plants)]
-        try:
-            for job in as_completed(jobs):
-                done.append(job.result())
+    jobs = [(system, number, tuple(frames), tuple(overrides)) for number in range(plants)]
+    # Fresh processes, ended at once when the campaign is: leaving the block terminates them.
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        results = pool.imap_unordered(_job, jobs)
+        while len(done) < plants:
+            with contextlib.suppress(multiprocessing.TimeoutError):
+                done.append(results.next(timeout=_PATIENCE_S))
+            if report.due():
                 yield report(len(done))
-        finally:
-            for job in jobs:
-                job.cancel()
     return summary(done, frames)
 
 

@@ -185,6 +185,23 @@ class CommandGuard:
                 return f"two neighbours exceed max_neighbour = {lim.max_neighbour} ({step:.6g})"
         return None
 
+    def allowed_share(self, shape: ArrayLike) -> float:
+        """Largest factor, at most 1, with which a shape breaks no rule by itself (slew apart).
+
+        A shape scaled by it keeps its form, where :meth:`limit` cuts single actuators off. Disabled
+        actuators do not count: no factor makes them legal.
+
+        Raises
+        ------
+        CommandRejected
+            See :meth:`validate`.
+        """
+        wanted = self.validate(shape)
+        wanted[self._disabled] = 0.0
+        peak = _peak(wanted)
+        share = min(1.0, self.limits.max_stroke / peak) if peak > 0 else 1.0
+        return share * self._scale(wanted * share)
+
     def _validated(self, command: ArrayLike) -> NDArray[np.float64]:
         asked = self._as_array(command)
         if asked.dtype.kind not in "fiu":

@@ -171,7 +171,10 @@ class FaultyCamera(Camera):
             left = (deadline - self.now_ns()) * 1e-9
             if left <= 0:
                 raise FrameTimeout(self.name, f"no frame within {timeout_s:g} s")
-            frame = self.inner.next_frame(left)
+            try:
+                frame = self.inner.next_frame(left)
+            except FrameTimeout:
+                raise FrameTimeout(self.name, f"no frame within {timeout_s:g} s") from None
             if self.lost_from is not None and frame.index >= self.lost_from:
                 raise DeviceLost(self.name, f"lost at frame {frame.index}, as arranged")
             if not self._withheld(frame.index):

@@ -70,6 +70,7 @@ class ShackHartmannModel:
         self._metres = 2 * config.devices.dm.stroke_m
         self._rows, self._columns = np.nonzero(grid.valid)
         self._config, self._grid = config, grid
+        self._variants: list[ShackHartmannModel] | None = None
         self._weights = slope_weights(config, grid, self._pupil)
 
     @property
@@ -111,10 +112,10 @@ class ShackHartmannModel:
 
     def variants(self) -> list[ShackHartmannModel]:
         """The same sensor with spots that move by a quarter more than the slopes say."""
-        if not self._grid.motion_px:
-            return []
-        grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_DOUBT))
-        return [ShackHartmannModel(self._config, grid)]
+        if self._variants is None:
+            grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_DOUBT))
+            self._variants = [ShackHartmannModel(self._config, grid)] if grid.motion_px else []
+        return list(self._variants)
 
     def _influence(self, width: float) -> InfluenceFunctions:
         return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)

@@ -79,6 +79,9 @@ class _Views:
         self._cut = counts / grid.counts * float(np.percentile(light[light > 0], 95)) if grid.counts else 0.0
         self._samples = (np.arange(p) - (p - 1) / 2) / p
         self._spot = spot
+        # An average over motion is not worth double precision; a small-signal limit is.
+        self._real = np.dtype(np.float32 if grid.motion_px else np.float64)
+        self._complex = np.dtype(np.complex64 if grid.motion_px else np.complex128)
         self._blocks, self._along = {}, {}
         field = field_pixels(p, spot)
         # The windows stay on the grid as it was found; the lenslets stand where the references,
@@ -88,7 +91,7 @@ class _Views:
             i, j = rows + step[0], columns + step[1]
             exists = (i >= 0) & (i < n) & (j >= 0) & (j < n)
             i, j = np.clip(i, 0, n - 1), np.clip(j, 0, n - 1)
-            self._blocks[step] = blocks[i, j] * exists[:, None, None]
+            self._blocks[step] = (blocks[i, j] * exists[:, None, None]).astype(self._real)
             self._along[step] = tuple(
                 self._transform(first + number * pitch, at, p, field)
                 for first, pitch, number, at in (
@@ -104,15 +107,16 @@ class _Views:
         first = first_pixels(centre, field)
         size = at.shape[1]
         reach = (at >= first[:, None]) & (at < first[:, None] + field)
-        return lenslet_transform(centre, at[:, 0], p, size, self._spot) * reach[:, None, :]
+        matrix = lenslet_transform(centre, at[:, 0], p, size, self._spot) * reach[:, None, :]
+        return matrix.astype(self._complex)
 
     def accumulate(
         self, out: dict[tuple[int, int], NDArray[np.float64]], dx: float, dy: float, share: float
     ) -> None:
         """Add ``share`` times the derivatives with all spots moved by ``(dx, dy)`` pixels."""
-        tilt = [np.exp(2j * np.pi * d * self._samples / self._spot) for d in (dy, dx)]
+        tilt = [np.exp(2j * np.pi * d * self._samples / self._spot).astype(self._complex) for d in (dy, dx)]
         fields = {}
-        image = np.zeros(self._inside.shape)
+        image = np.zeros(self._inside.shape, self._real)
         for step in STEPS:
             fy, fx = self._along[step]
             amplitude = self._blocks[step] * tilt[0].conj()[:, None] * tilt[1].conj()[None, :]
@@ -125,7 +129,7 @@ class _Views:
         x, y = self._columns_at[:, None, :], self._rows_at[:, :, None]
         for axis, at in enumerate((x, y)):
             middle = (counted * at).sum(axis=(1, 2)) / total
-            lever = (at - middle[:, None, None]) * seen * (share / total)[:, None, None]
+            lever = ((at - middle[:, None, None]) * seen * (share / total)[:, None, None]).astype(self._real)
             for step, (amplitude, e) in fields.items():
                 fy, fx = self._along[step]
                 back = np.matmul(np.matmul(fy, lever * e.conj()), fx.transpose(0, 2, 1))

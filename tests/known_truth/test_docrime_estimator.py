@@ -202,9 +202,9 @@ def test_a_refused_frame_is_named_and_leaves_no_trace(at):
 
 
 def test_frames_that_are_too_few_to_begin_with_are_not_forgotten():
-    # One row in 36 has a whole past, so the first thousand frames hold fewer than the 37 needed.
+    # One row in 51 has a whole past, so the first thousand frames hold fewer than the 37 needed.
     slopes, pokes, truth = make(9000, turbulence=0.02)
-    keep = np.random.default_rng(0).random(9000) > 0.4
+    keep = np.random.default_rng(0).random(9000) > 0.43
     keep[0] = True
     held = pokes.copy()
     for k in np.flatnonzero(~keep):
@@ -222,3 +222,12 @@ def test_frames_that_are_too_few_to_begin_with_are_not_forgotten():
     gain = float(np.vdot(s.matrix, truth) / np.vdot(truth, truth))
     assert gain == pytest.approx(1, abs=0.15)
     assert np.mean(((s.matrix - gain * truth) / s.sigma) ** 2) == pytest.approx(1.0, abs=0.3)
+
+
+@pytest.mark.parametrize("correlations", [True, False])
+@pytest.mark.parametrize("order", [0, 6])
+def test_a_mirror_that_nothing_answers_to_is_refused(correlations, order):
+    slopes, pokes, _ = make(3000, poke=0.0)
+    poked = np.random.default_rng(9).uniform(-0.01, 0.01, pokes.shape)
+    with pytest.raises(CalibrationError, match="does not respond"):
+        solved(slopes, poked, correlations=correlations, order=order)

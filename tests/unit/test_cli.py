@@ -391,7 +391,7 @@ def test_quiet_shows_no_progress(escape, bench, tmp_path):
 @pytest.mark.usefixtures("reports")
 def test_reproduce_shwfs_shows_registration_strehl_and_report(escape, bench, tmp_path):
     run = tmp_path / "run"
-    code, out, err = escape("reproduce", "shwfs", "--out", run, "--loop-frames", 321)
+    code, out, err = escape("reproduce", "shwfs", "--out", run, "--loop-frames", 321, "--plants", 0)
     assert code == 0, err
     for word in ("planted", "Shift Y", "push-pull", "DO-CRIME", "ESCAPE", "OTF", "±"):
         assert word in out
@@ -413,7 +413,7 @@ def test_reproduce_shwfs_shows_registration_strehl_and_report(escape, bench, tmp
 
 
 def test_reproduce_judges_its_own_result(document, bench, tmp_path):
-    words = ("reproduce", "shwfs", "--out", tmp_path / "run")
+    words = ("reproduce", "shwfs", "--out", tmp_path / "run", "--plants", 0)
     code, found, _ = document(*words, "--set", "twin.registration.shift_x=30")
     assert code == 1
     failed = [check["text"] for check in found["criteria"] if not check["met"]]
@@ -439,7 +439,7 @@ def test_reproduce_table1(escape, document, bench, tmp_path):
 @pytest.mark.parametrize("place", ["push-pull", "escape", "model_psf", "closed_loop"])
 def test_ctrl_c_in_a_reproduction_keeps_what_is_done(document, bench, tmp_path, place):
     bench.hook = lambda name: name == place and os.kill(os.getpid(), signal.SIGINT)
-    code, found, _ = document("reproduce", "shwfs", "--out", tmp_path / "run")
+    code, found, _ = document("reproduce", "shwfs", "--out", tmp_path / "run", "--plants", 0)
     assert code == 130
     assert found["partial"] is True
     assert found["criteria"] == []
@@ -477,3 +477,7 @@ def test_show_compare_report(escape, document, im, tmp_path):
     # The run's log, shown in the report, has grown since; the figures are the same to the byte.
     assert (moved / "report.html").read_text().split("<h2>Origin")[0] == before.split("<h2>Origin")[0]
     assert document("show", moved)[1]["command"] == "calibrate"
+    # A calibration alone has no image to draw.
+    code, _, err = escape("report", moved, "--picture", tmp_path / "picture.png")
+    assert code == 2
+    assert "holds no matrix or no closed-loop image" in err

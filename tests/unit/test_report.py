@@ -27,6 +27,8 @@ from escape_hw.report import (
     tables,
 )
 from escape_hw.report.build import write_report
+from escape_hw.report.content import read_run
+from escape_hw.report.picture import draw, write_picture
 
 LOOPS = {
     "push-pull": fake.loop("push-pull", strehl=0.63),
@@ -114,10 +116,11 @@ def test_page_shows_everything(page):
     for word in (
         "SIMULATED", "SPRINT convergence", "Stacked closed-loop PSFs", "Interaction matrices", "Sky time",
         "Residual wavefront", "last mirror command", "Mean sensor frame", "best gain", "a missed one",
-        "α SHORT", "planted", "Signal-to-noise", "Configuration", "&lt;script&gt;alert(1)",
+        "α SHORT", "planted", "Signal-to-noise", "Temporal response", "Configuration",
+        "&lt;script&gt;alert(1)",
     ):  # fmt: skip
         assert word in page, word
-    assert page.count("<figure>") == 10
+    assert page.count("<figure>") == 11
     assert "ABORTED" not in page
 
 
@@ -275,3 +278,44 @@ def test_documents_are_strict_json():
     document = documents.calibration_document(fake.calibration("escape"))
     assert document["snr"]["median"] > 0
     assert documents.calibration_document(fake.calibration("docrime"))["registration"] is None
+
+
+def test_the_temporal_response_is_drawn_in_percent():
+    response = fake.calibration("docrime").response
+    axes = figures_bench.temporal_response(response).axes[0]
+    assert [bar.get_height() for bar in axes.patches] == pytest.approx(list(100 * response.weights))
+    assert f"{response.delay:.2f} frames" in axes.get_title()
+
+
+def test_psfs_are_drawn_without_their_background():
+    plain = fake.loop("escape")
+    offset = dataclasses.replace(plain, psf=plain.psf + np.float32(500.0))
+    shown, bare = (
+        np.asarray(figures_bench.stacked_psfs({"ESCAPE": loop}).axes[1].images[0].get_array())
+        for loop in (offset, plain)
+    )
+    assert np.median(shown) < -2.0
+    np.testing.assert_allclose(shown, bare, atol=0.05)
+
+
+def test_frames_shared_by_two_matrices_are_stated_once(page):
+    assert page.count(": frames</dt>") == 1
+    assert "push-pull and ESCAPE: frames" in page
+
+
+def test_picture_of_a_run(tmp_path):
+    run = make_run(tmp_path / "run")
+    write_picture(run, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+    figure = draw(read_run(run))
+    texts = {text.get_text() for part in figure.subfigs for axes in part.axes for text in (axes.title,)}
+    assert {"push-pull", "DO-CRIME", "ESCAPE", "model"} <= texts
+    assert "SIMULATED" in figure.get_suptitle()
+    with pytest.raises(ProductError, match="no closed-loop image"):
+        write_picture(make_run(tmp_path / "lean", lean=True), tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_sky_time_is_told_in_words_too(page):
+    assert "rms over 20 random plants" in page
+    assert "Fewest frames that meet every goal: whitened 500, plain none of these." in page

@@ -63,7 +63,7 @@ def run() -> list[BenchmarkRow]:
             for how, ours in (
                 ("recorded", whole),
                 ("as they come", streaming),
-                # More than the peer finds: `escape calibrate` hands the covariance to SPRINT.
+                # More than the peer finds: for SPRINT, which wants the noise's covariance between slopes.
                 ("recorded, with the noise's covariance", partial(whole, correlations=True)),
                 ("as they come, with the noise's covariance", partial(streaming, correlations=True)),
             ):

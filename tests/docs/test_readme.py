@@ -1,0 +1,127 @@
+"""What the README and the documents say can be done, and what they point at is there."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+#: Minutes each; that their words are right is checked all the same.
+LONG = ("escape reproduce shwfs", "escape reproduce table1", "escape reproduce sky-time", "escape report run")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+def shell_lines() -> list[str]:
+    return [line.strip().removeprefix(".venv/bin/") for block in blocks("sh") for line in block.splitlines()]
+
+
+def escape_lines() -> list[str]:
+    return [line for line in shell_lines() if line.startswith("escape ")]
+
+
+def call(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONIOENCODING": "utf-8", "XDG_DATA_HOME": str(folder / "data")}
+    return subprocess.run(
+        words, cwd=folder, capture_output=True, text=True, timeout=240, check=False, env=environment
+    )
+
+
+def escape(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    program = [sys.executable, "-c", "from escape_hw.cli import main; main()"]
+    return call([*program, *line.split()[1:]], folder)
+
+
+@pytest.mark.parametrize("number", range(len(blocks("python"))))
+def test_python_blocks_run(number: int, tmp_path: Path) -> None:
+    done = call([sys.executable, "-c", blocks("python")[number]], tmp_path)
+    assert done.returncode == 0, done.stderr
+    if "Strehl" in blocks("python")[number]:
+        assert re.search(r"shift x: -1\d\.\d+ ± \d", done.stdout)
+        assert re.search(r"Strehl ratio: 0\.\d+ ± 0\.\d+", done.stdout)
+
+
+def test_commands_run_in_the_order_they_stand(tmp_path: Path) -> None:
+    ran = 0
+    for line in escape_lines():
+        if not line.startswith(LONG):
+            done = escape(line, tmp_path)
+            assert done.returncode == 0, f"{line}: {done.stderr}"
+            ran += 1
+    assert ran >= 9
+    assert (tmp_path / "first" / "report.html").is_file()
+    assert (tmp_path / "closed" / "report.html").is_file()
+
+
+def test_long_commands_are_spelled_right() -> None:
+    from typer.main import get_command
+
+    from escape_hw.cli.app import app
+
+    long = [line for line in escape_lines() if line.startswith(LONG)]
+    assert {line for line in LONG if any(found.startswith(line) for found in long)} == set(LONG)
+    for line in long:
+        command: Any = get_command(app)
+        words, context = line.split()[1:], None
+        while hasattr(command, "resolve_command"):
+            context = command.make_context(command.name, list(words), parent=context)
+            _, command, words = command.resolve_command(context, words)
+        command.make_context(command.name, list(words), parent=context)
+
+
+def test_make_targets_exist() -> None:
+    targets = [line.split()[1] for line in shell_lines() if line.startswith("make ")]
+    assert {"run", "test", "check", "perf"} <= set(targets)
+    if shutil.which("make") is None:
+        pytest.skip("make is not installed")
+    for target in targets:
+        done = call(["make", "--dry-run", "--directory", str(ROOT), target], ROOT)
+        assert done.returncode == 0, done.stderr
+
+
+def test_other_shell_lines_are_the_install_steps() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    others = [line for line in shell_lines() if line and not line.startswith(("make ", "escape "))]
+    for line in others:
+        assert line.startswith(("python3 -m venv", "pip install --editable", "pytest")), line
+        for extra in re.findall(r"\[([a-z,]+)\]", line):
+            assert set(extra.split(",")) <= set(extras)
+
+
+def test_mistakes_are_reported_as_shown(tmp_path: Path) -> None:
+    shown = re.findall(r"^    bench\.toml:\d+  (.*)$", README, re.MULTILINE)
+    assert len(shown) == 2
+    assert escape("escape config init my-bench --out bench.toml", tmp_path).returncode == 0
+    file = tmp_path / "bench.toml"
+    text, gains = re.subn(
+        r"(?ms)(^\[loop\].*?)^gain = [^\n]*", r"\1gain = 3.0\nleek = 0.01", file.read_text(), count=1
+    )
+    assert gains == 1
+    file.write_text(text)
+    done = escape("escape config check bench.toml", tmp_path)
+    assert done.returncode == 2
+    told = re.findall(r"bench\.toml:\d+  (.*)$", done.stderr, re.MULTILINE)
+    assert told == shown
+
+
+@pytest.mark.parametrize(
+    "document", ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md")))]
+)
+def test_links_lead_somewhere(document: str) -> None:
+    path = ROOT / document
+    text = path.read_text(encoding="utf-8")
+    assert "@@" not in text
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
+        if not target.startswith(("http://", "https://")):
+            assert (path.parent / target).exists(), f"{document} points at {target}"

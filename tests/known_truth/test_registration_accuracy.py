@@ -1,0 +1,70 @@
+"""The registration against planted truths that the estimators never see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from escape_hw.api.procedure import run
+from escape_hw.api.registration import PARAMETERS
+from escape_hw.runtime.sky_time import GOAL, RANGES, PlantErrors, random_plant, run_plant, sky_time, summary
+
+SYSTEM = "razor-shwfs"
+
+
+def _meets_goal(curves: dict[str, Any], estimator: str, frames: int) -> bool:
+    at = curves["frames"].index(frames)
+    return all(curves["estimators"][estimator][p][at] <= goal for p, goal in curves["goal"].items())
+
+
+@pytest.fixture(scope="module")
+def few() -> list[PlantErrors]:
+    """Three plants, all imperfections on, 0.6 seconds of frames each."""
+    return [run_plant(SYSTEM, number, (300,)) for number in (0, 1, 2)]
+
+
+def test_plants_fill_their_ranges_and_differ() -> None:
+    plants = np.array([random_plant(n).to_array() for n in range(200)])
+    assert (np.abs(plants) <= RANGES).all()
+    assert (plants.std(axis=0) > 0.5 * RANGES).all()
+
+
+def test_three_hundred_frames_meet_the_goal_on_every_plant(few: Sequence[PlantErrors]) -> None:
+    curves = summary(few, (300,))
+    assert _meets_goal(curves, "whitened", 300)
+    assert curves["fewest_frames"]["whitened"] == 300
+
+
+def test_whitening_is_what_meets_it(few: Sequence[PlantErrors]) -> None:
+    curves = summary(few, (300,))
+    assert not _meets_goal(curves, "plain", 300)
+    plain, whitened = (
+        np.array([curves["estimators"][e][p][0] for p in PARAMETERS]) for e in ("plain", "whitened")
+    )
+    assert (plain / whitened).mean() > 3
+
+
+def test_no_error_is_beyond_what_its_sigma_allows(few: Sequence[PlantErrors]) -> None:
+    pulls = np.array([p.errors / p.sigmas for p in few])
+    assert np.abs(pulls).max() < 5
+    assert 0.2 < np.mean(pulls[:, 1] ** 2) < 3
+
+
+def test_no_estimate_beats_the_bound_and_none_claims_to(few: Sequence[PlantErrors]) -> None:
+    for plant in few:
+        assert (plant.sigmas[1, 0] > plant.bound).all()
+
+
+@pytest.mark.slow
+def test_twenty_plants_short_and_two_seconds() -> None:
+    """The paper's SHORT run and a tenth of it: accurate, and honest about it in every parameter."""
+    curves = run(sky_time(SYSTEM, plants=20, frames=(1000, 10_000)))
+    for frames in (1000, 10_000):
+        assert _meets_goal(curves, "whitened", frames)
+        at = curves["frames"].index(frames)
+        for name in PARAMETERS:
+            assert 0.5 <= curves["chi2"]["whitened"][name][at] <= 2.0, (frames, name)
+    assert (np.array([curves["bound"][p][0] for p in PARAMETERS]) < GOAL).all()
