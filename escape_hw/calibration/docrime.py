@@ -31,6 +31,9 @@ from escape_hw.calibration.sensor_setup import (
 from escape_hw.errors import Aborted, TooFewFrames
 from escape_hw.pipeline.slopes import SlopeExtractor
 
+#: Seconds of turbulence over which the mean tilt and focus in the references average out well enough.
+_REFERENCE_S = 10.0
+
 Record = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -192,12 +195,18 @@ def docrime_run(
     notes = []
     if float(np.median(matrix.snr())) < 1:
         notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
+    seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
+    if session.mean_frame is not None and seconds < _REFERENCE_S:
+        notes.append(
+            f"the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio; "
+            "the matrix is not touched by it: close the loop on references taken over a longer time"
+        )
     result = CalibrationResult(
         matrix,
         session.finished_grid(),
         solution.frames,
         solution.lost_frames,
-        (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz,
+        seconds,
         response,
         partial=partial,
         mean_frame=session.mean_frame,

@@ -8,10 +8,14 @@ from collections.abc import Sequence
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``escape``; ends the process with the command's exit code."""
-    from escape_hw.cli.app import run
-
     try:
+        from escape_hw.cli.app import run
+
         run(arguments)
+    except KeyboardInterrupt:
+        # Before a command has taken Ctrl-C over nothing is open.
+        sys.stderr.write("stopped before anything was opened\n")
+        _leave_at_once(130)
     except SystemExit as ended:
         # Only where the process is ours alone, and somebody has pressed Ctrl-C and waits.
         if arguments is None and ended.code == 130:

@@ -87,6 +87,9 @@ def unpack_grid(path: Path, hdus: fits.HDUList) -> SubApertureGrid:
         valid=valid,
         references_px=references,
         flux=fits_file.array(path, hdus, "FLUX", np.float32),
+        counts=float(header["COUNTS"]),
+        motion_px=float(header["MOTION"]),
+        background=float(header["BACKGND"]),
     )
 
 
