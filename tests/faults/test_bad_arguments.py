@@ -36,7 +36,9 @@ def refuse(bench, procedure, error: type[EscapeError], match: str) -> None:
     assert not bench.screen.state.blocked
 
 
-@pytest.mark.parametrize("procedure", [docrime, escape, push_pull, find_sensor, measure_model_psf, measure_dark])
+@pytest.mark.parametrize(
+    "procedure", [docrime, escape, push_pull, find_sensor, measure_model_psf, measure_dark]
+)
 @pytest.mark.parametrize("frames", [0, -1])
 def test_no_frames(shared, procedure, frames):
     refuse(shared, procedure(shared, frames=frames), ConfigError, f"frames is {frames}")
