@@ -57,6 +57,7 @@ class _Session:
     n_modes: int
     grid: SubApertureGrid | None
     setup_frames: int
+    correlations: bool
     mean_frame: NDArray[np.float32] | None = None
     slopes_of: SlopeExtractor | None = None
     estimator: DocrimeEstimator | None = None
@@ -89,7 +90,11 @@ class _Session:
         self.slopes_of = extractor(self.bench, self.grid)
         self.motion, self.light = Motion(self.grid.n_slopes), LightWatch(self.bench.wfs.name, self.grid)
         self.estimator = DocrimeEstimator(
-            self.grid.n_slopes, self.n_modes, order=self.estimator_order, lags=self.lags
+            self.grid.n_slopes,
+            self.n_modes,
+            order=self.estimator_order,
+            lags=self.lags,
+            correlations=self.correlations,
         )
         for frame, poke in self.waiting:
             self._feed(frame, poke)
@@ -127,8 +132,12 @@ def docrime_run(
     whiten: bool = True,
     grid: SubApertureGrid | None = None,
     record: bool = False,
+    correlations: bool = True,
 ) -> Procedure[DocrimeRun]:
-    """As :func:`docrime`, with the solution beside the matrix, and with the telemetry if asked for."""
+    """As :func:`docrime`, with the solution beside the matrix, and with the telemetry if asked for.
+
+    The solution knows how the noise of the slopes is correlated unless ``correlations`` is false.
+    """
     c = bench.config.calibration
     n_frames = c.frames if frames is None else some_frames(frames)
     poke = c.poke if poke is None else poke
@@ -142,8 +151,9 @@ def docrime_run(
         )
     to_modes = np.linalg.pinv(m2c)
     session = _Session(
-        bench, c.whiten_order if whiten else 0, c.lags, m2c.shape[1], grid, min(SETUP_FRAMES, n_frames)
-    )
+        bench, c.whiten_order if whiten else 0, c.lags, m2c.shape[1], grid, min(SETUP_FRAMES, n_frames),
+        correlations,
+    )  # fmt: skip
     session.kept = [] if record else None
     shortened, partial = 0, False
     report = Reporter("DO-CRIME", n_frames)
@@ -237,7 +247,11 @@ def docrime(
     Aborted
         Stopped before a matrix could be solved.
     """
-    return (yield from docrime_run(bench, frames=frames, poke=poke, whiten=whiten, grid=grid)).result
+    # Nobody asks a matrix how the noise of its slopes is correlated.
+    run = yield from docrime_run(
+        bench, frames=frames, poke=poke, whiten=whiten, grid=grid, correlations=False
+    )
+    return run.result
 
 
 def _least_frames(n_modes: int, order: int, lags: int) -> int:

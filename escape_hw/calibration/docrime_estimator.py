@@ -10,10 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.regression import RegressionSums
 from escape_hw.calibration.response import (
+    SLOPES,
     ResponseTracker,
     autocovariance,
     filtered,
@@ -21,7 +23,7 @@ from escape_hw.calibration.response import (
     usable_rows,
 )
 from escape_hw.calibration.significance import require_response, spread
-from escape_hw.calibration.telemetry import Telemetry
+from escape_hw.calibration.telemetry import Recorder, Telemetry
 from escape_hw.calibration.whitening import apply_filter, prediction_error_filter
 from escape_hw.errors import CalibrationError, TooFewFrames
 
@@ -32,7 +34,7 @@ BLOCK = 500
 #: Degrees of freedom without which no standard error is worth stating.
 MIN_FREEDOM = 20
 #: Slopes that the filter, common to all, is found from.
-_FEW_SLOPES = 64
+_FEW_SLOPES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,14 +83,9 @@ class DocrimeEstimator:
         if order < 0 or lags < 1:
             raise ValueError(f"order is {order} and lags {lags}; they must be at least 0 and 1")
         self.n_slopes, self.n_modes, self.order, self.lags = n_slopes, n_modes, order, lags
-        self._index = np.empty(BURN_IN, np.int64)
-        self._slopes = np.empty((BURN_IN, n_slopes), np.float32)
-        self._pokes = np.empty((BURN_IN, n_modes), np.float32)
-        self._filled = 0
-        self._data: Telemetry | None = None
-        self._last_index: int | None = None
-        # Rows on the time line, on which long gaps are cut short; the first frame stands at row 0.
-        self._row, self._absorbed = -1, -1
+        self._recorder = Recorder(n_slopes, n_modes, BURN_IN)
+        self._shapes = (n_slopes,), (n_modes,)
+        self._next: int | None = None
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
         self._tracker: ResponseTracker | None = None
@@ -115,29 +112,25 @@ class DocrimeEstimator:
         ValueError
             Wrong shape, not finite, or an index that does not rise.
         """
-        if slopes.shape != (self.n_slopes,) or poke.shape != (self.n_modes,):
+        if slopes.shape != self._shapes[0] or poke.shape != self._shapes[1]:
             raise ValueError(
                 f"slopes {slopes.shape} and poke {poke.shape} do not fit "
                 f"({self.n_slopes},) and ({self.n_modes},)"
             )
-        # A sum of squares is finite when all numbers are, and takes a tenth of the time to ask.
-        if not math.isfinite(slopes.dot(slopes) + poke.dot(poke)):
-            raise ValueError(f"frame {index}: slopes or poke are not finite")
-        if self._last_index is not None and index <= self._last_index:
-            raise ValueError(f"frame index went from {self._last_index} to {index}; it must rise")
-        k, step = self._filled, 1 if self._last_index is None else index - self._last_index
-        self._row += min(step, self._longest_gap() + 1)
-        self.lost_frames += step - 1
-        self._index[k], self._slopes[k], self._pokes[k] = self._row, slopes, poke
-        self._last_index, self._filled = index, k + 1
-        if self._filled >= self._room():
+        if index != self._next:
+            return self.extend(np.array([index]), slopes[None], poke[None])
+        room = self._recorder.take_one(slopes, poke)
+        if room < 0:
+            raise _not_finite(index)
+        self._next = index + 1
+        if not room:
             self._absorb()
         return self
 
     def extend(
         self, index: NDArray[np.int64], slopes: NDArray[np.floating], pokes: NDArray[np.floating]
     ) -> DocrimeEstimator:
-        """Take many recorded frames at once; see :meth:`partial_fit`.
+        """Take many recorded frames at once, or none of them; see :meth:`partial_fit`.
 
         Parameters
         ----------
@@ -152,33 +145,39 @@ class DocrimeEstimator:
                 f"slopes {slopes.shape} and pokes {pokes.shape} do not fit {n} frames of "
                 f"{self.n_slopes} slopes and {self.n_modes} modes"
             )
+        if not n:
+            return self
         if not math.isfinite(np.vdot(slopes, slopes) + np.vdot(pokes, pokes)):
-            raise ValueError("slopes or pokes are not finite")
-        before = index[:1] - 1 if self._last_index is None else [self._last_index]
+            fine = np.isfinite(slopes).all(axis=1) & np.isfinite(pokes).all(axis=1)
+            raise _not_finite(int(index[np.argmin(fine)]))
+        before = index[0] - 1 if self._next is None else self._next - 1
         steps = np.diff(index, prepend=before)
         if (steps <= 0).any():
-            raise ValueError("frame indices must rise")
-        rows = self._row + np.cumsum(np.minimum(steps, self._longest_gap() + 1))
-        done = 0
-        while done < n:
-            take, k = min(self._room() - self._filled, n - done), self._filled
-            self._index[k : k + take] = rows[done : done + take]
-            self.lost_frames += int(steps[done : done + take].sum()) - take
-            self._slopes[k : k + take] = slopes[done : done + take]
-            self._pokes[k : k + take] = pokes[done : done + take]
-            done += take
-            self._last_index, self._filled = int(index[done - 1]), k + take
-            self._row = int(rows[done - 1])
-            if self._filled >= (BURN_IN if self._response is None else 250):
-                self._absorb()
+            k = int(np.argmax(steps <= 0))
+            last = before if k == 0 else index[k - 1]
+            raise ValueError(f"frame index went from {last} to {index[k]}; it must rise")
+        breaks = np.flatnonzero(steps[1:] != 1) + 1
+        for start, end in zip([0, *breaks], [*breaks, n], strict=True):
+            self._lose(int(steps[start]) - 1)
+            done = start
+            while done < end:
+                done += self._recorder.take(slopes[done:end], pokes[done:end])
+                if self._recorder.full:
+                    self._absorb()
+        self._next = int(index[-1]) + 1
         return self
 
-    def _longest_gap(self) -> int:
-        """A gap longer than the memory of filter and response separates the stretches for good."""
-        return 2 * (self.order + self.lags)
+    def _lose(self, frames: int) -> None:
+        """Lay out lost frames; a gap longer than all memory separates the stretches for good."""
+        self.lost_frames += frames
+        for _ in range(min(frames, self._memory() + self.order + self.lags)):
+            self._recorder.lose_one()
+            if self._recorder.full:
+                self._absorb()
 
-    def _room(self) -> int:
-        return BURN_IN if self._response is None else BLOCK
+    def _memory(self) -> int:
+        """Rows before a row that its filtered slopes and pokes are made of."""
+        return 2 * self.order + self.lags
 
     def solve(self) -> DocrimeSolution:
         """The matrix, its standard errors and the temporal response so far.
@@ -200,12 +199,14 @@ class DocrimeEstimator:
         sums = self._sums.centred()
         _require_excitation(sums.gram)
         matrix = sums.solve()
-        covariance = sums.residual_power(matrix) / (sums.count - self.n_modes - self.lags)
-        if covariance.ndim == 2 and self.order:
-            require_response(sums.gram, matrix, covariance, self.lags)
+        freedom = sums.count - self.n_modes - self.lags
+        if self.order:
+            rows, power = sums.sample(matrix)
+            require_response(sums.gram, rows, power / freedom, self.lags)
+        covariance = sums.residual_power(matrix) / freedom
         covariance = covariance if covariance.ndim == 2 else np.diag(covariance)
         variance = np.maximum(np.diag(covariance), 0.0) * self._spread
-        sigma = np.sqrt(np.outer(variance, np.diag(np.linalg.inv(sums.gram))))
+        sigma = np.outer(np.sqrt(variance), np.sqrt(sums.inverse_diagonal()))
         scale = self._tracker.scale()
         return DocrimeSolution(
             matrix * scale,
@@ -219,38 +220,36 @@ class DocrimeEstimator:
 
     def _absorb(self) -> None:
         """Move the gathered frames into the sums; fit the filter first if there is none yet."""
-        if not self._filled:
-            return
-        n, self._filled = self._filled, 0
-        fresh = Telemetry.from_frames(self._index[:n], self._slopes[:n], self._pokes[:n])
-        self.frames += n
-        start = 0
-        if self._data is not None:
-            start = 0 if self._response is None else self._data.present.size
-            fresh = self._data.followed_by(fresh, int(self._index[0]) - self._absorbed - 1)
-        self._absorbed = int(self._index[n - 1])
+        recorder = self._recorder
+        data, start = recorder.telemetry(), recorder.kept
+        self.frames += recorder.fresh
         if self._response is None:
-            self._fit(fresh)
+            start = 0
+            self._fit(data)
         if self._response is not None:
-            self._sum(fresh, start)
-            fresh = fresh.tail(2 * self.order + self.lags)
-        self._data = fresh
+            self._sum(data, start)
+        recorder.keep(recorder.filled if self._response is None else self._memory())
+        if self._response is None:
+            # Not enough to go by yet: the next call sees these frames again.
+            recorder.resize(recorder.filled + BURN_IN)
+        elif start == 0:
+            recorder.resize(recorder.filled + BLOCK)
 
     def _sum(self, data: Telemetry, start: int) -> None:
         """Add the rows from ``start`` on to the sums."""
         if self._whitener is None or self._response is None:
             raise RuntimeError("sums need the filter and the response")
-        slopes, pokes, now = filtered(data, self._whitener, self.lags, start)
-        if not now.size:
+        block = filtered(data, self._whitener, self.lags, start)
+        if not block.now.size:
             return
-        self._sums.add(slopes, apply_filter(pokes, self._response.weights, now))
+        self._sums.add(block.slopes, block.pokes_through(self._response.weights))
         if self._tracker is None:
             self._tracker = ResponseTracker(
-                self._sums.centred().solve(), self._response, now.size, autocovariance(pokes, now, self.lags)
+                self._sums.centred().solve(), self._response, block.now.size, autocovariance(block, self.lags)
             )
         elif self.order:
             # Without the filter later frames would tell less than the first ones' differences did.
-            self._tracker.add(slopes, pokes, now)
+            self._tracker.add(block)
 
     def _fit(self, data: Telemetry) -> None:
         """Temporal response and filter from the first frames: by frame differences, then by the filter.
@@ -261,7 +260,7 @@ class DocrimeEstimator:
             return
         _require_excitation(data.pokes.T @ data.pokes)
         # Differences tell the response well even where the plain estimator is asked for.
-        difference, few = np.array([1.0, -1.0]), data.thinned(_FEW_SLOPES)
+        difference, few = np.array([1.0, -1.0]), data.thinned(_FEW_SLOPES if self.order else SLOPES)
         response, whitener = fit_response(few, difference, self.lags), np.ones(1)
         if self.order:
             residuals, usable = self._residuals(few, difference, response)
@@ -275,8 +274,8 @@ class DocrimeEstimator:
         self, few: Telemetry, difference: NDArray[np.float64], response: TemporalResponse
     ) -> float:
         """Factor on the plain estimator's variance; the differences must show that there is a response."""
-        slopes, pokes, now = filtered(few, difference, self.lags)
-        seen = apply_filter(pokes, response.weights, now)
+        block = filtered(few, difference, self.lags)
+        slopes, seen, now = block.slopes, block.pokes_through(response.weights), block.now
         sums = RegressionSums.zeros(slopes.shape[1], self.n_modes, correlations=True)
         matrix = sums.add(slopes, seen).centred().solve()
         left = slopes - seen @ matrix.T.astype(np.float32)
@@ -284,18 +283,20 @@ class DocrimeEstimator:
         require_response(sums.gram, matrix, covariance * spread(left, seen, now, self.lags), self.lags)
         residuals, usable = self._residuals(few, difference, response)
         at = np.flatnonzero(usable)
-        return spread(residuals[at], apply_filter(few.pokes, response.weights, at), at, self.lags)
+        return spread(
+            residuals[at], apply_filter(few.rows, response.weights, at, few.n_slopes), at, self.lags
+        )
 
     def _residuals(
         self, data: Telemetry, whitener: NDArray[np.float64], response: TemporalResponse
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Slopes less what the pokes explain ``(n_times, n_slopes)``, and the rows where that is known."""
-        slopes, pokes, now = filtered(data, whitener, self.lags)
-        sums = RegressionSums.zeros(slopes.shape[1], self.n_modes, correlations=False)
-        matrix = sums.add(slopes, apply_filter(pokes, response.weights, now)).centred().solve()
+        block = filtered(data, whitener, self.lags)
+        sums = RegressionSums.zeros(data.n_slopes, self.n_modes, correlations=False)
+        matrix = sums.add(block.slopes, block.pokes_through(response.weights)).centred().solve()
         at = data.complete(0, self.lags)
         residuals = np.zeros_like(data.slopes)
-        explained = apply_filter(data.pokes, response.weights, at) @ matrix.T.astype(np.float32)
+        explained = apply_filter(data.rows, response.weights, at, data.n_slopes) @ matrix.T.astype(np.float32)
         residuals[at] = data.slopes[at] - explained
         usable = np.zeros_like(data.present)
         usable[at] = True
@@ -304,8 +305,14 @@ class DocrimeEstimator:
 
 def _require_excitation(gram: NDArray[np.floating]) -> None:
     """Raise :class:`CalibrationError` unless pokes with these sums of squares span the modes."""
-    values = np.linalg.eigvalsh(gram.astype(np.float64))
-    if values[0] <= 1e-7 * values[-1]:
+    # Factor and estimated condition: a twentieth of the time of the eigenvalues.
+    size = np.abs(gram).sum(axis=0).max()
+    factor, failed = lapack.dpotrf(gram)
+    if failed or lapack.dpocon(factor, size)[0] <= 1e-7:
         raise CalibrationError(
             "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
         )
+
+
+def _not_finite(index: int) -> ValueError:
+    return ValueError(f"frame {index}: slopes or pokes are not finite")

@@ -2,16 +2,62 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_toeplitz, toeplitz
+from scipy.linalg import cho_factor, cho_solve, solve_toeplitz, toeplitz
 
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.whitening import apply_filter
 
 #: Slopes that the response is estimated from, evenly spread; more tell little and take time.
-SLOPES = 128
+SLOPES = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Filtered:
+    """Filtered telemetry.
+
+    Parameters
+    ----------
+    rows
+        Filtered slopes and pokes ``(n_rows, n_slopes + n_modes)``.
+    now
+        Rows whose slopes and whose pokes of all lags are known ``(n,)``, rising.
+    n_slopes
+        How many columns are slopes.
+    """
+
+    rows: NDArray[np.float32]
+    now: NDArray[np.intp]
+    n_slopes: int
+
+    @property
+    def slopes(self) -> NDArray[np.float32]:
+        """Slopes of the usable rows ``(n, n_slopes)``."""
+        return self.before(0)[:, : self.n_slopes]
+
+    @property
+    def pokes(self) -> NDArray[np.float32]:
+        """Pokes of all rows ``(n_rows, n_modes)``."""
+        return self.rows[:, self.n_slopes :]
+
+    def before(self, lag: int) -> NDArray[np.float32]:
+        """The rows ``lag`` rows before the usable ones."""
+        return shifted(self.rows, self.now, lag)
+
+    def pokes_through(self, response: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Pokes as the usable rows' slopes saw them ``(n, n_modes)``."""
+        return apply_filter(self.rows, response, self.now, self.n_slopes)
+
+
+def shifted(rows: NDArray[np.float32], now: NDArray[np.intp], lag: int) -> NDArray[np.float32]:
+    """``rows[now - lag]``; a view where ``now`` is unbroken."""
+    if now.size and now[-1] - now[0] + 1 == now.size:
+        return rows[now[0] - lag : now[-1] - lag + 1]
+    return rows[now - lag]
 
 
 def usable_rows(data: Telemetry, order: int, lags: int) -> NDArray[np.intp]:
@@ -19,10 +65,8 @@ def usable_rows(data: Telemetry, order: int, lags: int) -> NDArray[np.intp]:
     return data.complete(order, lags + order)
 
 
-def filtered(
-    data: Telemetry, whitener: NDArray[np.float64], lags: int, start: int = 0
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.intp]]:
-    """Filtered slopes of all usable rows, filtered pokes of all rows, and where the two meet.
+def filtered(data: Telemetry, whitener: NDArray[np.float64], lags: int, start: int = 0) -> Filtered:
+    """Filter slopes and pokes alike.
 
     Parameters
     ----------
@@ -33,28 +77,20 @@ def filtered(
     lags
         Lags that must be known.
     start
-        First row wanted.
-
-    Returns
-    -------
-    slopes : ndarray, ``(n, n_slopes)``
-    pokes : ndarray, ``(n_rows, n_modes)``
-    now : ndarray, ``(n,)``
-        Row of ``pokes`` of the same moment as each row of ``slopes``; the lags before it are there.
+        First row whose slopes are wanted.
     """
     order = whitener.size - 1
     at = usable_rows(data, order, lags)
-    at = at[at >= start]
-    slopes = apply_filter(data.slopes, whitener, at)
-    # Pokes are known on every row, so one filtered copy serves all lags.
-    first = max(start - lags, order) if at.size else order
-    return slopes, apply_filter(data.pokes, whitener, np.arange(first, data.present.size)), at - first
+    at = at[np.searchsorted(at, start) :]
+    first = max(start - lags, order)
+    rows = apply_filter(data.rows, whitener, np.arange(first, data.present.size))
+    return Filtered(rows, at - first, data.n_slopes)
 
 
-def autocovariance(pokes: NDArray[np.float32], now: NDArray[np.intp], lags: int) -> NDArray[np.float64]:
+def autocovariance(data: Filtered, lags: int) -> NDArray[np.float64]:
     """Autocovariance of the filtered pokes by lag ``(lags,)``."""
-    present = pokes[now]
-    return np.array([float(np.vdot(present, pokes[now - lag])) for lag in range(lags)])
+    present, *past = (np.ascontiguousarray(data.before(lag)[:, data.n_slopes :]) for lag in range(lags))
+    return np.array([float(np.vdot(present, one)) for one in (present, *past)])
 
 
 def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> TemporalResponse:
@@ -79,15 +115,15 @@ def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> T
     TemporalResponse
         Standard errors hold for turbulence that moves neighbouring slopes together.
     """
-    slopes, pokes, now = filtered(data.thinned(SLOPES), whitener, lags)
-    slopes -= slopes.mean(axis=0)
-    pokes -= pokes.mean(axis=0)
+    few = filtered(data.thinned(SLOPES), whitener, lags)
+    slopes, pokes, now = few.slopes - few.slopes.mean(axis=0), few.pokes - few.pokes.mean(axis=0), few.now
     best = _strongest_lag(slopes, pokes, now, lags)
     middle = now.size // 2
     parts = [slice(0, middle), slice(middle, now.size)]
     weights, covariances = [], []
     for here, there in (parts, parts[::-1]):
-        w, c = _regress(slopes, pokes @ _matrix(slopes[here], pokes[now[here] - best]), now, lags, there)
+        matrix = _matrix(slopes[here], shifted(pokes, now[here], best))
+        w, c = _regress(slopes, pokes @ matrix, now, lags, there)
         weights.append(w)
         covariances.append(c)
     mean = np.mean(weights, axis=0)
@@ -97,16 +133,16 @@ def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> T
 def _strongest_lag(
     slopes: NDArray[np.float32], pokes: NDArray[np.float32], now: NDArray[np.intp], lags: int
 ) -> int:
-    few = np.ascontiguousarray(slopes[:, ::2])
-    return int(np.argmax([np.square(few.T @ pokes[now - lag]).sum() for lag in range(lags)]))
+    few = np.ascontiguousarray(slopes[:, ::3])
+    return int(np.argmax([np.square(few.T @ shifted(pokes, now, lag)).sum() for lag in range(lags)]))
 
 
 def _matrix(slopes: NDArray[np.float32], pokes: NDArray[np.float32]) -> NDArray[np.float32]:
     """Least squares ``(n_modes, n_slopes)``."""
-    gram = (pokes.T @ pokes).astype(np.float64)
+    gram = pokes.T @ pokes
     # Half a short run may hold fewer frames than modes; a little damping keeps the matrix finite.
     gram[np.diag_indices_from(gram)] += 1e-2 * np.trace(gram) / len(gram)
-    return np.linalg.solve(gram, pokes.T @ slopes).astype(np.float32)
+    return np.asarray(cho_solve(cho_factor(gram, check_finite=False), pokes.T @ slopes, check_finite=False))
 
 
 def _regress(
@@ -118,7 +154,7 @@ def _regress(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weights of the lags, scaled to sum 1, and their covariance, on a part of the rows."""
     at, y = now[part], slopes[part]
-    z = np.stack([predicted[at - lag] for lag in range(lags)])
+    z = np.stack([shifted(predicted, at, lag) for lag in range(lags)])
     flat = z.reshape(lags, -1)
     normal = (flat @ flat.T).astype(np.float64)
     weights = np.linalg.solve(normal, (flat @ y.ravel()).astype(np.float64))
@@ -164,27 +200,16 @@ class ResponseTracker:
         lags = first.weights.size
         self._normal, self._right, self.rows = np.zeros(lags), np.zeros(lags), 0
 
-    def add(self, slopes: NDArray[np.float32], pokes: NDArray[np.float32], now: NDArray[np.intp]) -> None:
-        """Take filtered slopes and pokes of a block.
-
-        Parameters
-        ----------
-        slopes
-            ``(n, n_slopes)``.
-        pokes
-            ``(n_rows, n_modes)``, every row of the block and of the lags before it.
-        now
-            Row of ``pokes`` that each row of ``slopes`` belongs to ``(n,)``, rising.
-        """
-        z = pokes @ self._matrix
-        y = np.ascontiguousarray(slopes[:, :: self._step])
-        unbroken = now[-1] - now[0] + 1 == now.size
+    def add(self, data: Filtered) -> None:
+        """Take a block of filtered slopes and pokes, with the rows of the lags before it."""
+        z = data.pokes @ self._matrix
+        slopes = np.ascontiguousarray(data.slopes[:, :: self._step])
+        present = shifted(z, data.now, 0)
         for lag in range(self._right.size):
-            past = z[now[0] - lag : now[-1] - lag + 1] if unbroken else z[now - lag]
-            present = z[now[0] : now[-1] + 1] if unbroken else z[now]
-            self._right[lag] += np.vdot(y, past)
+            past = shifted(z, data.now, lag)
+            self._right[lag] += np.vdot(slopes, past)
             self._normal[lag] += np.vdot(present, past)
-        self.rows += now.size
+        self.rows += data.now.size
 
     def response(self) -> TemporalResponse:
         """The response of all rows so far."""

@@ -35,7 +35,7 @@ _GAIN, _WIDTH, _SHAPE = 0, 6, 7
 _EXPLAINED = 0.8
 #: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
 #: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
-_FLOOR = np.array([0.05, 0.05, 5e-4, 0.03, 0.012])
+_FLOOR = np.array([0.04, 0.04, 3e-4, 0.035, 0.018])
 
 
 @dataclass(slots=True, eq=False)
@@ -346,7 +346,7 @@ def _covariance(
 ) -> NDArray[np.float64]:
     """Sandwich covariance of the common parameters, in units of their own.
 
-    The middle holds the noise with its correlation between slopes, where it is known, and else the
+    The middle holds the noise's correlation between patches, where it is known, and else the
     scatter of the scores from mode to mode, which shows what moved all slopes together while one
     mode was measured. To it comes the scatter from patch to patch of 2 x 2 sub-apertures as it is
     found, which includes what the model still misses: neighbouring lenslets fall on the pixels in
@@ -364,7 +364,9 @@ def _covariance(
         by_mode = each.sum(axis=1)
         meat += by_mode @ by_mode.T
     else:
-        whole = noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
+        # Within a patch the scatter holds the noise already.
+        apart = problem.patches[:, None] != problem.patches[None, :]
+        whole = np.where(apart, noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise))), 0.0)
         meat += np.einsum("psm,st,qtm->pq", scores, whole, scores, optimize=True)
     found = bread @ meat @ bread
     # Never better than the noise alone allows.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,57 +15,36 @@ class Telemetry:
 
     Parameters
     ----------
-    slopes
-        ``(n_times, n_slopes)``; rows of lost frames are zero.
-    pokes
-        ``(n_times, n_modes)``: the poke that was sent after the frame of that row; while a frame is
-        lost, the previous poke stays on the mirror.
+    rows
+        ``(n_times, n_slopes + n_modes)``: the slopes, and the poke that was sent after the frame of
+        that row. Slopes of lost frames are zero; while a frame is lost, the previous poke stays on
+        the mirror. Side by side, one pass filters both.
     present
         ``(n_times,)``, false where the frame was lost.
+    n_slopes
+        How many columns are slopes.
     """
 
-    slopes: NDArray[np.float32]
-    pokes: NDArray[np.floating]
+    rows: NDArray[np.float32]
     present: NDArray[np.bool_]
-
-    @classmethod
-    def from_frames(
-        cls, index: NDArray[np.int64], slopes: NDArray[np.float32], pokes: NDArray[np.floating]
-    ) -> Telemetry:
-        """Lay frames out by index.
-
-        Parameters
-        ----------
-        index
-            Frame index ``(n,)``, rising.
-        slopes, pokes
-            ``(n, n_slopes)`` and ``(n, n_modes)``: the slopes of each frame and the poke that was
-            sent when it had arrived.
-        """
-        if index.size and (np.diff(index) <= 0).any():
-            raise ValueError("frame indices must rise; was the camera restarted in the middle of a run?")
-        at = index - index[0] if index.size else index
-        n = int(at[-1]) + 1 if at.size else 0
-        present = np.zeros(n, dtype=bool)
-        present[at] = True
-        latest = np.maximum.accumulate(np.where(present, np.arange(n), 0))
-        all_slopes = np.zeros((n, slopes.shape[1]), np.float32)
-        all_slopes[at] = slopes
-        all_pokes = np.zeros((n, pokes.shape[1]), pokes.dtype)
-        all_pokes[at] = pokes
-        return cls(all_slopes, all_pokes[latest], present)
+    n_slopes: int
 
     @property
-    def n_lost(self) -> int:
-        """Number of lost frames."""
-        return int((~self.present).sum())
+    def slopes(self) -> NDArray[np.float32]:
+        """``(n_times, n_slopes)``."""
+        return self.rows[:, : self.n_slopes]
+
+    @property
+    def pokes(self) -> NDArray[np.float32]:
+        """``(n_times, n_modes)``."""
+        return self.rows[:, self.n_slopes :]
 
     def complete(self, past: int, lags: int) -> NDArray[np.intp]:
         """Rows whose last ``past`` slopes are all there and whose poke history is known."""
         n = self.present.size
         first = past + lags - 1
-        if n <= first:
-            return np.empty(0, dtype=np.intp)
+        if n <= first or self.present.all():
+            return np.arange(first, max(n, first))
         ok = np.ones(n - first, dtype=bool)
         for k in range(past + 1):
             ok &= self.present[first - k : n - k]
@@ -72,26 +52,100 @@ class Telemetry:
 
     def thinned(self, n_slopes: int) -> Telemetry:
         """At most ``n_slopes`` of the slopes, evenly spread."""
-        step = max(1, -(-self.slopes.shape[1] // n_slopes))
-        return Telemetry(np.ascontiguousarray(self.slopes[:, ::step]), self.pokes, self.present)
+        step = max(1, -(-self.n_slopes // n_slopes))
+        few = self.slopes[:, ::step]
+        return Telemetry(np.concatenate([few, self.pokes], axis=1), self.present, few.shape[1])
 
-    def tail(self, rows: int) -> Telemetry:
-        """The last ``rows`` rows, as the past of what follows."""
-        start = max(0, self.present.size - rows)
-        return Telemetry(self.slopes[start:], self.pokes[start:], self.present[start:])
 
-    def followed_by(self, other: Telemetry, gap: int = 0) -> Telemetry:
-        """The stretch itself, ``gap`` lost frames, and another."""
-        if gap:
-            hold = np.repeat(self.pokes[-1:], gap, axis=0)
-            blank = np.zeros((gap, self.slopes.shape[1]), np.float32)
-            return Telemetry(
-                np.concatenate([self.slopes, blank, other.slopes]),
-                np.concatenate([self.pokes, hold, other.pokes]),
-                np.concatenate([self.present, np.zeros(gap, bool), other.present]),
-            )
-        return Telemetry(
-            np.concatenate([self.slopes, other.slopes]),
-            np.concatenate([self.pokes, other.pokes]),
-            np.concatenate([self.present, other.present]),
-        )
+class Recorder:
+    """Gathers the frames of a run on its time line, in a buffer that is used again and again.
+
+    Parameters
+    ----------
+    n_slopes, n_modes
+        Sizes.
+    rows
+        Rows of the buffer.
+    """
+
+    def __init__(self, n_slopes: int, n_modes: int, rows: int) -> None:
+        self.n_slopes = n_slopes
+        self._rows = np.zeros((rows, n_slopes + n_modes), np.float32)
+        self._present = np.ones(rows, np.bool_)
+        self._slots: list[tuple[NDArray[np.float32], ...]] = []
+        #: Rows in use, and those of them that were there at the last :meth:`keep`.
+        self.filled = self.kept = 0
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no room for another frame."""
+        return self.filled == len(self._present)
+
+    @property
+    def fresh(self) -> int:
+        """Frames that arrived since the last :meth:`keep`."""
+        return int(np.count_nonzero(self._present[self.kept : self.filled]))
+
+    def take(self, slopes: NDArray[np.floating], pokes: NDArray[np.floating]) -> int:
+        """Put in consecutive frames ``(n, n_slopes)``, ``(n, n_modes)``.
+
+        Returns
+        -------
+        int
+            How many there was room for.
+        """
+        k, n = self.filled, min(len(slopes), len(self._present) - self.filled)
+        self._rows[k : k + n, : self.n_slopes] = slopes[:n]
+        self._rows[k : k + n, self.n_slopes :] = pokes[:n]
+        self.filled += n
+        return n
+
+    def take_one(self, slopes: NDArray[np.floating], poke: NDArray[np.floating]) -> int:
+        """Put in one frame ``(n_slopes,)``, ``(n_modes,)``, for which there must be room.
+
+        Returns
+        -------
+        int
+            How many more there is room for; -1 if the frame is not finite, and so was not taken.
+        """
+        if not self._slots:
+            rows = self._rows
+            self._slots = list(zip(rows, rows[:, : self.n_slopes], rows[:, self.n_slopes :], strict=True))
+        k = self.filled
+        row, its_slopes, its_poke = self._slots[k]
+        its_slopes[...] = slopes
+        its_poke[...] = poke
+        # A sum of squares is finite when all numbers are, and takes a tenth of the time to ask.
+        if not isfinite(row.dot(row)):
+            return -1
+        self.filled = k = k + 1
+        return len(self._slots) - k
+
+    def lose_one(self) -> None:
+        """Put in a lost frame, for which there must be room; something must stand before it."""
+        k = self.filled
+        self._rows[k, : self.n_slopes] = 0
+        self._rows[k, self.n_slopes :] = self._rows[k - 1, self.n_slopes :]
+        self._present[k] = False
+        self.filled = k + 1
+
+    def telemetry(self) -> Telemetry:
+        """All rows in use; a view, good until more is put in."""
+        return Telemetry(self._rows[: self.filled], self._present[: self.filled], self.n_slopes)
+
+    def keep(self, rows: int) -> None:
+        """Forget all but the last ``rows`` rows, the past of what follows."""
+        start = max(0, self.filled - rows)
+        n = self.filled - start
+        if start:
+            self._rows[:n] = self._rows[start : self.filled]
+            self._present[:n] = self._present[start : self.filled]
+            self._present[n:] = True
+        self.filled = self.kept = n
+
+    def resize(self, rows: int) -> None:
+        """Give the buffer another number of rows, at least those in use."""
+        old, used, self._slots = self.telemetry(), self.filled, []
+        self._rows = np.zeros((rows, old.rows.shape[1]), np.float32)
+        self._present = np.ones(rows, np.bool_)
+        self._rows[:used], self._present[:used] = old.rows, old.present

@@ -58,28 +58,52 @@ def prediction_error_filter(
 
 
 def apply_filter(
-    values: NDArray[np.floating], weights: NDArray[np.float64], at: NDArray[np.intp]
+    values: NDArray[np.floating], weights: NDArray[np.float64], at: NDArray[np.intp], column: int = 0
 ) -> NDArray[np.float32]:
-    """Filtered rows ``sum_k weights[k] values[at - k]``, ``(at.size, n)`` in single precision.
+    """Filtered rows ``sum_k weights[k] values[at - k]`` in single precision.
 
-    ``at`` rises; its unbroken stretches are filtered as slices, without index gathering.
+    Parameters
+    ----------
+    values
+        ``(n_times, n)``.
+    weights
+        The filter, latest first.
+    at
+        Rows wanted; they rise. All rows between the first and the last are filtered, and those not
+        wanted dropped.
+    column
+        First column wanted.
+
+    Returns
+    -------
+    ndarray, ``(at.size, n - column)``
     """
     source = np.ascontiguousarray(values, dtype=np.float32)
-    out = np.empty((at.size, source.shape[1]), np.float32)
-    breaks = np.flatnonzero(np.diff(at) != 1) + 1
-    for start, end in zip([0, *breaks], [*breaks, at.size], strict=True):
-        if end > start:
-            _filter(source, weights.astype(np.float32), int(at[start]), out[start:end])
-    return out
+    if not at.size:
+        return np.empty((0, source.shape[1] - column), np.float32)
+    first, n = int(at[0]), int(at[-1] - at[0]) + 1
+    # Whole quads of taps: one pass over a row serves four.
+    taps = np.zeros(-(-weights.size // 4) * 4, np.float32)
+    taps[: weights.size] = weights
+    out = np.empty((n, source.shape[1] - column), np.float32)
+    _filter(source, taps, first, column, out)
+    return out if n == at.size else out[at - first]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _filter(values, weights, first, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _filter(values, taps, first, column, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     for t in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[t, j] = weights[0] * values[first + t, j]
-        for k in range(1, weights.size):
-            w = weights[k]
-            if w != 0:
-                for j in range(out.shape[1]):
-                    out[t, j] += w * values[first + t - k, j]
+        # Whole rows as slices, else the compiler does not see that it may take many columns at once.
+        row = out[t]
+        for k in range(0, taps.size, 4):
+            a, b, c, d = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
+            # Taps that only fill the last quad may reach before the first row; they weigh nothing.
+            now = first + t - k
+            va, vb = values[max(now, 0), column:], values[max(now - 1, 0), column:]
+            vc, vd = values[max(now - 2, 0), column:], values[max(now - 3, 0), column:]
+            if k == 0:
+                for j in range(row.size):
+                    row[j] = a * va[j] + b * vb[j] + c * vc[j] + d * vd[j]
+            else:
+                for j in range(row.size):
+                    row[j] += a * va[j] + b * vb[j] + c * vc[j] + d * vd[j]

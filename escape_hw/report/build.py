@@ -183,7 +183,12 @@ def _sky_time(run: RunContent) -> str:
     if not curves:
         return ""
     drawing = figures_registration.error_curves(curves)
-    caption = "Error of the registration against the frames used, with the Cramér-Rao bound."
+    plants = f", rms over {curves['plants']} random plants" if "plants" in curves else ""
+    caption = f"Error of the registration against the frames used{plants}, with the Cramér-Rao bound."
+    fewest = curves.get("fewest_frames") or {}
+    if fewest:
+        met = ", ".join(f"{name} {count or 'none of these'}" for name, count in fewest.items())
+        caption += f" Fewest frames that meet every goal: {met}."
     return html.section("Sky time", html.figure("skytime", drawing, caption))
 
 

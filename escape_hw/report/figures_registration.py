@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import RegistrationEstimate
@@ -78,6 +78,11 @@ def error_curves(curves: Mapping[str, Any]) -> Figure:
             panel.axhline(curves["goal"][name], color=style.MUTED, lw=1.0, ls=":", label="goal")
         style.tidy(panel).set_title(title, fontsize=9.5)
         panel.set(xlabel="frames", ylabel=f"rms error [{_SHORT_UNITS[unit]}]")
+        # The frames themselves, few enough to be read: powers of ten tell little over one decade.
+        labelled = frames[:: -(-frames.size // 5)]
+        panel.xaxis.set_major_locator(FixedLocator(list(labelled)))
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
+        panel.xaxis.set_minor_locator(NullLocator())
     handles, labels = panels[0].get_legend_handles_labels()
     style.bare(panels[5]).legend(
         handles, labels, loc="center", frameon=False, fontsize=9, labelcolor=style.INK

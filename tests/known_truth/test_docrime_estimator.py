@@ -180,3 +180,54 @@ def test_pokes_that_leave_a_mode_alone_are_refused():
     pokes[:, 4] = 0
     with pytest.raises(CalibrationError, match="excite"):
         solved(slopes, pokes)
+
+
+@pytest.mark.parametrize("at", [200, 1700])
+def test_a_refused_frame_is_named_and_leaves_no_trace(at):
+    slopes, pokes, _ = make(2500)
+    broken = slopes.copy()
+    broken[at, 3] = np.nan
+    one, many = DocrimeEstimator(N_SLOPES, N_MODES), DocrimeEstimator(N_SLOPES, N_MODES)
+    many.extend(np.arange(100), slopes[:100], pokes[:100])
+    with pytest.raises(ValueError, match=f"frame {at}: .*not finite"):
+        many.extend(np.arange(100, 2500), broken[100:], pokes[100:])
+    many.extend(np.arange(100, 2500), slopes[100:], pokes[100:])
+    for k in range(2500):
+        if k == at:
+            with pytest.raises(ValueError, match=f"frame {at}: .*not finite"):
+                one.partial_fit(k, broken[k], pokes[k])
+        one.partial_fit(k, slopes[k], pokes[k])
+    assert np.array_equal(one.solve().matrix, many.solve().matrix)
+    assert one.frames == 2500
+
+
+def test_frames_that_are_too_few_to_begin_with_are_not_forgotten():
+    # One row in 51 has a whole past, so the first thousand frames hold fewer than the 37 needed.
+    slopes, pokes, truth = make(9000, turbulence=0.02)
+    keep = np.random.default_rng(0).random(9000) > 0.43
+    keep[0] = True
+    held = pokes.copy()
+    for k in np.flatnonzero(~keep):
+        held[k] = held[k - 1]
+    seen = sum(w * np.roll(held - pokes, lag, axis=0) for lag, w in enumerate(RESPONSE))
+    slopes += (seen @ truth.T).astype(np.float32)
+    index = np.flatnonzero(keep)
+    with pytest.raises(TooFewFrames):
+        solved(slopes[:1001], pokes[:1001], keep[:1001])
+    estimator = DocrimeEstimator(N_SLOPES, N_MODES).extend(index, slopes[index], pokes[index])
+    s = estimator.solve()
+    assert s.frames == int(keep.sum())
+    assert s.lost_frames == index[-1] + 1 - index.size
+    # So few frames leave the response, and with it the gain common to all elements, uncertain.
+    gain = float(np.vdot(s.matrix, truth) / np.vdot(truth, truth))
+    assert gain == pytest.approx(1, abs=0.15)
+    assert np.mean(((s.matrix - gain * truth) / s.sigma) ** 2) == pytest.approx(1.0, abs=0.3)
+
+
+@pytest.mark.parametrize("correlations", [True, False])
+@pytest.mark.parametrize("order", [0, 6])
+def test_a_mirror_that_nothing_answers_to_is_refused(correlations, order):
+    slopes, pokes, _ = make(3000, poke=0.0)
+    poked = np.random.default_rng(9).uniform(-0.01, 0.01, pokes.shape)
+    with pytest.raises(CalibrationError, match="does not respond"):
+        solved(slopes, poked, correlations=correlations, order=order)

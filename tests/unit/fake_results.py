@@ -180,6 +180,8 @@ def sky_time() -> dict[str, object]:
         name: [float(s * np.sqrt(300 / f)) for f in frames] for name, s in zip(names, SIGMA, strict=True)
     }
     return {
+        "plants": 20,
+        "fewest_frames": {"whitened": 500, "plain": None},
         "frames": frames,
         "estimators": {
             "whitened": {name: [1.3 * v for v in values] for name, values in bound.items()},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from escape_hw.calibration import regression
 from escape_hw.calibration.regression import RegressionSums
 
 N, N_SLOPES, N_MODES = 400, 9, 5
@@ -29,6 +30,8 @@ def test_blocks_add_up_to_least_squares_with_an_intercept(offset):
     answer = np.linalg.lstsq(design, slopes.astype(float), rcond=None)[0]
     matrix = centred.solve()
     assert matrix == pytest.approx(answer[:-1].T, abs=1e-4)
+    inverse = np.diag(np.linalg.inv((pokes - pokes.mean(0)).T.astype(float) @ (pokes - pokes.mean(0))))
+    assert centred.inverse_diagonal() == pytest.approx(inverse, rel=1e-4)
     residual = slopes - design @ answer
     assert centred.residual_power(matrix) == pytest.approx(residual.T @ residual, rel=1e-3, abs=2e-2)
 
@@ -49,3 +52,17 @@ def test_empty_sums_are_empty():
     sums = RegressionSums.zeros(3, 2, correlations=True).centred()
     assert sums.count == 0
     assert not sums.gram.any()
+
+
+@pytest.mark.parametrize("correlations", [True, False])
+@pytest.mark.parametrize("limit", [64, 5, 4])
+def test_correlations_of_a_few_slopes_are_always_known(monkeypatch, correlations, limit):
+    monkeypatch.setattr(regression, "FEW", limit)
+    slopes, pokes = data(1.0)
+    full = RegressionSums.zeros(N_SLOPES, N_MODES, correlations=True).add(slopes, pokes).centred()
+    sums = RegressionSums.zeros(N_SLOPES, N_MODES, correlations=correlations).add(slopes, pokes).centred()
+    matrix = sums.solve()
+    step = {64: 1, 5: 2, 4: 3}[limit]
+    rows, power = sums.sample(matrix)
+    assert np.array_equal(rows, matrix[::step])
+    assert power == pytest.approx(full.residual_power(matrix)[::step, ::step], rel=1e-3, abs=2e-2)

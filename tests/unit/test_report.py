@@ -314,3 +314,8 @@ def test_picture_of_a_run(tmp_path):
     with pytest.raises(ProductError, match="no closed-loop image"):
         write_picture(make_run(tmp_path / "lean", lean=True), tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()
+
+
+def test_sky_time_is_told_in_words_too(page):
+    assert "rms over 20 random plants" in page
+    assert "Fewest frames that meet every goal: whitened 500, plain none of these." in page

@@ -5,49 +5,46 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.telemetry import Telemetry
+from escape_hw.calibration.telemetry import Recorder, Telemetry
 
 
-def stretch(index, n_slopes=3, n_modes=2):
+def recorder(index, rows=100, n_slopes=3, n_modes=2):
     """Rows that carry their own index."""
-    index = np.asarray(index, np.int64)
-    slopes = np.repeat(index[:, None], n_slopes, 1).astype(np.float32)
-    return Telemetry.from_frames(index, slopes, np.repeat(10.0 * index[:, None], n_modes, 1))
+    r = Recorder(n_slopes, n_modes, rows)
+    for k, i in enumerate(index):
+        for _ in range(i - index[k - 1] - 1 if k else 0):
+            r.lose_one()
+        assert r.take_one(np.full(n_slopes, i, np.float32), np.full(n_modes, 10.0 * i)) == rows - r.filled
+    return r
+
+
+def stretch(index):
+    return recorder(index).telemetry()
 
 
 def test_rows_stand_at_their_index():
     t = stretch([5, 6, 8, 11])
     assert t.present.tolist() == [True, True, False, True, False, False, True]
     assert t.slopes[:, 0].tolist() == [5, 6, 0, 8, 0, 0, 11]
-    assert t.n_lost == 3
+    assert t.slopes.shape == (7, 3)
+    assert t.pokes.shape == (7, 2)
 
 
 def test_while_a_frame_is_lost_the_last_poke_stays():
     assert stretch([5, 6, 8, 11]).pokes[:, 0].tolist() == [50, 60, 60, 80, 80, 80, 110]
 
 
-def test_single_precision_pokes_stay_single():
-    pokes = np.zeros((2, 1), np.float32)
-    assert Telemetry.from_frames(np.arange(2), np.zeros((2, 1), np.float32), pokes).pokes.dtype == np.float32
-
-
-@pytest.mark.parametrize("index", [[3, 3], [4, 2], [1, 2, 3, 3, 4]])
-def test_an_index_that_does_not_rise_is_refused(index):
-    with pytest.raises(ValueError, match="must rise"):
-        stretch(index)
-
-
 def test_nothing_is_a_stretch_too():
     empty = stretch([])
     assert empty.slopes.shape == (0, 3)
-    assert empty.n_lost == 0
     assert empty.complete(2, 3).size == 0
 
 
 @pytest.mark.parametrize(("past", "lags"), [(0, 1), (2, 1), (0, 3), (2, 4)])
-def test_complete_rows_are_those_with_all_they_need(past, lags):
+@pytest.mark.parametrize("lost", [0.0, 0.15])
+def test_complete_rows_are_those_with_all_they_need(past, lags, lost):
     rng = np.random.default_rng(0)
-    t = stretch(np.flatnonzero(rng.random(80) > 0.15))
+    t = stretch(np.flatnonzero(rng.random(80) >= lost))
     want = [
         k
         for k in range(past + lags - 1, t.present.size)
@@ -55,30 +52,69 @@ def test_complete_rows_are_those_with_all_they_need(past, lags):
         if all(t.present[k - j] for j in range(past + 1))
     ]
     assert t.complete(past, lags).tolist() == want
-    assert 0 < len(want) < 80
+    assert 0 < len(want) <= 80
 
 
-@pytest.mark.parametrize("cut", [1, 4, 9])
-def test_two_stretches_make_one(cut):
-    index = np.array([0, 1, 2, 4, 5, 9, 10, 11, 12, 15])
-    whole = stretch(index)
-    first, second = stretch(index[:cut]), stretch(index[cut:])
-    joined = first.followed_by(second, int(index[cut] - index[cut - 1] - 1))
-    for name in ("slopes", "pokes", "present"):
-        assert np.array_equal(getattr(joined, name), getattr(whole, name))
+def test_many_frames_at_once_are_many_single_ones():
+    slopes, pokes = np.arange(12.0).reshape(4, 3), np.arange(8.0).reshape(4, 2)
+    one, many = Recorder(3, 2, 3), Recorder(3, 2, 3)
+    assert [one.take_one(s, p) for s, p in zip(slopes[:3], pokes[:3], strict=True)] == [2, 1, 0]
+    assert many.take(slopes, pokes) == 3
+    assert one.full
+    assert many.full
+    assert np.array_equal(one.telemetry().rows, many.telemetry().rows)
+    assert np.array_equal(many.telemetry().pokes, pokes[:3])
 
 
-def test_the_tail_is_the_last_rows():
-    t = stretch([0, 1, 3, 4])
-    assert t.tail(2).slopes[:, 0].tolist() == [3, 4]
-    assert t.tail(3).present.tolist() == [False, True, True]
-    assert t.tail(99).slopes.shape == t.slopes.shape
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("where", ["slopes", "poke"])
+def test_a_frame_that_is_not_finite_is_not_taken(bad, where):
+    r = recorder([0, 1])
+    slopes, poke = np.ones(3, np.float32), np.ones(2)
+    (slopes if where == "slopes" else poke)[1] = bad
+    assert r.take_one(slopes, poke) == -1
+    assert r.filled == 2
+    assert r.take_one(np.full(3, 2, np.float32), np.full(2, 20.0)) > 0
+    assert np.array_equal(r.telemetry().rows, stretch([0, 1, 2]).rows)
+
+
+def test_what_is_kept_is_the_past_of_what_follows():
+    index = [0, 1, 3, 4]
+    r = recorder(index, rows=6)
+    assert r.fresh == 4
+    r.keep(3)
+    assert (r.filled, r.kept, r.fresh) == (3, 3, 0)
+    for i in (5, 6, 7):
+        assert r.take_one(np.full(3, i, np.float32), np.full(2, 10.0 * i)) == 7 - i
+    assert r.fresh == 3
+    t = r.telemetry()
+    assert t.slopes[:, 0].tolist() == [0, 3, 4, 5, 6, 7]
+    assert t.pokes[:, 0].tolist() == [10, 30, 40, 50, 60, 70]
+    assert t.present.tolist() == [False, True, True, True, True, True]
+    r.keep(99)
+    assert r.filled == 6
+    assert r.fresh == 0
+
+
+@pytest.mark.parametrize("rows", [4, 9])
+def test_another_size_changes_nothing_that_is_there(rows):
+    r = recorder([0, 1, 3], rows=6)
+    before = r.telemetry()
+    r.resize(rows)
+    after = r.telemetry()
+    assert np.array_equal(after.rows, before.rows)
+    assert np.array_equal(after.present, before.present)
+    room = rows - 4
+    assert r.full == (room == 0)
+    for k in range(room):
+        assert r.take_one(np.ones(3, np.float32), np.ones(2)) == room - k - 1
+    assert r.telemetry().present.tolist() == [True, True, False, True] + [True] * room
 
 
 @pytest.mark.parametrize(("limit", "kept"), [(100, 10), (10, 10), (5, 5), (4, 4), (3, 3), (1, 1)])
 def test_thinning_keeps_at_most_so_many_slopes(limit, kept):
     rng = np.random.default_rng(1)
-    t = Telemetry.from_frames(np.arange(4), rng.standard_normal((4, 10)).astype(np.float32), np.zeros((4, 1)))
+    t = Telemetry(rng.standard_normal((4, 11)).astype(np.float32), np.ones(4, bool), 10)
     thin = t.thinned(limit)
     assert 0 < thin.slopes.shape[1] <= kept
     assert np.isin(thin.slopes, t.slopes).all()

@@ -101,4 +101,6 @@ def test_applying_a_filter_is_a_convolution(dtype):
     assert got.dtype == np.float32
     assert got == pytest.approx(want, abs=1e-5)
     assert apply_filter(x, w, np.empty(0, np.intp)).shape == (0, 7)
+    assert apply_filter(x, w, at, 3) == pytest.approx(want[:, 3:], abs=1e-5)
+    assert apply_filter(x, w, np.empty(0, np.intp), 3).shape == (0, 4)
     assert apply_filter(np.asfortranarray(x), w, at) == pytest.approx(want, abs=1e-5)
