@@ -1,0 +1,89 @@
+"""Hardly enough frames: the errors are large and honest, whatever comes out is never garbage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_bench import PLANTED, small
+
+from escape_hw.calibration.docrime import docrime_run
+from escape_hw.calibration.sprint import sprint
+from escape_hw.errors import TooFewFrames
+
+#: Fewest frames that 30 modes with a filter of 6 and 5 lags may start with, and a few more.
+JUST_ENOUGH = (82, 90, 130)
+RUNS = 4
+
+
+@pytest.fixture(scope="module")
+def short_runs(good):
+    """A few runs of each length, plain and whitened, on one bench."""
+    with small("twin.loss_probability=0") as bench:
+        return {
+            (n, whiten): [
+                bench.run(docrime_run(bench, frames=n, grid=good.grid, whiten=whiten)) for _ in range(RUNS)
+            ]
+            for n in JUST_ENOUGH
+            for whiten in (True, False)
+        }
+
+
+@pytest.mark.parametrize("whiten", [True, False])
+@pytest.mark.parametrize("frames", JUST_ENOUGH)
+def test_stated_errors_against_the_truth(good, short_runs, frames, whiten):
+    chi2, gains = [], []
+    for run in short_runs[frames, whiten]:
+        matrix = run.result.matrix
+        assert np.isfinite(matrix.data).all()
+        assert (matrix.sigma > 0).all()
+        gain = float(np.vdot(matrix.data, good.matrix.data) / np.vdot(good.matrix.data, good.matrix.data))
+        # The response is scaled to sum 1 and comes from few frames: it errs for all elements alike.
+        errors = (matrix.data / gain - good.matrix.data) / np.hypot(matrix.sigma, good.matrix.sigma)
+        chi2.append(np.mean(np.square(errors)))
+        gains.append(gain)
+    assert 0.5 < np.mean(chi2) < 2
+    assert np.abs(np.array(gains) - 1).max() < (0.25 if whiten else 0.5)
+
+
+def test_errors_grow_towards_the_limit(short_runs):
+    sizes = [np.median([run.result.matrix.sigma for run in short_runs[n, True]]) for n in JUST_ENOUGH]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[0] > 1.3 * sizes[-1]
+
+
+@pytest.mark.parametrize("frames", JUST_ENOUGH)
+def test_the_registration_is_right_within_its_errors_or_says_that_it_is_not(good, short_runs, frames):
+    pulls = []
+    for run in short_runs[frames, True][: RUNS // 2]:
+        estimate = sprint(run.result.matrix, good.model, modes=20, covariance=run.solution.covariance)
+        if estimate.converged:
+            pulls.append((estimate.registration.to_array() - PLANTED) / estimate.sigma)
+        else:
+            assert estimate.warnings
+    assert pulls
+    assert np.abs(pulls).max() < 5
+    assert np.mean(np.square(pulls)) < 3
+
+
+def test_the_full_bench_at_its_limit():
+    from escape_hw.runtime.system import open_system
+
+    with open_system("razor-shwfs") as bench:
+        with pytest.raises(TooFewFrames, match=r"209 frames cannot constrain 94 modes.* at least 210"):
+            bench.run(docrime_run(bench, frames=209))
+        assert bench.dm.sent_count == 0
+        run = bench.run(docrime_run(bench, frames=215))
+        estimate = sprint(
+            run.result.matrix, bench.model(run.result.grid), modes=50, covariance=run.solution.covariance
+        )
+    assert estimate.converged, estimate.warnings
+    pulls = (estimate.registration.to_array() - PLANTED) / estimate.sigma
+    assert np.abs(pulls).max() < 4
+
+
+def test_loss_that_leaves_too_few_complete_frames_is_an_error():
+    """Enough frames were asked for, but half of them got lost: refused with the number needed."""
+    with small("twin.loss_probability=0.5") as bench:
+        with pytest.raises(TooFewFrames, match=r"complete frames cannot constrain 30 modes; at least \d+"):
+            bench.run(docrime_run(bench, frames=100))
+        assert not bench.dm.shape.any()

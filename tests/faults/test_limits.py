@@ -1,0 +1,100 @@
+"""Pokes that the mirror's limits cut short are still known pokes: the matrix stays unbiased."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_bench import PLANTED, assert_flat, faulty, small
+
+from escape_hw.calibration.docrime import docrime_run
+from escape_hw.calibration.push_pull import push_pull
+from escape_hw.calibration.sensor_setup import modal_basis
+from escape_hw.calibration.sprint import sprint
+from escape_hw.errors import CalibrationError, ConfigError
+
+LIMITS = {
+    "stroke": "devices.dm.limits.max_stroke=0.05",
+    "tiny stroke": "devices.dm.limits.max_stroke=0.02",
+    "slew": "devices.dm.limits.max_slew=0.05",
+    "neighbours": "devices.dm.limits.max_neighbour=0.05",
+    "mean": "devices.dm.limits.max_mean=0.001",
+}
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_docrime_with_shortened_pokes(good, name):
+    with faulty("twin.loss_probability=0", LIMITS[name], dm={}) as bench:
+        run = bench.run(docrime_run(bench, frames=600, grid=good.grid))
+        reached = np.array(bench.dm.reached)
+        limits = bench.dm.limits
+        m2c = run.result.matrix.m2c
+        assert_flat(bench)
+    assert run.result.matrix.metrics["shortened"] > 300
+    assert np.abs(reached).max() <= limits.max_stroke
+    assert np.abs(np.diff(reached, axis=0)).max() <= (limits.max_slew or 2) + 1e-9
+    # What reached the mirror lies in the span of the modes: nothing else can pass for their response.
+    assert np.abs(reached - reached @ np.linalg.pinv(m2c).T @ m2c.T).max() < 1e-9
+    matrix = run.result.matrix
+    errors = (matrix.data - good.matrix.data) / np.hypot(matrix.sigma, good.matrix.sigma)
+    assert np.mean(np.square(errors)) == pytest.approx(1, abs=0.5)
+    gain = np.vdot(matrix.data, good.matrix.data) / np.vdot(good.matrix.data, good.matrix.data)
+    assert gain == pytest.approx(1, abs=0.03)
+    estimate = sprint(matrix, good.model, modes=20, covariance=run.solution.covariance)
+    assert estimate.converged, estimate.warnings
+    assert np.abs((estimate.registration.to_array() - PLANTED) / estimate.sigma).max() < 4
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_push_pull_with_shortened_pokes(good, name):
+    matrices = []
+    for limits in ((), (LIMITS[name],)):
+        with small("twin.loss_probability=0", *limits) as bench:
+            bench.screen.set(inserted=False)
+            matrices.append(bench.run(push_pull(bench, frames=15, grid=good.grid)).matrix)
+            assert_flat(bench)
+    free, limited = matrices
+    gain = np.vdot(limited.data, free.data) / np.vdot(free.data, free.data)
+    assert gain == pytest.approx(1, abs=0.03)
+    errors = (limited.data - free.data) / np.hypot(limited.sigma, free.sigma)
+    # Vibration is common to the frames of a push, so the scatter within it understates a little.
+    assert np.mean(np.square(errors)) < 4
+
+
+@pytest.mark.parametrize("disabled", [(0, 5, 6, 7, 20, 30)])
+def test_disabled_actuators(disabled):
+    numbers = list(disabled)
+    with faulty(f"devices.dm.limits.disabled={numbers}", dm={}) as bench:
+        run = bench.run(docrime_run(bench, frames=800))
+        reached = np.array(bench.dm.reached)
+        model = bench.model(run.result.grid)
+        m2c = modal_basis(bench)
+        assert_flat(bench)
+    assert not reached[:, numbers].any()
+    assert not m2c[numbers].any()
+    assert np.linalg.matrix_rank(m2c) == 30
+    assert run.result.matrix.snr().min() > 5
+    estimate = sprint(run.result.matrix, model, modes=20, covariance=run.solution.covariance)
+    assert estimate.converged, estimate.warnings
+    assert np.abs((estimate.registration.to_array() - PLANTED) / estimate.sigma).max() < 5
+
+
+def test_more_modes_than_working_actuators_make():
+    disabled = list(range(7))
+    with small(f"devices.dm.limits.disabled={disabled}") as bench:
+        with pytest.raises(CalibrationError, match="30 modes asked for; this mirror of 30 actuators"):
+            bench.run(docrime_run(bench, frames=400))
+        assert bench.dm.sent_count == 0
+
+
+def test_a_stored_basis_that_moves_a_disabled_actuator(good, tmp_path):
+    from escape_hw.io.fits import save_matrix
+
+    path = save_matrix(tmp_path / "basis.fits", good.run.result)
+    basis = ("basis.kind=file", f"basis.file={path}")
+    with small(*basis) as bench:
+        np.testing.assert_allclose(modal_basis(bench), good.matrix.m2c, rtol=1e-9)
+    with (
+        small(*basis, "devices.dm.limits.disabled=[3]") as bench,
+        pytest.raises(ConfigError, match="disabled"),
+    ):
+        modal_basis(bench)
