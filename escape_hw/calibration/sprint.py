@@ -367,7 +367,9 @@ def _covariance(
         # Within a patch the scatter holds the noise already.
         apart = problem.patches[:, None] != problem.patches[None, :]
         whole = np.where(apart, noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise))), 0.0)
-        meat += np.einsum("psm,st,qtm->pq", scores, whole, scores, optimize=True)
+        # Only what adds to the errors counts: negative correlations are too uncertain to trade on.
+        shares, directions = np.linalg.eigh(np.einsum("psm,st,qtm->pq", scores, whole, scores, optimize=True))
+        meat += (directions * np.maximum(shares, 0.0)) @ directions.T
     found = bread @ meat @ bread
     # Never better than the noise alone allows.
     scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))
