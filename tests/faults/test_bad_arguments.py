@@ -150,6 +150,6 @@ def test_nan_slopes_never_become_a_matrix(bench, good, monkeypatch):
         return np.full(self.grid.n_slopes, np.nan, np.float32)
 
     monkeypatch.setattr(SlopeExtractor, "__call__", broken)
-    with pytest.raises(ValueError, match="slopes or poke are not finite"):
+    with pytest.raises(ValueError, match="slopes or pokes are not finite"):
         bench.run(docrime(bench, frames=300, grid=good.grid))
     assert_flat(bench)
