@@ -8,8 +8,6 @@ fits what the synthetic model does not know as random effects (see :mod:`~.misfi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,169 +16,19 @@ from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, SprintIteration
-from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
+from escape_hw.calibration.linearisation import GAIN, WIDTH, Problem, State
+from escape_hw.calibration.misfit import NormalEquations, Priors
 from escape_hw.errors import CalibrationError, IncompatibleProduct
 
-#: Half steps of the central differences, in the units of the parameters.
-_STEPS = np.array([2.0, 2.0, 0.05, 0.2, 0.2])
 #: Largest move in one iteration: the model is only locally linear.
 _LARGEST = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
 #: A step below this many standard errors, or below the last column of the table, ends the descent.
 _SMALL = np.array([5e-3, 5e-3, 2e-4, 2e-3, 2e-3])
-_WIDTH_STEP = 0.05
-#: Width of the broad pedestal that influence functions may stand on, relative to their own.
-_PEDESTAL = 1.7
-_GAIN, _WIDTH, _SHAPE = 0, 6, 7
 #: Share of what noise leaves to explain that the model must explain to be believed.
 _EXPLAINED = 0.8
 #: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
 #: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
 _FLOOR = np.array([0.04, 0.04, 3e-4, 0.035, 0.018])
-
-
-@dataclass(slots=True, eq=False)
-class _State:
-    """Present values: common parameters and random effects."""
-
-    gain: float
-    alpha: NDArray[np.float64]
-    width: float
-    shape: float
-    variant: NDArray[np.float64]
-    sampling: NDArray[np.float64]
-    actuator_gain: NDArray[np.float64]
-    actuator_width: NDArray[np.float64]
-    slope_gain: NDArray[np.float64]
-
-    def offset(self) -> NDArray[np.float64]:
-        """Distance from the priors' means, in the order of the unknowns."""
-        head = np.concatenate([[0.0], np.zeros(5), [self.width, self.shape]])
-        return np.concatenate(
-            [head, self.variant, self.sampling, self.actuator_gain, self.actuator_width, self.slope_gain]
-        )
-
-
-class _Problem:
-    """One matrix, one model, and the weights between them."""
-
-    def __init__(
-        self, matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], priors: Priors
-    ) -> None:
-        data = matrix.data[:, columns].astype(float)
-        sigma = matrix.sigma[:, columns].astype(float)
-        self.model, self.priors = model, priors
-        self.m2c = matrix.m2c[:, columns]
-        self.measured_errors = bool((sigma > 0).all())
-        if self.measured_errors:
-            # Standard errors factor into slopes' noise and modes' excitation: both estimators say so.
-            power = np.log(sigma)
-            self.by_slope = np.exp(power.mean(axis=1) - power.mean())
-            self.by_mode = np.exp(power.mean(axis=0))
-        else:
-            self.by_slope = np.ones(data.shape[0])
-            self.by_mode = np.full(data.shape[1], max(float(data.std()), 1e-30))
-        self.data = data / self.by_slope[:, None] / self.by_mode
-        self.modes = self.m2c / self.by_mode
-        self.variants = tuple(model.variants())
-        rows, cols = np.nonzero(matrix.valid)
-        # x slopes share what their column does to them, y slopes what their row does.
-        self.lines = np.unique(np.concatenate([cols, matrix.valid.shape[1] + rows]), return_inverse=True)[1]
-        self.n_lines = int(self.lines.max()) + 1
-        self.patches = np.tile(np.unique(rows // 2 * 1000 + cols // 2, return_inverse=True)[1], 2)
-        self.precision = np.concatenate(
-            [
-                np.zeros(6),
-                [priors.width**-2, priors.shape**-2],
-                np.ones(len(self.variants)),
-                np.full(self.n_lines, priors.sampling**-2),
-                np.full(model.n_act, priors.actuator_gain**-2),
-                np.full(model.n_act, priors.actuator_width**-2),
-                np.full(data.shape[0], priors.slope_gain**-2),
-            ]
-        )
-
-    def start(self, registration: Registration) -> _State:
-        n_act, n_slopes = self.model.n_act, self.data.shape[0]
-        zeros = np.zeros(n_act)
-        model = self._weighted(self.model.zonal_matrix(registration)) @ self.modes
-        gain = float(np.vdot(model, self.data) / np.vdot(model, model))
-        return _State(
-            gain,
-            registration.to_array(),
-            0.0,
-            0.0,
-            np.zeros(len(self.variants)),
-            np.zeros(self.n_lines),
-            zeros,
-            zeros.copy(),
-            np.zeros(n_slopes),
-        )
-
-    def _weighted(self, zonal: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(zonal / self.by_slope[:, None])
-
-    def linearise(self, state: _State) -> NormalEquations:
-        """Model and derivatives about a state."""
-        here, w = Registration.from_array(state.alpha), 1.0 + state.width
-        zonal = {0: self._weighted(self.model.zonal_matrix(here, w))}
-        for side in (-1, 1):
-            zonal[side] = self._weighted(self.model.zonal_matrix(here, w * (1 + side * _WIDTH_STEP)))
-        by_width = (zonal[1] - zonal[-1]) / (2 * _WIDTH_STEP)
-        by_shape = self._weighted(self.model.zonal_matrix(here, w * _PEDESTAL)) - zonal[0]
-        moved = []
-        for k, step in enumerate(_STEPS):
-            d = np.eye(5)[k] * step
-            plus, minus = (
-                self._weighted(self.model.zonal_matrix(Registration.from_array(state.alpha + s * d), w))
-                for s in (1, -1)
-            )
-            moved.append((plus - minus) / (2 * step))
-        rows = (1 + state.slope_gain)[:, None]
-        acting = 1 + state.actuator_gain
-        shaped = zonal[0] + state.shape * by_shape + state.actuator_width * by_width
-
-        def modal(z: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.asarray(rows * (z * acting) @ self.modes)
-
-        variants = [self._weighted(v.zonal_matrix(here, w)) - zonal[0] for v in self.variants]
-        for share, difference in zip(state.variant, variants, strict=True):
-            shaped = shaped + share * difference
-        unit = modal(shaped)
-        parts = (*moved, by_width, by_shape, *variants)
-        common = np.stack([unit, *(state.gain * modal(z) for z in parts)])
-        # Where a slope samples the wavefront: a shift shared by the lenslets of a column (x) or row (y).
-        sampled = np.zeros((self.lines.max() + 1, *unit.shape))
-        half = unit.shape[0] // 2
-        rows_of = np.arange(unit.shape[0])
-        sampled[self.lines, rows_of] = np.where((rows_of < half)[:, None], common[1], common[2])
-        common = np.concatenate([common, sampled])
-        model = state.gain * unit + np.einsum("l,lsm->sm", state.sampling, sampled)
-        return normal_equations(
-            common,
-            state.gain * rows * shaped,
-            state.gain * rows * by_width * acting,
-            self.modes,
-            state.gain * (shaped * acting) @ self.modes,
-            self.data - model,
-            self.precision,
-            state.offset(),
-        )
-
-    def move(self, state: _State, step: NDArray[np.floating]) -> _State:
-        n_act = self.model.n_act
-        v, n = len(self.variants), len(self.variants) + self.n_lines
-        variant, sampling, gains, widths, slopes = np.split(step[8:], [v, n, n + n_act, n + 2 * n_act])
-        return _State(
-            state.gain + step[_GAIN],
-            state.alpha + step[1:6],
-            float(np.clip(state.width + step[_WIDTH], -0.5, 1.0)),
-            float(np.clip(state.shape + step[_SHAPE], -0.5, 0.5)),
-            state.variant + variant,
-            state.sampling + sampling,
-            state.actuator_gain + gains,
-            state.actuator_width + widths,
-            state.slope_gain + slopes,
-        )
 
 
 def choose_modes(matrix: InteractionMatrix, n_modes: int) -> NDArray[np.intp]:
@@ -274,7 +122,7 @@ def sprint_steps(
         raise CalibrationError("the interaction matrix is not finite; measure it again")
     if not matrix.data[:, columns].any():
         raise CalibrationError("the interaction matrix is zero; does the sensor see the mirror?")
-    problem = _Problem(matrix, model, columns, priors or Priors())
+    problem = Problem(matrix, model, columns, priors or Priors())
     if not np.isfinite(problem.data).all():
         raise CalibrationError("the interaction matrix's standard errors are not finite; measure it again")
     if problem.measured_errors and float(matrix.snr()[columns].max()) < 0.1:
@@ -336,13 +184,13 @@ def _reduced(system: NormalEquations) -> NDArray[np.float64]:
     return np.asarray(a - b @ np.linalg.solve(c, b.T))
 
 
-def _record(state: _State, system: NormalEquations, norm: float) -> SprintIteration:
+def _record(state: State, system: NormalEquations, norm: float) -> SprintIteration:
     chi2 = float(np.mean(np.square(system.residual)))
     return SprintIteration(Registration.from_array(state.alpha), state.gain, norm, chi2)
 
 
 def _covariance(
-    problem: _Problem, system: NormalEquations, noise: NDArray[np.float64] | None
+    problem: Problem, system: NormalEquations, noise: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
     """Sandwich covariance of the common parameters, in units of their own.
 
@@ -379,9 +227,9 @@ def _covariance(
 
 
 def _estimate(
-    problem: _Problem,
+    problem: Problem,
     matrix: InteractionMatrix,
-    state: _State,
+    state: State,
     system: NormalEquations,
     history: list[SprintIteration],
     settled: bool,
@@ -412,8 +260,8 @@ def _estimate(
     return RegistrationEstimate(
         Registration.from_array(state.alpha),
         covariance[1:6, 1:6],
-        Measured(state.gain, float(sigma[_GAIN])),
-        Measured(1 + state.width, float(sigma[_WIDTH])),
+        Measured(state.gain, float(sigma[GAIN])),
+        Measured(1 + state.width, float(sigma[WIDTH])),
         settled and len(warnings) == 0,
         tuple(history),
         chi2,
