@@ -114,6 +114,7 @@ def test_a_faint_response_is_told_by_its_errors():
     assert (snr < 1) == any("signal-to-noise ratio below 1" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_the_full_bench_in_the_dark_and_without_response():
     from escape_hw.runtime.system import open_system
 

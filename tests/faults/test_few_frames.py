@@ -11,7 +11,7 @@ from escape_hw.calibration.sprint import sprint
 from escape_hw.errors import TooFewFrames
 
 #: Fewest frames that 30 modes with a filter of 6 and 5 lags may start with, and a few more.
-JUST_ENOUGH = (82, 90, 130)
+JUST_ENOUGH = (82, 130)
 RUNS = 4
 
 

@@ -19,9 +19,14 @@ LIMITS = {
     "neighbours": "devices.dm.limits.max_neighbour=0.05",
     "mean": "devices.dm.limits.max_mean=0.001",
 }
+#: Two of them tell nothing that the others do not, most of the time.
+SOME = [
+    pytest.param(name, marks=pytest.mark.slow if name in ("tiny stroke", "neighbours") else ())
+    for name in LIMITS
+]
 
 
-@pytest.mark.parametrize("name", LIMITS)
+@pytest.mark.parametrize("name", SOME)
 def test_docrime_with_shortened_pokes(good, name):
     with faulty("twin.loss_probability=0", LIMITS[name], dm={}) as bench:
         run = bench.run(docrime_run(bench, frames=600, grid=good.grid))
@@ -44,7 +49,7 @@ def test_docrime_with_shortened_pokes(good, name):
     assert np.abs((estimate.registration.to_array() - PLANTED) / estimate.sigma).max() < 4
 
 
-@pytest.mark.parametrize("name", LIMITS)
+@pytest.mark.parametrize("name", SOME)
 def test_push_pull_with_shortened_pokes(good, name):
     matrices = []
     for limits in ((), (LIMITS[name],)):
