@@ -1,0 +1,259 @@
+"""Wrong input and dying devices through the real command line, on the real twin."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_bench import SMALL, configuration
+
+from escape_hw import register_device
+from escape_hw.cli import main
+from escape_hw.io.fits import load_matrix, save_matrix
+from escape_hw.io.provenance import Provenance
+from escape_hw.testing import FaultyCamera, FaultyMirror
+from escape_sim import devices
+
+
+@pytest.fixture
+def run(capsys, monkeypatch, tmp_path):
+    """Run a command with ``--json``: exit code, document, standard error."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr("escape_hw.runtime.keep.write_report", lambda folder: folder)
+
+    def call(*words: object) -> tuple[int, dict, str]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main([*map(str, words), "--json"])
+        out, err = capsys.readouterr()
+        assert "Traceback" not in err
+        return ended.value.code or 0, json.loads(out, parse_constant=pytest.fail), err
+
+    return call
+
+
+@pytest.fixture
+def nothing_opens(monkeypatch):
+    """Fail when any device is opened."""
+    monkeypatch.setattr("escape_hw.bench.Bench.open", lambda self: pytest.fail("something was opened"))
+
+
+@pytest.fixture(scope="module")
+def system(tmp_path_factory):
+    """The small bench as a system file."""
+    path = tmp_path_factory.mktemp("system") / "small.toml"
+    path.write_text(configuration().to_toml())
+    return path
+
+
+@pytest.fixture(scope="module")
+def im(good, tmp_path_factory):
+    """A good matrix as a product."""
+    origin = Provenance(configuration().to_toml(), "kl", 1)
+    return save_matrix(tmp_path_factory.mktemp("im") / "im.fits", good.run.result, origin)
+
+
+SETTINGS = [
+    ("loop.gian=0.3", "loop.gain"),
+    ("twin.registration.shift_z=1", "twin.registration.shift_"),
+    ("loop.gain=0", "0 < x <= 2"),
+    ("loop.gain=-0.1", "0 < x <= 2"),
+    ("loop.gain=2.5", "0 < x <= 2"),
+    ("loop.gain=nan", "loop.gain"),
+    ("loop.gain=inf", "loop.gain"),
+    ("loop.gain=high", "loop.gain"),
+    ("loop.gain", "loop.gain"),
+    ("loop.dropped_modes=30", "dropped_modes"),
+    ("calibration.frames=0", "calibration.frames"),
+    ("calibration.poke=0", "calibration.poke"),
+    ("calibration.poke=nan", "calibration.poke"),
+    ("devices.dm.limits.disabled=[37]", "0 to 36"),
+    ("devices.dm.limits.max_stroke=1.5", "max_stroke"),
+    ("devices.wfs.exposure_s=0.1", "longer than a frame"),
+    ("basis.n_modes=38", "37 actuators"),
+]
+
+
+@pytest.mark.usefixtures("nothing_opens")
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        (("calibrate", "razor-shwsf"), "razor-shwfs"),
+        (("calibrate", "no-such-file.toml"), "no-such-file.toml"),
+        *((("calibrate", "SYSTEM", "--set", setting), match) for setting, match in SETTINGS),
+        (("calibrate", "SYSTEM", "--modes", "0"), "modes"),
+        (("calibrate", "SYSTEM", "--frames", "0"), "frames"),
+        (("calibrate", "SYSTEM", "--frames", "-5"), "frames"),
+        (("calibrate", "SYSTEM", "--poke", "0"), "--poke"),
+        (("calibrate", "SYSTEM", "--poke", "-0.02"), "--poke"),
+        (("calibrate", "SYSTEM", "--poke", "2"), "--poke"),
+        (("calibrate", "SYSTEM", "--poke", "nan"), "--poke"),
+        (("calibrate", "SYSTEM", "--seed", "-1"), "seed"),
+        (("calibrate", "SYSTEM", "--mode", "metal"), "mode"),
+        (("loop", "SYSTEM", "--im", "IM", "--gain", "0"), "gain"),
+        (("loop", "SYSTEM", "--im", "IM", "--gain", "-1"), "gain"),
+        (("loop", "SYSTEM", "--im", "IM", "--gain", "nan"), "gain"),
+        (("loop", "SYSTEM", "--im", "IM", "--leak", "1.5"), "leak"),
+        (("loop", "SYSTEM", "--im", "IM", "--leak", "nan"), "leak"),
+        (("loop", "SYSTEM", "--im", "IM", "--drop", "30"), "dropped_modes"),
+        (("loop", "SYSTEM", "--im", "IM", "--drop", "-1"), "drop"),
+        (("loop", "SYSTEM", "--im", "IM", "--frames", "0"), "frames"),
+        (("loop", "SYSTEM", "--im", "absent.fits"), "absent.fits"),
+        (("loop", "SYSTEM", "--im", "SYSTEM"), "not a FITS file"),
+        (("sprint", "SYSTEM", "--im", "SYSTEM"), "not a FITS file"),
+    ],
+)
+def test_refused_with_exit_2_before_anything_is_opened(run, system, im, words, match):
+    code, document, err = run(*({"SYSTEM": system, "IM": im}.get(word, word) for word in words))
+    assert code == 2
+    assert match in document["error"]["message"]
+    assert match in err
+
+
+def test_unknown_model_and_driver(run, system, tmp_path):
+    code, document, _ = run("calibrate", system, "--set", "calibration.model=fats", "--out", tmp_path / "a")
+    assert code == 2
+    assert "'fats'" in document["error"]["message"]
+    assert "fast" in document["error"]["message"]
+    code, document, _ = run("calibrate", system, "--set", "devices.wfs.sim_driver=sim-ximae")
+    assert code == 2
+    assert "sim-ximea" in document["error"]["message"]
+
+
+@pytest.mark.usefixtures("nothing_opens")
+def test_a_matrix_of_another_system_basis_or_mirror(run, system, good, tmp_path):
+    own = Provenance(configuration().to_toml(), "kl", 1)
+
+    def refused(name: str, *sets: str, origin: Provenance = own, command: str = "loop", **changes: object):
+        matrix = replace(good.matrix, **changes)
+        path = save_matrix(tmp_path / f"{name}.fits", replace(good.run.result, matrix=matrix), origin)
+        words = [word for key in sets for word in ("--set", key)]
+        code, document, _ = run(command, system, "--im", path, *words)
+        assert code == 2
+        assert document["error"]["type"] == "IncompatibleProduct"
+        return document["error"]["message"]
+
+    assert "'maps-nir'" in refused("a", system="maps-nir")
+    assert "'maps-nir'" in refused("b", command="sprint", system="maps-nir")
+    assert "kind of basis" in refused("c", origin=replace(own, basis="zonal"))
+    assert "number of modes" in refused("d", "basis.n_modes=25")
+    assert "number of actuators" in refused("e", m2c=good.matrix.m2c[:-1])
+    assert "number of actuators" in refused("f", command="sprint", m2c=good.matrix.m2c[:-1])
+
+
+def test_a_matrix_of_another_camera_region(run, system, im, tmp_path):
+    words = ("--set", "devices.wfs.region=[270,206,100,100]", "--no-strehl", "--out", tmp_path / "run")
+    code, document, _ = run("loop", system, "--im", im, *words)
+    assert code == 2
+    assert document["error"]["type"] == "IncompatibleProduct"
+    assert "beyond the camera's region" in document["error"]["message"]
+
+
+@pytest.mark.usefixtures("nothing_opens")
+@pytest.mark.parametrize("command", ["loop", "sprint", "show", "compare"])
+def test_truncated_and_flipped_products(run, system, im, command, tmp_path):
+    content = im.read_bytes()
+    damaged = tmp_path / "damaged.fits"
+    words = {
+        "loop": ("loop", system, "--im", damaged),
+        "sprint": ("sprint", system, "--im", damaged),
+        "show": ("show", damaged),
+        "compare": ("compare", im, damaged),
+    }[command]
+
+    def refused(changed: bytes) -> None:
+        damaged.write_bytes(changed)
+        code, document, err = run(*words)
+        assert (code, document["error"]["type"]) == (2, "ProductError")
+        assert "damaged.fits: " in err
+
+    for size in (0, 1, 80, 2879, 2880, len(content) // 2, len(content) // 5760 * 2880, len(content) - 2880):
+        refused(content[:size])
+    rng = np.random.default_rng(5)
+    for place in (0, 9, 81, *rng.integers(0, len(content), 12)):
+        flipped = bytearray(content)
+        flipped[place] ^= 1 << int(rng.integers(0, 7))
+        refused(bytes(flipped))
+
+
+def test_a_dead_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path):
+    opened = []
+
+    def dying_camera(name, config, shared):
+        opened.append(shared)
+        return FaultyCamera(devices.make_wfs_camera(name, config, shared), stall_from=60)
+
+    def dying_mirror(name, config, shared):
+        return FaultyMirror(devices.make_mirror(name, config, shared), lost_from=20)
+
+    register_device("dying-camera", dying_camera)
+    register_device("dying-mirror", dying_mirror)
+    commands = {
+        "docrime": ("calibrate", system, "--method", "docrime", "--frames", 300),
+        "push-pull": ("calibrate", system, "--method", "push-pull", "--frames", 3),
+        "escape": ("calibrate", system, "--frames", 300),
+        "loop": ("loop", system, "--im", im, "--frames", 300, "--no-strehl"),
+        "reproduce": ("reproduce", "shwfs", "--system", system, "--frames", 300, "--loop-frames", 100),
+    }
+    for name, words in commands.items():
+        out = tmp_path / f"camera-{name}"
+        code, document, err = run(*words, "--out", out, "--set", "devices.wfs.sim_driver=dying-camera")
+        assert (code, document["error"]["type"]) == (3, "FrameTimeout"), name
+        assert "wfs: no frame within 1 s" in err
+        assert "FrameTimeout" in (out / "run.log").read_text()
+        assert not list(out.glob("*.fits"))
+        dynamics = opened[-1]["simulated bench"].dynamics
+        dynamics.mean(dynamics._time, dynamics._time + 1)
+        assert not dynamics._target.any()
+        out = tmp_path / f"mirror-{name}"
+        code, document, err = run(*words, "--out", out, "--set", "devices.dm.sim_driver=dying-mirror")
+        assert (code, document["error"]["type"]) == (3, "DeviceLost"), name
+        assert "dm: lost" in err
+        # It could not be flattened any more: that is said.
+        assert "closing dm" in err
+
+
+def test_too_few_frames_no_light_and_no_response_exit_1(run, system, tmp_path):
+    code, document, _ = run("calibrate", system, "--frames", 50, "--out", tmp_path / "a")
+    assert (code, document["error"]["type"]) == (1, "TooFewFrames")
+    assert "at least 82 frames" in document["error"]["message"]
+    dark = ("--set", "twin.wfs.photons_per_frame=1")
+    code, document, _ = run("calibrate", system, "--frames", 300, *dark, "--out", tmp_path / "b")
+    assert (code, document["error"]["type"]) == (1, "CalibrationError")
+    assert "no spots" in document["error"]["message"]
+    still = ("--set", "devices.dm.stroke_m=1e-12")
+    code, document, _ = run("calibrate", system, "--frames", 300, *still, "--out", tmp_path / "c")
+    assert (code, document["error"]["type"]) == (1, "CalibrationError")
+    assert "does not respond" in document["error"]["message"]
+
+
+def test_one_percent_of_lost_frames_changes_no_registration(run, system, tmp_path):
+    found = {}
+    for loss in (0.0, 0.01):
+        lossy = ("--set", f"twin.loss_probability={loss}", "--frames", 600, "--out", tmp_path / str(loss))
+        code, document, err = run("calibrate", system, *lossy)
+        assert code == 0, err
+        assert document["converged"]
+        found[loss] = document["registration"]
+        product = load_matrix(document["products"]["im"])
+        assert (product.result.lost_frames > 0) == (loss > 0)
+    for name, value in found[0.0].items():
+        other = found[0.01][name]
+        assert abs(value["value"] - other["value"]) < 4 * np.hypot(value["sigma"], other["sigma"]), name
+
+
+def test_the_same_command_twice_gives_the_same_numbers(run, tmp_path):
+    sets = [word for key in SMALL for word in ("--set", key)]
+    found = []
+    for name in ("a", "b"):
+        code, document, err = run(
+            "calibrate", "razor-shwfs", *sets, "--frames", 300, "--seed", 11, "--out", tmp_path / name
+        )
+        assert code == 0, err
+        product = load_matrix(document["products"]["docrime"])
+        found.append((document["registration"], document["gain"], product.matrix.data, product.matrix.sigma))
+    assert found[0][:2] == found[1][:2]
+    np.testing.assert_array_equal(found[0][2], found[1][2])
+    np.testing.assert_array_equal(found[0][3], found[1][3])

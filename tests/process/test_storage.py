@@ -1,0 +1,89 @@
+"""A disk that takes no more: told in one line, nothing half written, the mirror safe first."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import sys
+
+import pytest
+
+from escape_hw.io.fits import load_matrix
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits and devices of Linux")
+
+
+def at_most(size: int):
+    """Files of this process grow no further than ``size`` bytes, as on a full disk."""
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    return limit
+
+
+@pytest.mark.parametrize("method", ["docrime", "escape"])
+def test_no_room_for_the_matrix(escape, system, tmp_path, method):
+    out = tmp_path / "run"
+    words = ("calibrate", system, "--method", method, "--frames", 300, "--out", out, "--json")
+    done = escape(*words, preexec_fn=at_most(60_000))
+    assert done.returncode == 1, done.stderr
+    document = json.loads(done.stdout)
+    assert document["error"]["type"] == "StorageError"
+    assert "cannot be written" in document["error"]["message"]
+    assert str(out) in document["error"]["message"]
+    assert "Traceback" not in done.stderr
+    # Neither a product nor a piece of one.
+    assert {path.name for path in out.iterdir()} == {"config.toml", "run.log"}
+    assert "did not close cleanly" not in (out / "run.log").read_text()
+
+
+def test_no_room_after_the_matrix(escape, system, im, tmp_path):
+    """The matrix fits, the report does not: the matrix is kept."""
+    out = tmp_path / "run"
+    words = ("calibrate", system, "--method", "docrime", "--frames", 300, "--out", out, "--json")
+    done = escape(*words, preexec_fn=at_most(im.stat().st_size + 2880))
+    assert done.returncode == 1, done.stderr
+    assert json.loads(done.stdout)["error"]["type"] == "StorageError"
+    assert not load_matrix(out / "im.fits").result.partial
+    assert json.loads((out / "result.json").read_text())["products"]["im"] == "im.fits"
+    assert not [path.name for path in out.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("where", ["/dev/full/run", "/proc/run", "FILE/run"])
+def test_a_folder_that_cannot_be_stops_the_command_before_anything_opens(escape, system, tmp_path, where):
+    (tmp_path / "file").write_text("")
+    out = where.replace("FILE", str(tmp_path / "file"))
+    done = escape("calibrate", system, "--out", out, "--json")
+    assert done.returncode == 2, done.stderr
+    assert json.loads(done.stdout)["error"]["type"] == "StorageError"
+    assert "DO-CRIME" not in done.stderr
+
+
+def test_no_room_for_the_configuration_stops_the_command_before_anything_opens(escape, system, tmp_path):
+    words = ("calibrate", system, "--method", "docrime", "--out", tmp_path / "run", "--json")
+    done = escape(*words, preexec_fn=at_most(1000))
+    assert done.returncode == 2, done.stderr
+    assert json.loads(done.stdout)["error"]["type"] == "StorageError"
+    assert "DO-CRIME" not in done.stderr
+
+
+def test_a_document_that_cannot_be_delivered_is_no_success(environment):
+    import subprocess
+
+    from running import ESCAPE
+
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [*ESCAPE, "systems", "--json"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            env=environment,
+            timeout=60,
+        )
+    assert done.returncode not in (0, 130)
+    assert "Traceback" not in done.stderr
