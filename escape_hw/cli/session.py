@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import sys
 import time
 import traceback
@@ -44,7 +45,7 @@ class Session:
         self.tables = Console(file=self._stdout, width=None if self._stdout.isatty() else _PIPE_WIDTH)
         self.interrupts = Interrupts(self.tell)
         self.folder: RunFolder | None = None
-        self.was_opened = False
+        self.was_opened = self._deaf = False
         self.code = DONE
         self._document: Mapping[str, Any] | None = None
         self._began = time.monotonic()
@@ -60,14 +61,18 @@ class Session:
 
     def show(self, *what: RenderableType) -> None:
         """Results for people, on standard output; silent with ``--json``."""
-        if not self.json:
+        if self.json or self._deaf:
+            return
+        try:
             for item in what:
                 self.tables.print(item, highlight=False, markup=False, soft_wrap=isinstance(item, str))
+        except OSError as error:
+            self._nobody_reads(error)
 
     def result(self, document: Mapping[str, Any], met: bool = True) -> None:
         """The command's document, printed at its end with ``--json``; ``met`` false: exit code 1."""
         self._document = document
-        self.code = DONE if met else FAILED
+        self.code = self.code or (DONE if met else FAILED)
 
     def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure with progress; Ctrl-C aborts it.
@@ -163,8 +168,20 @@ class Session:
         from escape_hw.io.documents import dumps
 
         if self.json and self._document is not None:
-            self._stdout.write(dumps(self._document) + "\n")
-            self._stdout.flush()
+            try:
+                self._stdout.write(dumps(self._document) + "\n")
+                self._stdout.flush()
+            except OSError as error:
+                self._nobody_reads(error)
+
+    def _nobody_reads(self, error: OSError) -> None:
+        """Standard output takes no more (a full disk, a closed pipe): tell once, and go on without it."""
+        self._deaf = True
+        self.code = self.code or FAILED
+        self.tell(f"error: standard output cannot be written ({error.strerror or error})")
+        with contextlib.suppress(OSError, ValueError):
+            # Or Python would try again at its end, and fail again.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stdout.fileno())
 
 
 @contextmanager
@@ -178,13 +195,12 @@ def session(command: str, *, json: bool = False, quiet: bool = False) -> Iterato
         try:
             with contextlib.redirect_stdout(sys.stderr):
                 yield one
-            code = one.code
         except typer.Exit:
             raise
         except (EscapeError, KeyboardInterrupt) as error:
-            code = one.fail(error)
+            one.code = one.fail(error)
         except Exception as error:
             log.exception("unexpected")
-            code = one.fail(error)
+            one.code = one.fail(error)
     one.print_document()
-    raise typer.Exit(code)
+    raise typer.Exit(one.code)

@@ -73,10 +73,13 @@ class Running:
             os.kill(self._process.pid, which)
         assert self._process.stdout is not None
         out = self._process.stdout.read()
+        self._process.stdout.close()
         _, status, usage = os.wait4(self._process.pid, 0)
         wall = time.monotonic() - began
         self._process.returncode = os.waitstatus_to_exitcode(status)
         self._reader.join(5)
+        assert self._process.stderr is not None
+        self._process.stderr.close()
         return Ended(
             self._process.returncode,
             wall,
@@ -89,7 +92,7 @@ class Running:
         """End it, if it has not ended."""
         if self._process.returncode is None:
             self._process.kill()
-            self._process.wait()
+            self._process.communicate()
 
     def _cpu_s(self) -> float:
         """Processor time that the process has used so far."""

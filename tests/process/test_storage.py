@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import resource
 import signal
+import subprocess
 import sys
 
 import pytest
+from running import ESCAPE
 
 from escape_hw.io.fits import load_matrix
 
@@ -70,14 +72,11 @@ def test_no_room_for_the_configuration_stops_the_command_before_anything_opens(e
     assert "DO-CRIME" not in done.stderr
 
 
-def test_a_document_that_cannot_be_delivered_is_no_success(environment):
-    import subprocess
-
-    from running import ESCAPE
-
+@pytest.mark.parametrize("words", [("systems", "--json"), ("systems",)])
+def test_a_result_that_cannot_be_delivered_is_no_success(environment, words):
     with open("/dev/full", "w") as full:
         done = subprocess.run(
-            [*ESCAPE, "systems", "--json"],
+            [*ESCAPE, *words],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
@@ -85,5 +84,21 @@ def test_a_document_that_cannot_be_delivered_is_no_success(environment):
             env=environment,
             timeout=60,
         )
-    assert done.returncode not in (0, 130)
-    assert "Traceback" not in done.stderr
+    assert done.returncode == 1
+    assert done.stderr.strip() == "error: standard output cannot be written (No space left on device)"
+
+
+@pytest.mark.parametrize("more", [("--json",), ()])
+def test_a_closed_pipe_is_no_success_and_no_crash(environment, im, more):
+    with subprocess.Popen(
+        [*ESCAPE, "show", im, *more],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as process:
+        process.stdout.close()
+        told = process.stderr.read()
+        assert process.wait(60) == 1
+    # A table that is cut off, as by "| head", is nothing to talk about; a lost document is.
+    assert told.strip() == ("error: standard output cannot be written (Broken pipe)" if more else "")
