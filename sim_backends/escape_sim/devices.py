@@ -266,7 +266,7 @@ class SimPhaseScreen(PhaseScreen):
     def state(self) -> ScreenState:
         """The present state."""
         b = self._bench
-        return ScreenState(b.screen_number, b.screen_inserted, b.speed_m_s, b.beam_blocked)
+        return ScreenState(b.plates.number, b.plates.inserted, b.plates.speed_m_s, b.beam_blocked)
 
     @property
     def n_screens(self) -> int:
@@ -282,5 +282,5 @@ class SimPhaseScreen(PhaseScreen):
 
     def _set(self, want: ScreenState) -> None:
         b = self._bench
-        b.screen_number, b.screen_inserted, b.beam_blocked = want.screen, want.inserted, want.blocked
-        b.speed_m_s = want.speed_m_s
+        b.plates.number, b.plates.inserted, b.beam_blocked = want.screen, want.inserted, want.blocked
+        b.plates.set_speed(want.speed_m_s, b.now_s)

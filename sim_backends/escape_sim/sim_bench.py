@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from itertools import pairwise
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,32 +15,17 @@ from escape_sim.detector import Detector
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.influence import InfluenceFunctions, MirrorSurface
 from escape_sim.mirror_dynamics import MirrorDynamics
+from escape_sim.phase_plates import PhasePlates
 from escape_sim.psf import FocalPlane
-from escape_sim.screen import RotatingScreen, von_karman_screen
-from escape_sim.shack_hartmann import ShackHartmannOptics
+from escape_sim.sensor_optics import SensorOptics, make_sensor_optics
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
 
 log = logging.getLogger(__name__)
 
-#: Side of the phase plates in pixels and distance of the pupil from their axis.
-_PLATE_PIXELS = 2048
-_PLATE_RADIUS_M = 28e-3
-
-
 #: How far a paced bench may lag behind the wall clock and still hurry to catch up, in seconds.
 _CATCH_UP_S = 0.05
-
-
-class SensorOptics(Protocol):
-    """Optics of a wavefront sensor: optical path in metres to relative intensity."""
-
-    def frame(
-        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        """Add the intensity to ``image`` and return it."""
-        ...
 
 
 class SimBench:
@@ -55,7 +40,7 @@ class SimBench:
     def __init__(self, config: SystemConfig) -> None:
         self.config = config
         streams = np.random.SeedSequence(config.system.seed).spawn(6)
-        self._plates_seed, hidden, latency, frames, wfs_noise, science_noise = streams
+        plates, hidden, latency, frames, wfs_noise, science_noise = streams
         self.latency_rng, self.frame_rng = np.random.default_rng(latency), np.random.default_rng(frames)
         truth = np.random.default_rng(hidden)
         self.pupil = pupil_geometry(config)
@@ -80,13 +65,9 @@ class SimBench:
             twin.wfs.fixed_pattern, np.random.default_rng(wfs_noise),
         )  # fmt: skip
         self._science_rng = np.random.default_rng(science_noise)
-        self._plates: dict[int, RotatingScreen] = {}
         self._exposures: _Exposures | None = None
-        screen = config.devices.screen
-        self.screen_number = screen.screen if screen else 0
-        self.screen_inserted, self.beam_blocked = screen is not None, False
-        self._path, self._path_since = 0.0, 0.0
-        self._speed = screen.speed_m_s if screen else 0.0
+        self.plates = PhasePlates(config, self.pupil, plates)
+        self.beam_blocked = False
 
     # ------------------------------------------------------------------ clock
     @property
@@ -111,25 +92,12 @@ class SimBench:
                 self._wall_start -= wait
 
     # ------------------------------------------------------------------ beam
-    @property
-    def speed_m_s(self) -> float:
-        """Speed of the phase screen across the pupil in metres per second."""
-        return self._speed
-
-    @speed_m_s.setter
-    def speed_m_s(self, value: float) -> None:
-        self._path, self._path_since, self._speed = self._path_at(self.now_s), self.now_s, value
-
-    def _path_at(self, time_s: float) -> float:
-        return self._path + self._speed * (time_s - self._path_since)
-
     def optical_path(self, start_s: float, end_s: float) -> NDArray[np.float32]:
         """Mean optical path ``(n, n)`` in metres over an exposure, common to both cameras."""
         middle = 0.5 * (start_s + end_s)
         opd = self._surface(self.dynamics.mean(start_s, end_s))
         opd *= self._metres
-        if self.screen_inserted:
-            self._plate().add(self._path_at(middle), opd)
+        self.plates.add(middle, opd)
         tip, tilt = self._vibration(middle)
         if tip or tilt:
             x = self.pupil.coordinates_m.astype(np.float32)
@@ -151,7 +119,7 @@ class SimBench:
     def sensor(self) -> SensorOptics:
         """The sensor's optics, built when first used."""
         if self._sensor is None:
-            self._sensor = self._make_sensor()
+            self._sensor = make_sensor_optics(self.config, self.pupil)
         return self._sensor
 
     def focal_plane(self, shape: tuple[int, int]) -> FocalPlane:
@@ -241,44 +209,6 @@ class SimBench:
             np.asarray(vib.amplitude_rad) * np.sin(2 * np.pi * f * time_s + self._vibration_phase)
         ).sum(1)
         return float(tip), float(tilt)
-
-    def _make_sensor(self) -> SensorOptics:
-        c, twin = self.config, self.config.twin.wfs
-        n_sub, pitch = c.sensor.n_sub, twin.pitch_px or c.sensor.pitch_px
-        width, height = c.devices.wfs.region[2:]
-        origin = (
-            (width - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[0],
-            (height - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[1],
-        )
-        amplitude = self.pupil.amplitude / np.sqrt(np.sum(np.square(self.pupil.amplitude, dtype=float)))
-        geometry = (
-            n_sub, self.pupil.n_pix, c.system.wavelength_m, pitch, c.sensor.spot_px, origin, (height, width),
-            amplitude.astype(np.float32),
-        )  # fmt: skip
-        if c.system.optics == "oopao":
-            # Imported here: OOPAO loads for two seconds and 1,600 modules.
-            from escape_sim.oopao_optics import OOPAOShackHartmann
-
-            return OOPAOShackHartmann(*geometry)
-        return ShackHartmannOptics(*geometry)
-
-    def _plate(self) -> RotatingScreen:
-        number = self.screen_number
-        if number not in self._plates:
-            screen = self.config.devices.screen
-            if screen is None:
-                raise ConfigError(f"system {self.config.system.name!r} has no [devices.screen] section")
-            # A key of its own for each plate, so that the order of use does not matter.
-            key = (*self._plates_seed.spawn_key, number)
-            seed = np.random.SeedSequence(self._plates_seed.entropy, spawn_key=key)
-            rng = np.random.default_rng(seed)
-            pixel = self.pupil.pixel_m
-            phase = von_karman_screen(
-                _PLATE_PIXELS, pixel, screen.screens_r0_m[number], screen.outer_scale_m, rng
-            )
-            opd = phase * np.float32(self.config.system.wavelength_m / (2 * np.pi))
-            self._plates[number] = RotatingScreen(opd, pixel, _PLATE_RADIUS_M, self.pupil.lit)
-        return self._plates[number]
 
 
 class _Exposures:

@@ -31,7 +31,7 @@ def _quick_benches() -> Iterator[None]:
         return plates[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("escape_sim.sim_bench.von_karman_screen", remembered)
+        patch.setattr("escape_sim.phase_plates.von_karman_screen", remembered)
         patch.setattr("escape_sim.detector.Detector.POOL", 1 << 19)
         yield
 
