@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix
 from escape_hw.calibration.derivatives import modal_jacobian
@@ -47,7 +47,7 @@ def pseudo_synthetic(
 
 
 def synthesise(
-    bench: Bench, grid: SubApertureGrid, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+    bench: Bench, grid: SensorGeometry, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
 ) -> CalibrationResult:
     """A calibration made of a registration alone, with nothing moved.
 
@@ -72,7 +72,7 @@ def escape(
     *,
     frames: int | None = None,
     poke: float | None = None,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
     whiten: bool = True,
 ) -> Procedure[CalibrationResult]:
     """Calibrate without a source: measure under turbulence, find the registration, synthesise.
