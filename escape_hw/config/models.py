@@ -127,6 +127,13 @@ class SystemConfig(Section):
     )
     twin: TwinConfig = Field(default_factory=TwinConfig, description="the simulated bench")
 
+    @property
+    def simulated(self) -> bool:
+        """True when any device is to be a twin."""
+        devices = (self.devices.dm, self.devices.wfs, self.devices.science, self.devices.screen)
+        modes = [(device.mode or self.system.mode, device) for device in devices if device is not None]
+        return any(mode == "sim" and device.sim_driver for mode, device in modes)
+
     def to_toml(self) -> str:
         """The whole effective configuration, defaults included, as ASCII TOML text.
 
@@ -142,7 +149,11 @@ class SystemConfig(Section):
             breaches.append(Breach("basis.n_modes", n_modes, f"the mirror has {n_act} actuators"))
         if self.loop.dropped_modes >= n_modes:
             breaches.append(
-                Breach("loop.dropped_modes", self.loop.dropped_modes, f"leaves none of the {n_modes} modes")
+                Breach(
+                    "loop.dropped_modes",
+                    self.loop.dropped_modes,
+                    f"leaves none of the {n_modes} modes; lower it",
+                )
             )
         enforce(breaches)
         return self

@@ -131,7 +131,7 @@ def diary(monkeypatch: pytest.MonkeyPatch) -> Diary:
     """A registry that knows the fake devices only; every factory writes into this diary."""
     diary = Diary()
 
-    def device_factory(driver: str) -> Callable[..., object]:
+    def device_factory(driver: str, *, hardware: bool = False) -> Callable[..., object]:
         kind = KINDS.get(driver.removeprefix("sim-"))
         if kind is None:
             raise ConfigError(f"no device driver '{driver}' is installed")
