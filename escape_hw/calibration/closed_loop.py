@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.camera import Camera
 from escape_hw.api.frames import Frame
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
@@ -18,9 +19,11 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, next_frame, some_frames
 from escape_hw.calibration.sensor_setup import extractor
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, IncompatibleProduct
+from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.integrator import LeakyIntegrator, gain_limit
 from escape_hw.pipeline.reconstructor import reconstructor
 from escape_hw.pipeline.slopes import SlopeExtractor
+from escape_hw.pipeline.standard_error import LEAST
 from escape_hw.pipeline.strehl import has_light, strehl, without_background
 
 #: Seconds after closing during which the science frames do not count.
@@ -39,7 +42,7 @@ _USUAL_DELAY = 2.0
 class _Record:
     """What a run gathers on its way."""
 
-    science: list[NDArray[np.uint16]] = field(default_factory=list)
+    science: FrameStack = field(default_factory=FrameStack)
     residual: list[float] = field(default_factory=list)
     latency: list[int] = field(default_factory=list)
     frames: int = 0
@@ -159,18 +162,16 @@ def closed_loop(
         if science is not None:
             science.stop()
     seconds = max((bench.wfs.now_ns() - started) * 1e-9, 1e-9)
-    ratio: StrehlEstimate | None = None
     notes = ["the loop diverged and was opened"] if record.diverged else []
-    if science is not None:
-        # The first frame or two after closing do not count.
-        expected = int((seconds - _CLOSING_S) * science.settings.frame_rate_hz) - 2
-        if len(record.science) < expected / 2:
-            notes.append(f"only {len(record.science)} of about {expected} frames came from {science.name}")
-    if science is not None and model_psf is not None and record.science and not record.diverged:
-        try:
-            ratio = strehl(np.array(record.science, dtype=np.float32), model_psf)
-        except CalibrationError as error:
-            notes.append(str(error))
+    images = record.science.images()
+    ratio: StrehlEstimate | None = None
+    if science is not None and model_psf is not None:
+        notes += _science_notes(bench, science, record, seconds)
+        if record.science.count and not record.diverged:
+            try:
+                ratio = strehl(images, model_psf)
+            except CalibrationError as error:
+                notes.append(f"no Strehl ratio: {error}")
     residual = np.array(record.residual, dtype=np.float32)
     settled = residual[len(residual) // 10 :]
     return LoopResult(
@@ -179,7 +180,7 @@ def closed_loop(
         stable=not record.diverged and _steady(residual),
         residual_rms_nm=float(np.sqrt(np.mean(np.square(settled)))) if settled.size else math.nan,
         strehl=ratio, latency_us=_percentiles(record.latency),
-        psf=_clean(np.mean(record.science, axis=0)) if record.science else None,
+        psf=_clean(images.mean(axis=0)) if record.science.count else None,
         model_psf=model_psf, residual_nm=residual[:: max(1, residual.size // 2000)],
         last_command=record.command, last_frame=None if record.last is None else record.last.data,
         partial=partial, notes=tuple(notes),
@@ -221,9 +222,27 @@ def _run(
         if watch and done >= closing and bench.science is not None:
             image = bench.science.poll()
             if image is not None and done > closing + 1:
-                record.science.append(image.data)
+                record.science.add(image.data)
         if report.due():
             yield report(done + 1, residual_nm=record.residual[-1], gain=float(control.gain))
+
+
+def _science_notes(bench: Bench, science: Camera, record: _Record, seconds: float) -> list[str]:
+    """What to know about the science frames of a run, or about their lack."""
+    rate, count = science.settings.frame_rate_hz, record.science.count
+    # The first frame or two after closing do not count.
+    expected = int((seconds - _CLOSING_S) * rate) - 2
+    notes = []
+    if count < expected / 2:
+        notes.append(f"only {count} of about {expected} frames came from {science.name}")
+    if count < LEAST and not record.diverged:
+        needed = math.ceil((_CLOSING_S + (LEAST + 2) / rate) * bench.wfs.settings.frame_rate_hz)
+        missing = "an error of the Strehl ratios" if count else "Strehl ratios"
+        notes.append(
+            f"too short for {missing}: {count} frames of {science.name} after the {_CLOSING_S:g} s in which "
+            f"the loop closes; run it for at least {needed} frames"
+        )
+    return notes
 
 
 def _clean(image: NDArray[np.floating]) -> NDArray[np.float32]:
