@@ -191,6 +191,7 @@ def docrime_run(
         "docrime-whitened" if whiten else "docrime",
         frames=solution.frames, lost_frames=solution.lost_frames, poke=float(poke),
         shortened=shortened, delay_frames=response.delay, whitening_order=solution.whitener.size - 1,
+        gain_sigma=solution.gain_sigma,
     )  # fmt: skip
     notes = []
     if float(np.median(matrix.snr())) < 1:
