@@ -117,7 +117,8 @@ class Bench:
             )
             if section is not None and device is not None
         }
-        told = [d.info.simulated for d in (self.dm, self.wfs, self.science) if d is not None and d.is_open]
+        speaking = (self.dm, self.wfs, self.science, self.screen)
+        told = [d.info.simulated for d in speaking if d is not None and d.is_open]
         return "sim" in chosen or any(told)
 
     def open(self) -> Self:

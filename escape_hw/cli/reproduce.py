@@ -96,7 +96,10 @@ def sky_time(
         one.show(_curves_table(campaign.rows(curves)))
         least = ", ".join(f"{name}: {n or 'none of these'}" for name, n in curves["fewest_frames"].items())
         one.show(f"fewest frames that meet the goal in every parameter: {least}")
-        one.result({**head, **curves}, met=curves["fewest_frames"]["whitened"] is not None)
+        if "note" in curves:
+            one.tell(curves["note"])
+        met = "note" not in curves and curves["fewest_frames"]["whitened"] is not None
+        one.result({**head, **curves}, met=met)
 
 
 def _curves_table(rows: Any) -> Any:
@@ -145,6 +148,7 @@ def _show_shwfs(one: Session, result: Any, document: dict[str, Any]) -> None:
     one.show(bands(document["simulated"], False))
     _show_registration(one, {"": result.calibrations["ESCAPE"]}, document)
     one.show(rich_table(strehl_table(result.loops)))
+    one.show(*result.notes)
     _show_end(one, document)
 
 

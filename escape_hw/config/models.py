@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from escape_hw.config.device_models import DevicesConfig, Mode
+from escape_hw.config.device_models import DeviceConfig, DevicesConfig, Mode
 from escape_hw.config.section import Breach, Section, enforce
 from escape_hw.config.toml_text import dump_toml
 from escape_hw.config.twin_models import TwinConfig
@@ -130,9 +130,8 @@ class SystemConfig(Section):
     @property
     def simulated(self) -> bool:
         """True when any device is to be a twin."""
-        devices = (self.devices.dm, self.devices.wfs, self.devices.science, self.devices.screen)
-        modes = [(device.mode or self.system.mode, device) for device in devices if device is not None]
-        return any(mode == "sim" and device.sim_driver for mode, device in modes)
+        present = [device for _, device in self.devices if isinstance(device, DeviceConfig)]
+        return any((d.mode or self.system.mode) == "sim" and d.sim_driver for d in present)
 
     def to_toml(self) -> str:
         """The whole effective configuration, defaults included, as ASCII TOML text.

@@ -38,7 +38,9 @@ class FrameStack:
         self._kept.append(self._sum / np.float32(self._each))
         self._sum, self._summed = None, 0
         if len(self._kept) == self._limit:
-            self._kept = [(a + b) / 2 for a, b in zip(self._kept[::2], self._kept[1::2], strict=True)]
+            self._kept = [
+                (a + b) / np.float32(2) for a, b in zip(self._kept[::2], self._kept[1::2], strict=True)
+            ]
             self._each *= 2
 
     def images(self) -> NDArray[np.float32]:

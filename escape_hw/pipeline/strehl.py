@@ -56,7 +56,7 @@ def centred(image: NDArray[np.floating]) -> NDArray[np.float64]:
     total = clean.sum()
     if not total > 0:
         raise CalibrationError("the science camera sees no light above its background")
-    return _moved(clean, _to_middle(clean)) / total
+    return np.asarray(_moved(clean, _to_middle(clean)) / total)
 
 
 def _to_middle(clean: NDArray[np.float64]) -> NDArray[np.float64]:
