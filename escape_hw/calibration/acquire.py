@@ -12,6 +12,7 @@ from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.mirror import DeformableMirror, SendReport
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
+from escape_hw.calibration.mean_focus import MeanFocus
 from escape_hw.errors import CalibrationError, ConfigError
 
 #: Spots move and blur by more than their centres of gravity show: what the window and the threshold
@@ -90,16 +91,18 @@ class Motion:
         variance = np.maximum(self._squares / self._n - np.square(self._sum / self._n), 0).mean()
         return replace(grid, motion_px=MOTION_FACTOR * float(np.sqrt(variance)))
 
-    def references(self, grid: SubApertureGrid) -> SubApertureGrid:
+    def references(self, grid: SubApertureGrid, focus: MeanFocus | None = None) -> SubApertureGrid:
         """The grid with its references moved onto the lattice of the mean spots of all frames.
 
         The grid was found on the first frames, whose mean tilt and focus are the turbulence's own;
         over the whole run they average out further. The windows stay where they are, so every
-        slope of the run keeps its meaning.
+        slope of the run keeps its meaning. ``focus``, which saw the same frames, takes out what the
+        wind explains of the mean focus.
         """
         if self._n < 2:
             return grid
-        mean = (self._sum / self._n).reshape(2, -1).T
+        total = self._sum / self._n
+        mean = (total if focus is None else focus.corrected(total)).reshape(2, -1).T
         rows, columns = np.nonzero(grid.valid)
         at = np.stack([columns, rows], axis=1) - (np.array(grid.valid.shape[::-1]) - 1) / 2
         weight = grid.flux[grid.valid].astype(float)

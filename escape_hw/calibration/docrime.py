@@ -21,6 +21,7 @@ from escape_hw.calibration.acquire import (
     some_frames,
 )
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator, DocrimeSolution
+from escape_hw.calibration.mean_focus import MeanFocus
 from escape_hw.calibration.sensor_setup import (
     SETUP_FRAMES,
     extractor,
@@ -65,6 +66,7 @@ class _Session:
     slopes_of: SlopeExtractor | None = None
     estimator: DocrimeEstimator | None = None
     motion: Motion | None = None
+    focus: MeanFocus | None = None
     light: LightWatch | None = None
     waiting: list[tuple[Frame, NDArray[np.float64]]] = field(default_factory=list)
     taken: int = 0
@@ -92,6 +94,8 @@ class _Session:
             self.grid, self.mean_frame = setup.grid, setup.mean_frame
         self.slopes_of = extractor(self.bench, self.grid)
         self.motion, self.light = Motion(self.grid.n_slopes), LightWatch(self.bench.wfs.name, self.grid)
+        if self.mean_frame is not None:
+            self.focus = MeanFocus(self.grid, self.bench.wfs.settings.frame_rate_hz)
         self.estimator = DocrimeEstimator(
             self.grid.n_slopes,
             self.n_modes,
@@ -108,7 +112,7 @@ class _Session:
         if self.grid is None or self.motion is None:
             raise RuntimeError("the sensor was never set up")
         grid = self.motion.of(self.grid)
-        return grid if self.mean_frame is None else self.motion.references(grid)
+        return grid if self.mean_frame is None else self.motion.references(grid, self.focus)
 
     def _feed(self, frame: Frame, poke: NDArray[np.float64]) -> None:
         if self.slopes_of is None or self.motion is None or self.light is None or self.estimator is None:
@@ -116,6 +120,8 @@ class _Session:
         slopes = self.slopes_of(frame.data)
         self.light(self.slopes_of.flux)
         self.motion.add(slopes)
+        if self.focus is not None:
+            self.focus.add(slopes)
         self.estimator.partial_fit(frame.index, slopes, poke)
         if self.kept is not None:
             self.kept.append((frame.index, slopes, poke))
@@ -197,10 +203,11 @@ def docrime_run(
     if float(np.median(matrix.snr())) < 1:
         notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
     seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
-    if session.mean_frame is not None and seconds < _REFERENCE_S:
+    if session.focus is not None and seconds < _REFERENCE_S and session.focus.still() is None:
         notes.append(
-            f"the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio; "
-            "the matrix is not touched by it: close the loop on references taken over a longer time"
+            f"the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio "
+            "and which the wind does not explain; the matrix is not touched by it: close the loop on "
+            "references taken over a longer time"
         )
     result = CalibrationResult(
         matrix,
