@@ -134,13 +134,7 @@ def closed_loop(
     some_frames(frames)
     if not (0 < gain < math.inf and 0 <= leak <= 1):
         raise ConfigError(f"gain is {gain} and leak {leak}; the gain must be positive, the leak in [0, 1]")
-    if matrix.m2c.shape[0] != bench.dm.info.n_act or matrix.n_slopes != grid.n_slopes:
-        raise IncompatibleProduct(
-            f"the matrix is for {matrix.m2c.shape[0]} actuators and {matrix.n_slopes} slopes; "
-            f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
-        )
-    if not np.array_equal(matrix.valid, grid.valid):
-        raise IncompatibleProduct("the matrix and the grid mark different sub-apertures as valid")
+    _require_fit(bench, matrix, grid)
     stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
     control = LeakyIntegrator(reconstructor(matrix.data, scale=stroke, dropped_modes=dropped), gain, leak)
     slopes_of = extractor(bench, grid)
@@ -149,8 +143,7 @@ def closed_loop(
     bench.dm.flatten()
     # One frame first: what the camera lost while nobody read it is not a loss of the loop.
     next_frame(bench)
-    before = bench.wfs.status()
-    started = bench.wfs.now_ns()
+    lost, started = bench.wfs.status().lost, bench.wfs.now_ns()
     if science is not None:
         science.stop()
     try:
@@ -162,29 +155,48 @@ def closed_loop(
         if science is not None:
             science.stop()
     seconds = max((bench.wfs.now_ns() - started) * 1e-9, 1e-9)
-    notes = ["the loop diverged and was opened"] if record.diverged else []
-    images = record.science.images()
-    ratio: StrehlEstimate | None = None
-    if science is not None and model_psf is not None:
-        notes += _science_notes(bench, science, record, seconds)
-        if record.science.count and not record.diverged:
-            try:
-                ratio = strehl(images, model_psf)
-            except CalibrationError as error:
-                notes.append(f"no Strehl ratio: {error}")
+    images, ratio, notes = _judged(bench, record, seconds, model_psf)
     residual = np.array(record.residual, dtype=np.float32)
     settled = residual[len(residual) // 10 :]
     return LoopResult(
         method=matrix.method, gain=gain, leak=leak, dropped_modes=dropped, frames=record.frames,
-        lost_frames=bench.wfs.status().lost - before.lost, rate_hz=record.frames / seconds,
+        lost_frames=bench.wfs.status().lost - lost, rate_hz=record.frames / seconds,
         stable=not record.diverged and _steady(residual),
         residual_rms_nm=float(np.sqrt(np.mean(np.square(settled)))) if settled.size else math.nan,
         strehl=ratio, latency_us=_percentiles(record.latency),
-        psf=_clean(images.mean(axis=0)) if record.science.count else None,
+        psf=_clean(images.mean(axis=0)) if len(images) else None,
         model_psf=model_psf, residual_nm=residual[:: max(1, residual.size // 2000)],
         last_command=record.command, last_frame=None if record.last is None else record.last.data,
         partial=partial, notes=tuple(notes),
     )  # fmt: skip
+
+
+def _require_fit(bench: Bench, matrix: InteractionMatrix, grid: SubApertureGrid) -> None:
+    """Raise :class:`IncompatibleProduct` unless mirror, matrix and grid belong together."""
+    if matrix.m2c.shape[0] != bench.dm.info.n_act or matrix.n_slopes != grid.n_slopes:
+        raise IncompatibleProduct(
+            f"the matrix is for {matrix.m2c.shape[0]} actuators and {matrix.n_slopes} slopes; "
+            f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
+        )
+    if not np.array_equal(matrix.valid, grid.valid):
+        raise IncompatibleProduct("the matrix and the grid mark different sub-apertures as valid")
+
+
+def _judged(
+    bench: Bench, record: _Record, seconds: float, model_psf: NDArray[np.float32] | None
+) -> tuple[NDArray[np.float32], StrehlEstimate | None, list[str]]:
+    """Images of the science camera, the Strehl ratios where there are any, and what to know about the run."""
+    notes = ["the loop diverged and was opened"] if record.diverged else []
+    images = record.science.images()
+    if bench.science is None or model_psf is None:
+        return images, None, notes
+    notes += _science_notes(bench, bench.science, record, seconds)
+    if record.diverged or not record.science.count:
+        return images, None, notes
+    try:
+        return images, strehl(images, model_psf), notes
+    except CalibrationError as error:
+        return images, None, [*notes, f"no Strehl ratio: {error}"]
 
 
 def _run(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.frames import Frame
+from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
@@ -191,36 +192,41 @@ def docrime_run(
         if partial:
             raise Aborted(f"aborted after {session.taken} frames, too few for a matrix") from None
         raise
-    response = solution.response
     matrix = measured_matrix(
         bench, session.grid, m2c, solution.matrix, solution.sigma,
         "docrime-whitened" if whiten else "docrime",
         frames=solution.frames, lost_frames=solution.lost_frames, poke=float(poke),
-        shortened=shortened, delay_frames=response.delay, whitening_order=solution.whitener.size - 1,
-        gain_sigma=solution.gain_sigma,
+        shortened=shortened, delay_frames=solution.response.delay,
+        whitening_order=solution.whitener.size - 1, gain_sigma=solution.gain_sigma,
     )  # fmt: skip
+    return DocrimeRun(_result(session, matrix, solution, partial), solution, session.record())
+
+
+def _result(
+    session: _Session, matrix: InteractionMatrix, solution: DocrimeSolution, partial: bool
+) -> CalibrationResult:
+    """The matrix with all that the run taught about the sensor."""
     notes = []
     if float(np.median(matrix.snr())) < 1:
         notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
-    seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
+    seconds = (solution.frames + solution.lost_frames) / session.bench.wfs.settings.frame_rate_hz
     if session.focus is not None and seconds < _REFERENCE_S and session.focus.still() is None:
         notes.append(
             f"the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio "
             "and which the wind does not explain; the matrix is not touched by it: close the loop on "
             "references taken over a longer time"
         )
-    result = CalibrationResult(
+    return CalibrationResult(
         matrix,
         session.finished_grid(),
         solution.frames,
         solution.lost_frames,
         seconds,
-        response,
+        solution.response,
         partial=partial,
         mean_frame=session.mean_frame,
         notes=tuple(notes),
     )
-    return DocrimeRun(result, solution, session.record())
 
 
 def docrime(
