@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from escape_hw.api.procedure import Procedure, Progress, Reporter, run
     from escape_hw.api.registration import Registration
     from escape_hw.api.results import CalibrationResult, LoopResult, Measured, RegistrationEstimate
-    from escape_hw.api.screen import PhaseScreen, ScreenState
+    from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
     from escape_hw.api.sensor import SubApertureGrid
     from escape_hw.calibration.closed_loop import best_gain, closed_loop, measure_model_psf
     from escape_hw.calibration.docrime import docrime
@@ -63,6 +63,7 @@ _HOME = {
     "Registration": "escape_hw.api.registration",
     "RegistrationEstimate": "escape_hw.api.results",
     "Reporter": "escape_hw.api.procedure",
+    "ScreenInfo": "escape_hw.api.screen",
     "ScreenState": "escape_hw.api.screen",
     "SendReport": "escape_hw.api.mirror",
     "SubApertureGrid": "escape_hw.api.sensor",
@@ -106,6 +107,7 @@ __all__ = [
     "Registration",
     "RegistrationEstimate",
     "Reporter",
+    "ScreenInfo",
     "ScreenState",
     "SendReport",
     "SubApertureGrid",

@@ -123,7 +123,7 @@ class Bench:
             )
             if section is not None and device is not None
         }
-        speaking = (self.dm, self.wfs, self.science, self.modulator)
+        speaking = (self.dm, self.wfs, self.science, self.screen, self.modulator)
         told = [d.info.simulated for d in speaking if d is not None and d.is_open]
         return "sim" in chosen or any(told)
 
@@ -217,11 +217,12 @@ def _build(
     """Build one device, or ``None`` when the system has none in this mode."""
     if section is None:
         return None
-    driver = section.sim_driver if mode_of(section, config) == "sim" else section.driver
+    twin = mode_of(section, config) == "sim"
+    driver = section.sim_driver if twin else section.driver
     if not driver:
         return None
     try:
-        factory = device_factory(driver)
+        factory = device_factory(driver, hardware=not twin)
     except ConfigError as error:
         raise ConfigError(f"devices.{name}: {error}") from error
     device = factory(name, config, shared)

@@ -27,6 +27,15 @@ class ScreenState:
     blocked: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class ScreenInfo:
+    """Identity of a changer of phase screens: model, serial number, whether it is a twin."""
+
+    model: str
+    serial: str
+    simulated: bool
+
+
 class PhaseScreen(Device):
     """A changer with one or more rotating phase screens.
 
@@ -34,6 +43,11 @@ class PhaseScreen(Device):
     is measured on. A telescope has no such device, and neither the open-loop DO-CRIME nor the
     ESCAPE procedure ever asks for it.
     """
+
+    @property
+    @abc.abstractmethod
+    def info(self) -> ScreenInfo:
+        """Identity; available once open."""
 
     @property
     @abc.abstractmethod

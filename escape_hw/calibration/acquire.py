@@ -10,6 +10,7 @@ from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.mirror import DeformableMirror, SendReport
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
+from escape_hw.calibration.mean_focus import MeanFocus
 from escape_hw.errors import CalibrationError, ConfigError
 
 #: So many frames in a row with half of the sub-apertures dark mean that the light has gone ...
@@ -85,9 +86,15 @@ class Motion:
         variance = np.maximum(self._squares / self._n - np.square(self._sum / self._n), 0).mean()
         return grid.with_motion(float(np.sqrt(variance)))
 
-    def references(self, grid: SensorGeometry) -> SensorGeometry:
-        """The geometry with the references that all frames of a run give, instead of its first ones."""
-        return grid if self._n < 2 else grid.with_mean_slopes(self._sum / self._n)
+    def references(self, grid: SensorGeometry, focus: MeanFocus | None = None) -> SensorGeometry:
+        """The geometry with the references that all frames of a run give, instead of its first ones.
+
+        ``focus``, which saw the same frames, takes out what the wind explains of the mean focus.
+        """
+        if self._n < 2:
+            return grid
+        mean = self._sum / self._n
+        return grid.with_mean_slopes(mean if focus is None else focus.corrected(mean))
 
 
 def reachable(dm: DeformableMirror, shape: NDArray[np.float64]) -> NDArray[np.float64]:

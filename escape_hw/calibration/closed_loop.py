@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.camera import Camera
 from escape_hw.api.frames import Frame
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
@@ -18,8 +19,10 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, next_frame, some_frames
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, IncompatibleProduct
+from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.integrator import LeakyIntegrator, gain_limit
 from escape_hw.pipeline.reconstructor import reconstructor
+from escape_hw.pipeline.standard_error import LEAST
 from escape_hw.pipeline.strehl import has_light, strehl, without_background
 
 #: Seconds after closing during which the science frames do not count.
@@ -38,7 +41,7 @@ _USUAL_DELAY = 2.0
 class _Record:
     """What a run gathers on its way."""
 
-    science: list[NDArray[np.uint16]] = field(default_factory=list)
+    science: FrameStack = field(default_factory=FrameStack)
     residual: list[float] = field(default_factory=list)
     latency: list[int] = field(default_factory=list)
     frames: int = 0
@@ -130,13 +133,7 @@ def closed_loop(
     some_frames(frames)
     if not (0 < gain < math.inf and 0 <= leak <= 1):
         raise ConfigError(f"gain is {gain} and leak {leak}; the gain must be positive, the leak in [0, 1]")
-    if matrix.m2c.shape[0] != bench.dm.info.n_act or matrix.n_slopes != grid.n_slopes:
-        raise IncompatibleProduct(
-            f"the matrix is for {matrix.m2c.shape[0]} actuators and {matrix.n_slopes} slopes; "
-            f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
-        )
-    if not np.array_equal(matrix.valid, grid.valid):
-        raise IncompatibleProduct(f"the matrix and the geometry mark different {grid.elements} as valid")
+    _require_fit(bench, matrix, grid)
     stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
     control = LeakyIntegrator(reconstructor(matrix.data, scale=stroke, dropped_modes=dropped), gain, leak)
     prepare_sensor(bench)
@@ -146,8 +143,7 @@ def closed_loop(
     bench.dm.flatten()
     # One frame first: what the camera lost while nobody read it is not a loss of the loop.
     next_frame(bench)
-    before = bench.wfs.status()
-    started = bench.wfs.now_ns()
+    lost, started = bench.wfs.status().lost, bench.wfs.now_ns()
     if science is not None:
         science.stop()
     try:
@@ -159,31 +155,48 @@ def closed_loop(
         if science is not None:
             science.stop()
     seconds = max((bench.wfs.now_ns() - started) * 1e-9, 1e-9)
-    ratio: StrehlEstimate | None = None
-    notes = ["the loop diverged and was opened"] if record.diverged else []
-    if science is not None:
-        # The first frame or two after closing do not count.
-        expected = int((seconds - _CLOSING_S) * science.settings.frame_rate_hz) - 2
-        if len(record.science) < expected / 2:
-            notes.append(f"only {len(record.science)} of about {expected} frames came from {science.name}")
-    if science is not None and model_psf is not None and record.science and not record.diverged:
-        try:
-            ratio = strehl(np.array(record.science, dtype=np.float32), model_psf)
-        except CalibrationError as error:
-            notes.append(str(error))
+    images, ratio, notes = _judged(bench, record, seconds, model_psf)
     residual = np.array(record.residual, dtype=np.float32)
     settled = residual[len(residual) // 10 :]
     return LoopResult(
         method=matrix.method, gain=gain, leak=leak, dropped_modes=dropped, frames=record.frames,
-        lost_frames=bench.wfs.status().lost - before.lost, rate_hz=record.frames / seconds,
+        lost_frames=bench.wfs.status().lost - lost, rate_hz=record.frames / seconds,
         stable=not record.diverged and _steady(residual),
         residual_rms_nm=float(np.sqrt(np.mean(np.square(settled)))) if settled.size else math.nan,
         strehl=ratio, latency_us=_percentiles(record.latency),
-        psf=_clean(np.mean(record.science, axis=0)) if record.science else None,
+        psf=_clean(images.mean(axis=0)) if len(images) else None,
         model_psf=model_psf, residual_nm=residual[:: max(1, residual.size // 2000)],
         last_command=record.command, last_frame=None if record.last is None else record.last.data,
         partial=partial, notes=tuple(notes),
     )  # fmt: skip
+
+
+def _require_fit(bench: Bench, matrix: InteractionMatrix, grid: SensorGeometry) -> None:
+    """Raise :class:`IncompatibleProduct` unless mirror, matrix and grid belong together."""
+    if matrix.m2c.shape[0] != bench.dm.info.n_act or matrix.n_slopes != grid.n_slopes:
+        raise IncompatibleProduct(
+            f"the matrix is for {matrix.m2c.shape[0]} actuators and {matrix.n_slopes} slopes; "
+            f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
+        )
+    if not np.array_equal(matrix.valid, grid.valid):
+        raise IncompatibleProduct(f"the matrix and the geometry mark different {grid.elements} as valid")
+
+
+def _judged(
+    bench: Bench, record: _Record, seconds: float, model_psf: NDArray[np.float32] | None
+) -> tuple[NDArray[np.float32], StrehlEstimate | None, list[str]]:
+    """Images of the science camera, the Strehl ratios where there are any, and what to know about the run."""
+    notes = ["the loop diverged and was opened"] if record.diverged else []
+    images = record.science.images()
+    if bench.science is None or model_psf is None:
+        return images, None, notes
+    notes += _science_notes(bench, bench.science, record, seconds)
+    if record.diverged or not record.science.count:
+        return images, None, notes
+    try:
+        return images, strehl(images, model_psf), notes
+    except CalibrationError as error:
+        return images, None, [*notes, f"no Strehl ratio: {error}"]
 
 
 def _run(
@@ -221,9 +234,27 @@ def _run(
         if watch and done >= closing and bench.science is not None:
             image = bench.science.poll()
             if image is not None and done > closing + 1:
-                record.science.append(image.data)
+                record.science.add(image.data)
         if report.due():
             yield report(done + 1, residual_nm=record.residual[-1], gain=float(control.gain))
+
+
+def _science_notes(bench: Bench, science: Camera, record: _Record, seconds: float) -> list[str]:
+    """What to know about the science frames of a run, or about their lack."""
+    rate, count = science.settings.frame_rate_hz, record.science.count
+    # The first frame or two after closing do not count.
+    expected = int((seconds - _CLOSING_S) * rate) - 2
+    notes = []
+    if count < expected / 2:
+        notes.append(f"only {count} of about {expected} frames came from {science.name}")
+    if count < LEAST and not record.diverged:
+        needed = math.ceil((_CLOSING_S + (LEAST + 2) / rate) * bench.wfs.settings.frame_rate_hz)
+        missing = "an error of the Strehl ratios" if count else "Strehl ratios"
+        notes.append(
+            f"too short for {missing}: {count} frames of {science.name} after the {_CLOSING_S:g} s in which "
+            f"the loop closes; run it for at least {needed} frames"
+        )
+    return notes
 
 
 def _clean(image: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -44,12 +44,16 @@ class DocrimeSolution:
     Parameters
     ----------
     matrix, sigma
-        ``(n_slopes, n_modes)``: slopes per unit mode, and standard errors.
+        ``(n_slopes, n_modes)``: slopes per unit mode, and standard errors of single elements beside a
+        gain that they share.
     covariance
         Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; diagonal where
         correlations were not asked for.
     whitener
         The filter used, ``[1]`` for the plain estimator.
+    gain_sigma
+        Relative standard error of the gain that all elements share: an error of the temporal response,
+        which is scaled to sum 1, scales the whole matrix.
     """
 
     matrix: NDArray[np.float64]
@@ -59,6 +63,7 @@ class DocrimeSolution:
     whitener: NDArray[np.float64]
     frames: int
     lost_frames: int
+    gain_sigma: float
 
 
 class DocrimeEstimator:
@@ -88,6 +93,7 @@ class DocrimeEstimator:
         self._next: int | None = None
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
+        self._response_covariance = np.zeros((lags, lags))
         self._tracker: ResponseTracker | None = None
         self._spread = 1.0
         self._sums = RegressionSums.zeros(n_slopes, n_modes, correlations=correlations)
@@ -216,6 +222,7 @@ class DocrimeEstimator:
             self._whitener,
             self.frames,
             self.lost_frames,
+            self._tracker.gain_sigma(),
         )
 
     def _absorb(self) -> None:
@@ -245,8 +252,9 @@ class DocrimeEstimator:
         self._sums.add(block.slopes, block.pokes_through(self._response.weights))
         if self._tracker is None:
             self._tracker = ResponseTracker(
-                self._sums.centred().solve(), self._response, block.now.size, autocovariance(block, self.lags)
-            )
+                self._sums.centred().solve(), self._response, self._response_covariance, block.now.size,
+                autocovariance(block, self.lags),
+            )  # fmt: skip
         elif self.order:
             # Without the filter later frames would tell less than the first ones' differences did.
             self._tracker.add(block)
@@ -261,14 +269,14 @@ class DocrimeEstimator:
         _require_excitation(data.pokes.T @ data.pokes)
         # Differences tell the response well even where the plain estimator is asked for.
         difference, few = np.array([1.0, -1.0]), data.thinned(_FEW_SLOPES if self.order else SLOPES)
-        response, whitener = fit_response(few, difference, self.lags), np.ones(1)
+        (response, covariance), whitener = fit_response(few, difference, self.lags), np.ones(1)
         if self.order:
             residuals, usable = self._residuals(few, difference, response)
             whitener = prediction_error_filter(residuals, usable, self.order)
-            response = fit_response(data, whitener, self.lags)
+            response, covariance = fit_response(data, whitener, self.lags)
         else:
             self._spread = self._plain_spread(few, difference, response)
-        self._whitener, self._response = whitener, response
+        self._whitener, self._response, self._response_covariance = whitener, response, covariance
 
     def _plain_spread(
         self, few: Telemetry, difference: NDArray[np.float64], response: TemporalResponse

@@ -109,6 +109,11 @@ def escape(
         )
     except Aborted:
         return replace(measured, partial=True)
+    # The matrix's own gain errs for all modes alike, which no fit to it can tell.
+    gain = estimate.gain
+    estimate = replace(
+        estimate, gain=replace(gain, sigma=float(np.hypot(gain.sigma, gain.value * run.solution.gain_sigma)))
+    )
     made = synthesise(bench, measured.grid, estimate, measured.matrix.m2c)
     metrics = {**measured.matrix.metrics, **made.matrix.metrics}
     return replace(

@@ -93,9 +93,21 @@ def karhunen_loeve(
     CalibrationError
         More modes than the mirror can make.
     """
-    n_act, n = surfaces.shape[0], pupil.shape[0]
     inside = surfaces[:, pupil]
     inside = inside - inside.mean(axis=1, keepdims=True)
+    orthonormal = _orthonormal(inside, pupil, n_modes)
+    covariance = _turbulent_covariance(inside, pupil, pixel_m, outer_scale_m)
+    variance, turn = np.linalg.eigh(orthonormal.T @ covariance @ orthonormal)
+    m2c = orthonormal @ turn[:, np.argsort(variance)[::-1]]
+    return fix_signs(unit_rms(m2c, surfaces, pupil))
+
+
+def _orthonormal(inside: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:
+    """Modes ``(n_act, n_modes)`` orthonormal over the pupil that span what the mirror makes best.
+
+    ``inside (n_act, n_pixels)`` are the influence functions over the pupil, without piston.
+    """
+    n_act = len(inside)
     gram = inside @ inside.T / inside.shape[1]
     rows, columns = np.nonzero(pupil)
     lean = np.square(columns - columns.mean()) - np.square(rows - rows.mean())
@@ -109,9 +121,15 @@ def karhunen_loeve(
         )
     order = np.argsort(values)[::-1][:n_modes]
     chosen = vectors[:, order] / np.sqrt(values[order])
-    orthonormal = np.linalg.solve(np.linalg.cholesky(chosen.T @ gram @ chosen), chosen.T).T
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(chosen.T @ gram @ chosen), chosen.T).T)
+
+
+def _turbulent_covariance(
+    inside: NDArray[np.float64], pupil: NDArray[np.bool_], pixel_m: float, outer_scale_m: float
+) -> NDArray[np.float64]:
+    """Covariance of what turbulence puts on each influence function ``(n_act, n_act)``, of unit trace."""
+    n_act, n = len(inside), pupil.shape[0]
     padded = np.zeros((n_act, 2 * n, 2 * n))
-    padded[:, :n, :n] = np.where(pupil, surfaces, 0.0)
     padded[:, :n, :n][:, pupil] = inside
     # With twice the pupil's size every pair of pixels keeps its own distance: nothing wraps around.
     apart = np.minimum(np.arange(2 * n), 2 * n - np.arange(2 * n)) * pixel_m
@@ -124,11 +142,7 @@ def karhunen_loeve(
     weighted = transform * (spectrum * twice).ravel()
     covariance = weighted.real @ transform.real.T + weighted.imag @ transform.imag.T
     # An overall factor turns no mode.
-    covariance /= np.trace(covariance)
-    turbulent = orthonormal.T @ covariance @ orthonormal
-    variance, turn = np.linalg.eigh(turbulent)
-    m2c = orthonormal @ turn[:, np.argsort(variance)[::-1]]
-    return fix_signs(unit_rms(m2c, surfaces, pupil))
+    return np.asarray(covariance / np.trace(covariance))
 
 
 def zonal(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:

@@ -93,7 +93,9 @@ def autocovariance(data: Filtered, lags: int) -> NDArray[np.float64]:
     return np.array([float(np.vdot(present, one)) for one in (present, *past)])
 
 
-def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> TemporalResponse:
+def fit_response(
+    data: Telemetry, whitener: NDArray[np.float64], lags: int
+) -> tuple[TemporalResponse, NDArray[np.float64]]:
     """Share of the final response in each of the frames after a command.
 
     Every slope answers to the same few lags, so the lags are regressed on what a provisional matrix
@@ -112,8 +114,10 @@ def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> T
 
     Returns
     -------
-    TemporalResponse
+    response : TemporalResponse
         Standard errors hold for turbulence that moves neighbouring slopes together.
+    covariance : ndarray, ``(lags, lags)``
+        Of its weights; their errors sum to zero.
     """
     few = filtered(data.thinned(SLOPES), whitener, lags)
     slopes, pokes, now = few.slopes - few.slopes.mean(axis=0), few.pokes - few.pokes.mean(axis=0), few.now
@@ -127,7 +131,8 @@ def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> T
         weights.append(w)
         covariances.append(c)
     mean = np.mean(weights, axis=0)
-    return TemporalResponse(mean, np.sqrt(np.diag(np.sum(covariances, axis=0))) / 2)
+    covariance = np.sum(covariances, axis=0) / 4
+    return TemporalResponse(mean, np.sqrt(np.diag(covariance))), covariance
 
 
 def _strongest_lag(
@@ -178,8 +183,8 @@ class ResponseTracker:
     ----------
     matrix
         Matrix of the first frames ``(n_slopes, n_modes)``.
-    first
-        Response of the first frames.
+    first, covariance
+        Response of the first frames and the covariance of its weights.
     rows
         Number of rows it came from.
     autocovariance
@@ -190,12 +195,13 @@ class ResponseTracker:
         self,
         matrix: NDArray[np.float64],
         first: TemporalResponse,
+        covariance: NDArray[np.float64],
         rows: int,
         autocovariance: NDArray[np.float64],
     ) -> None:
         self._step = max(1, -(-matrix.shape[0] // SLOPES))
         self._matrix = np.ascontiguousarray(matrix[:: self._step].T, np.float32)
-        self._first, self._first_rows = first, rows
+        self._first, self._covariance, self._first_rows = first, covariance, rows
         self._autocovariance = autocovariance
         lags = first.weights.size
         self._normal, self._right, self.rows = np.zeros(lags), np.zeros(lags), 0
@@ -216,7 +222,7 @@ class ResponseTracker:
         if self.rows < self._first_rows:
             return self._first
         weights = solve_toeplitz(self._normal, self._right)
-        share = self._first_rows / (self._first_rows + self.rows)
+        share = self._share()
         mean = share * self._first.weights + (1 - share) * weights / weights.sum()
         return TemporalResponse(mean, self._first.sigma * np.sqrt(share))
 
@@ -229,3 +235,14 @@ class ResponseTracker:
         assumed = self._first.weights
         seen = toeplitz(self._autocovariance) @ assumed
         return float((assumed @ seen) / (self.response().weights @ seen))
+
+    def gain_sigma(self) -> float:
+        """Standard error of the factor that the response's errors put on all of a matrix."""
+        seen = toeplitz(self._autocovariance) @ self._first.weights
+        variance = float(seen @ self._covariance @ seen) * self._share()
+        return float(np.sqrt(variance)) / abs(float(self.response().weights @ seen))
+
+    def _share(self) -> float:
+        """Share of the rows behind the first response; one as long as nothing else is used."""
+        later = self.rows if self.rows >= self._first_rows else 0
+        return self._first_rows / (self._first_rows + later)

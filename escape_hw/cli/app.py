@@ -66,9 +66,10 @@ def run(arguments: Sequence[str] | None = None) -> None:
 
 
 def _tell_usage(error: Exception, words: Sequence[str]) -> None:
-    from escape_hw.io.documents import dumps
+    from escape_hw.io.documents import dumps, head
 
     message = str(error.format_message())  # type: ignore[attr-defined]
     typer.echo(f"error: {message}", err=True)
     command = next((word for word in words if not word.startswith("-")), "")
-    typer.echo(dumps({"schema": 1, "command": command, "error": {"type": "UsageError", "message": message}}))
+    failure = {"type": "UsageError", "message": message}
+    typer.echo(dumps({**head(command, None, None, None), "error": failure}))

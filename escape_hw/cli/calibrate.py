@@ -43,12 +43,11 @@ def calibrate(
 ) -> None:
     """Measure an interaction matrix and, with ESCAPE, the registration behind it."""
     with session("calibrate", json=json, quiet=quiet) as one:
-        from escape_hw.config.load import load_system
-
+        choice = options.Choice.of(system, set, seed, mode)
+        if modes is not None:
+            choice = _with_modes(one, choice, modes)
+        config = one.configured(choice)
         start = _procedure(method, frames, poke, accuracy, plain)
-        overrides = [*(set or []), *([] if modes is None else [f"basis.n_modes={modes}"])]
-        choice = options.Choice.of(system, overrides, seed, mode)
-        config = load_system(choice.system, overrides=choice.set, seed=seed, mode=mode)
         with one.run_folder(config, f"calibrate-{method}", out) as folder:
             with one.bench(choice) as bench:
                 from escape_hw.runtime.records import BenchRecord
@@ -59,6 +58,21 @@ def calibrate(
                 _finish(one, folder, record, result, accuracy)
             if stop is not None:
                 raise stop
+
+
+def _with_modes(one: Session, choice: options.Choice, modes: int) -> options.Choice:
+    """The choice with another number of modes; the loop goes on dropping the same share of them.
+
+    Who sets ``loop.dropped_modes`` gets what was set.
+    """
+    wanted = f"basis.n_modes={modes}"
+    if any(text.partition("=")[0].strip() == "loop.dropped_modes" for text in choice.set):
+        return choice.plus(wanted)
+    usual = one.configured(choice)
+    dropped = min(usual.loop.dropped_modes, modes * usual.loop.dropped_modes // usual.basis.n_modes)
+    if dropped != usual.loop.dropped_modes:
+        one.tell(f"loop.dropped_modes: {usual.loop.dropped_modes} becomes {dropped} with {modes} modes")
+    return choice.plus(wanted, f"loop.dropped_modes={dropped}")
 
 
 def _procedure(
@@ -140,9 +154,7 @@ def sprint(
 ) -> None:
     """Find the registration behind a measured interaction matrix; opens no device."""
     with session("sprint", json=json, quiet=quiet) as one:
-        from escape_hw.config.load import load_system
-
-        config = load_system(system, overrides=tuple(set or ()), seed=seed, mode=mode)
+        config = one.configured(options.Choice.of(system, set, seed, mode))
         with one.run_folder(config, "sprint", out) as folder:
             _sprint(one, folder, config, im)
 

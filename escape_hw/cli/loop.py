@@ -46,7 +46,6 @@ def loop(
 ) -> None:
     """Close the loop with an interaction matrix."""
     with session("loop", json=json, quiet=quiet) as one:
-        from escape_hw.config.load import load_system
         from escape_hw.errors import ConfigError
 
         if best and gain is not None:
@@ -54,7 +53,7 @@ def loop(
         given = {"gain": gain, "leak": leak, "dropped_modes": drop}
         settings = [f"loop.{key}={value}" for key, value in given.items() if value is not None]
         choice = options.Choice.of(system, [*(set or []), *settings], seed, mode)
-        config = load_system(choice.system, overrides=choice.set, seed=seed, mode=mode)
+        config = one.configured(choice)
         product = fitting_matrix(im, config, force)
         with one.run_folder(config, "loop", out) as folder:
             with one.bench(choice) as bench:
@@ -145,4 +144,4 @@ def _finish(
     )
     one.result(document, met=result.stable)
     one.show(bands(record.simulated, result.partial), rich_table(strehl_table({label: result})))
-    one.show(*products_view(document["products"]))
+    one.show(*result.notes, *products_view(document["products"]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -33,6 +33,10 @@ class Choice:
     set: tuple[str, ...] = ()
     seed: int | None = None
     mode: str | None = None
+
+    def plus(self, *overrides: str) -> Choice:
+        """The same with further overrides, which go last."""
+        return replace(self, set=(*self.set, *overrides))
 
     @classmethod
     def of(cls, system: str, overrides: list[str] | None, seed: int | None, mode: str | None) -> Choice:

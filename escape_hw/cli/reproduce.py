@@ -81,11 +81,10 @@ def sky_time(
 ) -> None:
     """Error of the registration against frames, plain and whitened, with the Cramer-Rao bound."""
     with session("reproduce sky-time", json=json, quiet=quiet) as one:
-        from escape_hw.config.load import load_system
         from escape_hw.io import documents
         from escape_hw.runtime import sky_time as campaign
 
-        config = load_system(system, overrides=set or [], mode="sim")
+        config = one.configured(options.Choice.of(system, set, None, "sim"))
         counts = sorted(frames or campaign.FRAMES)
         procedure = campaign.sky_time(
             system, plants=plants, frames=counts, overrides=set or [], workers=workers
@@ -97,7 +96,10 @@ def sky_time(
         one.show(_curves_table(campaign.rows(curves)))
         least = ", ".join(f"{name}: {n or 'none of these'}" for name, n in curves["fewest_frames"].items())
         one.show(f"fewest frames that meet the goal in every parameter: {least}")
-        one.result({**head, **curves}, met=curves["fewest_frames"]["whitened"] is not None)
+        if "note" in curves:
+            one.tell(curves["note"])
+        met = "note" not in curves and curves["fewest_frames"]["whitened"] is not None
+        one.result({**head, **curves}, met=met)
 
 
 def _curves_table(rows: Any) -> Any:
@@ -124,9 +126,7 @@ def _run(
     one: Session, choice: options.Choice, kind: str, out: Path | None, start: Any, keep: Any
 ) -> tuple[Any, dict[str, Any]]:
     """Open, run, close, keep; what an aborted run has measured is kept before it says so."""
-    from escape_hw.config.load import load_system
-
-    config = load_system(choice.system, overrides=choice.set, seed=choice.seed, mode=choice.mode)
+    config = one.configured(choice)
     with one.run_folder(config, f"reproduce-{kind}", out) as folder:
         with one.bench(choice) as bench:
             from escape_hw.runtime.records import BenchRecord
@@ -148,6 +148,7 @@ def _show_shwfs(one: Session, result: Any, document: dict[str, Any]) -> None:
     one.show(bands(document["simulated"], False))
     _show_registration(one, {"": result.calibrations["ESCAPE"]}, document)
     one.show(rich_table(strehl_table(result.loops)))
+    one.show(*result.notes)
     _show_end(one, document)
 
 

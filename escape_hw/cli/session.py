@@ -45,6 +45,7 @@ class Session:
         self.tables = Console(file=self._stdout, width=None if self._stdout.isatty() else _PIPE_WIDTH)
         self.interrupts = Interrupts(self.tell)
         self.folder: RunFolder | None = None
+        self._concerns: dict[str, Any] = {"system": None, "simulated": None, "seed": None}
         self.was_opened = self._deaf = False
         self.code = DONE
         self._document: Mapping[str, Any] | None = None
@@ -73,6 +74,27 @@ class Session:
         """The command's document, printed at its end with ``--json``; ``met`` false: exit code 1."""
         self._document = document
         self.code = self.code or (DONE if met else FAILED)
+
+    def configured(self, choice: Choice) -> SystemConfig:
+        """The configuration of the chosen system, whose name, mode and seed an error tells, too.
+
+        Raises
+        ------
+        ConfigError
+            It is wrong.
+        """
+        from escape_hw.config.bundled import bundled_systems
+        from escape_hw.config.load import load_system
+
+        # Even a configuration that is refused may concern a system that is known.
+        self.concerns(choice.system if choice.system in bundled_systems() else None, None, choice.seed)
+        config = load_system(choice.system, overrides=choice.set, seed=choice.seed, mode=choice.mode)
+        self.concerns(config.system.name, config.simulated, config.system.seed)
+        return config
+
+    def concerns(self, system: str | None, simulated: bool | None, seed: int | None) -> None:
+        """Remember what the command is about, as far as it is known, for the document of an error."""
+        self._concerns = {"system": system, "simulated": simulated, "seed": seed}
 
     def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure with progress; Ctrl-C aborts it.
@@ -118,6 +140,10 @@ class Session:
 
         with RunFolder(config.system.name, kind, out) as folder:
             self.folder = folder
+            if folder.asked is not None:
+                self.tell(
+                    f"{folder.asked} holds files already and is left alone; this run goes to {folder.path}"
+                )
             folder.write_config(config.to_toml())
             yield folder
 
@@ -143,10 +169,17 @@ class Session:
         self.tell(f"{'aborted' if code == ABORTED else 'error'}: {message}")
         for note in getattr(error, "__notes__", ()):
             self.tell(f"  {note}")
-        document = dict(self._document or {"schema": 1, "command": self.command})
+        document = dict(self._document or self._bare_document())
         document["error"] = {"type": kind, "message": message}
         self._document = document
         return code
+
+    def _bare_document(self) -> dict[str, Any]:
+        """What a document says when there is no result."""
+        from escape_hw.io.documents import head
+
+        known = head(self.command, **self._concerns)
+        return known if self.folder is None else {**known, **self.folder.place()}
 
     def _verdict(self, error: BaseException) -> tuple[int, str, str]:
         if isinstance(error, KeyboardInterrupt):

@@ -54,13 +54,11 @@ def check(
 ) -> None:
     """Check a configuration; tells every mistake at once with file, line, key and allowed range."""
     with session("config check", json=json) as one:
-        from escape_hw.config.load import load_system
         from escape_hw.io.documents import head
 
-        config = load_system(file, overrides=tuple(set or ()), seed=seed, mode=mode)
+        config = one.configured(options.Choice.of(file, set, seed, mode))
         one.show(f"{file}: sound ({config.system.name}, mode {config.system.mode})")
-        simulated = config.system.mode == "sim"
-        document = head("config check", config.system.name, simulated, config.system.seed)
+        document = head("config check", config.system.name, config.simulated, config.system.seed)
         one.result({**document, "file": file, "valid": True})
 
 

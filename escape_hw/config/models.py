@@ -7,7 +7,7 @@ from typing import Literal, Self, TypeVar, get_args
 
 from pydantic import Field, model_validator
 
-from escape_hw.config.device_models import DevicesConfig, Mode
+from escape_hw.config.device_models import DeviceConfig, DevicesConfig, Mode
 from escape_hw.config.section import Breach, Section, enforce
 from escape_hw.config.sensor_models import AnySensor, PyramidSection, SensorSection
 from escape_hw.config.toml_text import dump_toml
@@ -110,6 +110,12 @@ class SystemConfig(Section):
     )
     twin: TwinConfig = Field(default_factory=TwinConfig, description="the simulated bench")
 
+    @property
+    def simulated(self) -> bool:
+        """True when any device is to be a twin."""
+        present = [device for _, device in self.devices if isinstance(device, DeviceConfig)]
+        return any((d.mode or self.system.mode) == "sim" and d.sim_driver for d in present)
+
     def to_toml(self) -> str:
         """The whole effective configuration, defaults included, as ASCII TOML text.
 
@@ -141,7 +147,11 @@ class SystemConfig(Section):
             breaches.append(Breach("basis.n_modes", n_modes, f"the mirror has {n_act} actuators"))
         if self.loop.dropped_modes >= n_modes:
             breaches.append(
-                Breach("loop.dropped_modes", self.loop.dropped_modes, f"leaves none of the {n_modes} modes")
+                Breach(
+                    "loop.dropped_modes",
+                    self.loop.dropped_modes,
+                    f"leaves none of the {n_modes} modes; lower it",
+                )
             )
         enforce([*breaches, *self._sensor_rules()])
         return self

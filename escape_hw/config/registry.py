@@ -16,6 +16,8 @@ from escape_hw.errors import ConfigError
 DEVICES = "escape.devices"
 MODELS = "escape.models"
 _KINDS = {DEVICES: "device driver", MODELS: "synthetic model"}
+#: What the name of every twin begins with; other drivers drive real hardware.
+TWIN = "sim-"
 
 #: ``factory(name, config, shared) -> device``: the key in ``[devices]``, the whole configuration and
 #: one dictionary per opened system, through which the twins of one bench find each other.
@@ -55,15 +57,22 @@ def available(group: str) -> tuple[str, ...]:
     return tuple(sorted({*own, *(entry.name for entry in importlib.metadata.entry_points(group=group))}))
 
 
-def device_factory(name: str) -> DeviceFactory:
+def device_factory(name: str, *, hardware: bool = False) -> DeviceFactory:
     """The factory of a driver or twin.
+
+    Parameters
+    ----------
+    name
+        Of the driver or twin.
+    hardware
+        A driver of real hardware is wanted: no twin is offered instead of one that is missing.
 
     Raises
     ------
     ConfigError
         Unknown name (with the nearest one), or its package is not completely installed.
     """
-    return _OWN[name] if name in _OWN else cast(DeviceFactory, _load(DEVICES, name))
+    return _OWN[name] if name in _OWN else cast(DeviceFactory, _load(DEVICES, name, hardware))
 
 
 def model_factory(name: str) -> ModelFactory:
@@ -77,13 +86,13 @@ def model_factory(name: str) -> ModelFactory:
     return cast(ModelFactory, _load(MODELS, name))
 
 
-def _load(group: str, name: str) -> Any:
+def _load(group: str, name: str, hardware: bool = False) -> Any:
     kind = _KINDS[group]
     entries = {
         entry.value: entry for entry in importlib.metadata.entry_points(group=group) if entry.name == name
     }
     if not entries:
-        raise ConfigError(_unknown(group, name))
+        raise ConfigError(_no_driver(name) if hardware else _unknown(group, name))
     if len(entries) > 1:
         owners = " and ".join(f"{value} ({_package(entry)})" for value, entry in sorted(entries.items()))
         raise ConfigError(f"{kind} '{name}' is offered twice: {owners}; uninstall one of the packages")
@@ -109,6 +118,17 @@ def _unknown(group: str, name: str) -> str:
     return (
         f"no {_KINDS[group]} '{name}' is installed ({hint}installed: {listing}); "
         f"install the package that offers it as an entry point in '{group}'"
+    )
+
+
+def _no_driver(name: str) -> str:
+    real = tuple(driver for driver in available(DEVICES) if not driver.startswith(TWIN))
+    meant = nearest(name, real)
+    hint = f"did you mean '{meant}'? " if meant else ""
+    return (
+        f"no driver '{name}' for real hardware is installed ({hint}"
+        f"installed: {', '.join(real) if real else 'none, only twins'}); install the package that offers "
+        f"'{name}' as an entry point in '{DEVICES}', or use the twin (--mode sim)"
     )
 
 

@@ -41,6 +41,13 @@ class RunFolder:
         The folder itself; ``None`` makes a new dated one under :func:`default_base`. A folder that
         already holds a run is left alone and a sibling with a number is made.
 
+    Attributes
+    ----------
+    path
+        The folder.
+    asked
+        The folder that was asked for, when it could not be had because it holds files already.
+
     Raises
     ------
     StorageError
@@ -57,6 +64,7 @@ class RunFolder:
         else:
             wanted = Path(out).expanduser().absolute()
         self.path = _claim(wanted)
+        self.asked = wanted if out is not None and self.path != wanted else None
         self.products: dict[str, Path] = {}
         self._handler: logging.Handler | None = None
         check_writable(self.path, NEED_BYTES)
@@ -93,6 +101,10 @@ class RunFolder:
             logging.getLogger("escape_hw").setLevel(self._level)
             self._handler.close()
             self._handler = None
+
+    def place(self) -> dict[str, Any]:
+        """For documents: the folder used, and the one asked for when that is another."""
+        return {"folder": str(self.path), "folder_asked": None if self.asked is None else str(self.asked)}
 
     def file(self, name: str) -> Path:
         """Path of a file in this folder."""

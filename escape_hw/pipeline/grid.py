@@ -21,6 +21,8 @@ _CONTRAST = 0.3
 _NOISE_CONTRAST = 0.1
 #: Spots further off the lattice than this many median distances do not count.
 _OUTLIER = 5.0
+#: A pixel brighter than so many times its brightest neighbour is no part of a spot, but hot.
+_LONELY = 10.0
 
 
 def _comb_power(profile: NDArray[np.float64], pitch: float) -> complex:
@@ -135,7 +137,7 @@ def find_grid(
     """
     if references not in ("lattice", "mean"):
         raise ValueError(f"references is {references!r}; choose 'lattice' or 'mean'")
-    image = np.asarray(mean_frame, dtype=np.float64)
+    image = _without_hot_pixels(np.asarray(mean_frame, dtype=np.float64), n_sub)
     light = np.maximum(image - threshold, 0.0)
     if not light.any():
         raise CalibrationError(
@@ -153,6 +155,23 @@ def find_grid(
     if references == "mean":
         grid = replace(grid, references_px=_measure(grid, light).astype(np.float32))
     return grid
+
+
+def _without_hot_pixels(image: NDArray[np.float64], n_sub: int) -> NDArray[np.float64]:
+    """The image with bright pixels that stand alone lowered to their brightest neighbour.
+
+    Otherwise, one hot pixel holds as much light as a whole spot, and a dark sub-aperture around it
+    passes for a lit one.
+    """
+    around = np.ones((3, 3), dtype=bool)
+    around[1, 1] = False
+    brightest = ndimage.maximum_filter(image, footprint=around, mode="nearest")
+    # In the dark, noise stands out from noise; only what is as bright as a spot can pass for one.
+    lonely = (image > _LONELY * np.maximum(brightest, 0.0)) & (image > np.percentile(image, 99))
+    if lonely.sum() > n_sub**2 / 10:
+        # So many are the spots themselves, each on a pixel.
+        return image
+    return np.where(lonely, brightest, image)
 
 
 def _centre_lattice(

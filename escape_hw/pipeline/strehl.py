@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from escape_hw.api.results import Measured, StrehlEstimate
 from escape_hw.errors import CalibrationError
+from escape_hw.pipeline.standard_error import standard_error
 
 #: Radius of the encircled energy in pixels: about the first minimum of the bench's PSF (paper).
 RADIUS_PX = 3.0
@@ -55,18 +56,29 @@ def centred(image: NDArray[np.floating]) -> NDArray[np.float64]:
     total = clean.sum()
     if not total > 0:
         raise CalibrationError("the science camera sees no light above its background")
-    middle = np.array(clean.shape) // 2
-    shift = middle - np.array(centre_of(ndimage.gaussian_filter(clean, 1.0)))
-    moved = np.fft.ifft2(ndimage.fourier_shift(np.fft.fft2(clean), shift)).real
-    return np.asarray(moved / total)
+    return np.asarray(_moved(clean, _to_middle(clean)) / total)
+
+
+def _to_middle(clean: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shift (rows, columns) that takes an image's peak to the middle pixel."""
+    peak = centre_of(ndimage.gaussian_filter(clean, 1.0))
+    return np.asarray(np.array(clean.shape) // 2 - np.array(peak))
+
+
+def _moved(image: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.fft.ifft2(ndimage.fourier_shift(np.fft.fft2(image), shift)).real)
 
 
 def encircled(image: NDArray[np.float64], radius_px: float = RADIUS_PX) -> float:
     """Share of a centred image's light within ``radius_px`` of its middle."""
-    y, x = np.ogrid[: image.shape[0], : image.shape[1]]
-    r = np.hypot(y - image.shape[0] // 2, x - image.shape[1] // 2)
-    # The rim of the circle counts by the share of each pixel inside it, to first order.
-    return float((image * np.clip(radius_px + 0.5 - r, 0, 1)).sum())
+    return float((image * _circle(image.shape, radius_px)).sum())
+
+
+def _circle(shape: tuple[int, ...], radius_px: float) -> NDArray[np.float64]:
+    """One within a circle about the middle; its rim counts by the share of each pixel inside it."""
+    y, x = np.ogrid[: shape[0], : shape[1]]
+    # To first order.
+    return np.asarray(np.clip(radius_px + 0.5 - np.hypot(y - shape[0] // 2, x - shape[1] // 2), 0, 1))
 
 
 def ratios(
@@ -82,34 +94,43 @@ def ratios(
         Radius in cycles per pixel within which the transfer functions are summed; by default where
         the model's falls to 1 % of its peak.
     """
-    ours, reference = centred(image), centred(model)
-    otf, ideal = np.fft.fft2(np.fft.ifftshift(ours)).real, np.fft.fft2(np.fft.ifftshift(reference)).real
-    f = np.hypot(*np.meshgrid(np.fft.fftfreq(ours.shape[0]), np.fft.fftfreq(ours.shape[1]), indexing="ij"))
+    weights = _weights(centred(model), cutoff)
+    return np.asarray(weights @ centred(image).ravel())
+
+
+def _weights(model: NDArray[np.float64], cutoff: float | None = None) -> NDArray[np.float64]:
+    """Images ``(3, n_pixels)`` that a centred image of unit sum is multiplied by for the three ratios."""
+    ideal = np.fft.fft2(np.fft.ifftshift(model)).real
+    f = np.hypot(*np.meshgrid(*map(np.fft.fftfreq, model.shape), indexing="ij"))
     inside = f <= cutoff if cutoff else ideal > 0.01 * ideal.max()
-    middle = tuple(n // 2 for n in ours.shape)
-    return np.array(
-        [
-            ours[middle] / reference[middle],
-            otf[inside].sum() / ideal[inside].sum(),
-            encircled(ours) / encircled(reference),
-        ]
-    )
+    peak = np.zeros(model.shape)
+    middle = tuple(n // 2 for n in model.shape)
+    peak[middle] = 1 / model[middle]
+    # The sum of a transfer function over a set of frequencies is a sum over the image, too.
+    otf = np.fft.fftshift(np.fft.fft2(inside.astype(float)).real) / ideal[inside].sum()
+    circle = _circle(model.shape, RADIUS_PX) / encircled(model)
+    return np.stack([peak, otf, circle]).reshape(3, -1)
 
 
-def strehl(frames: NDArray[np.floating], model: NDArray[np.floating], batches: int = 8) -> StrehlEstimate:
+def strehl(frames: NDArray[np.floating], model: NDArray[np.floating]) -> StrehlEstimate:
     """Strehl ratios of a stack of frames, with standard errors.
 
-    The value is that of the mean of all frames; the error comes from the scatter of the means of
-    successive batches, long enough to be nearly independent.
+    The value is that of the mean of all frames. Each ratio is a weighted sum over that image divided
+    by its light, so every frame's share in it is known, and its error is that of the mean of those
+    shares (see :func:`~escape_hw.pipeline.standard_error.standard_error`). It holds for another
+    stretch of the same turbulence; the error of the model PSF is not in it.
 
     Parameters
     ----------
     frames
-        Science frames ``(n, rows, columns)``.
+        Science frames in their order ``(n, rows, columns)``.
     model
         Model PSF, taken without turbulence.
-    batches
-        How many batches; fewer when there are few frames.
+
+    Returns
+    -------
+    StrehlEstimate
+        Errors are NaN for fewer than :data:`~escape_hw.pipeline.standard_error.LEAST` frames.
 
     Raises
     ------
@@ -118,11 +139,15 @@ def strehl(frames: NDArray[np.floating], model: NDArray[np.floating], batches: i
     """
     if len(frames) == 0:
         raise CalibrationError("no science frames to take a Strehl ratio from; run the loop for longer")
-    values = ratios(frames.mean(axis=0), model)
-    n = min(batches, len(frames))
-    if n < 2:
-        errors = np.full(3, np.nan)
-    else:
-        parts = np.array([ratios(part.mean(axis=0), model) for part in np.array_split(frames, n)])
-        errors = parts.std(axis=0, ddof=1) / np.sqrt(n)
-    return StrehlEstimate(*(Measured(float(v), float(e)) for v, e in zip(values, errors, strict=True)))
+    mean = frames.mean(axis=0)
+    values = ratios(mean, model)
+    # The frames are not moved onto the middle; the weights are moved onto the image instead.
+    back = -_to_middle(without_background(mean))
+    weights = np.stack([_moved(w.reshape(mean.shape), back).ravel() for w in _weights(centred(model))])
+    weights = np.concatenate([weights, np.ones((1, mean.size))])
+    dark = float(mean.sum() - without_background(mean).sum()) / mean.size
+    sums = frames.reshape(len(frames), -1) @ weights.T.astype(np.float32) - dark * weights.sum(axis=1)
+    light = sums[:, 3:].mean()
+    shares = (sums[:, :3] - values * sums[:, 3:]) / light
+    errors = [standard_error(share) for share in shares.T]
+    return StrehlEstimate(*(Measured(float(v), e) for v, e in zip(values, errors, strict=True)))

@@ -181,7 +181,8 @@ def _matrices(run: RunContent) -> str:
 def _sky_time(run: RunContent) -> str:
     curves = run.document.get("sky_time")
     if not curves:
-        return ""
+        notes = run.document.get("notes") or []
+        return html.section("Sky time", html.notes(notes)) if notes else ""
     drawing = figures_registration.error_curves(curves)
     plants = f", rms over {curves['plants']} random plants" if "plants" in curves else ""
     caption = f"Error of the registration against the frames used{plants}, with the Cramér-Rao bound."
@@ -189,7 +190,8 @@ def _sky_time(run: RunContent) -> str:
     if fewest:
         met = ", ".join(f"{name} {count or 'none of these'}" for name, count in fewest.items())
         caption += f" Fewest frames that meet every goal: {met}."
-    return html.section("Sky time", html.figure("skytime", drawing, caption))
+    remarks = html.notes([curves["note"]] if "note" in curves else [])
+    return html.section("Sky time", html.figure("skytime", drawing, caption), remarks)
 
 
 def _bench(run: RunContent) -> str:

@@ -73,6 +73,6 @@ def finish(folder: RunFolder, document: Mapping[str, Any]) -> dict[str, Any]:
         write_report(folder.path)
     return {
         **document,
-        "folder": str(folder.path),
+        **folder.place(),
         "products": {k: str(v) for k, v in folder.products.items()},
     }

@@ -9,7 +9,7 @@ from typing import Any
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.bench import Bench
-from escape_hw.errors import Aborted
+from escape_hw.errors import Aborted, CalibrationError
 from escape_hw.runtime.procedures import calibrate_by, model_psf
 
 #: The paper's two runs: 20 seconds and 3 minutes at 500 Hz.
@@ -29,14 +29,15 @@ class ShwfsResult:
     """Push-pull, DO-CRIME and ESCAPE on one Shack-Hartmann bench, each with its loop.
 
     ``loops`` are the runs at each matrix's own best gain, ``scans`` the runs that found it, both by
-    label; ``sky_time`` holds error curves over a few random plants; ``partial`` is true when the
-    operator stopped it early.
+    label; ``sky_time`` holds error curves over a few random plants; ``notes`` say what went wrong on
+    the way; ``partial`` is true when the operator stopped it early.
     """
 
     calibrations: dict[str, CalibrationResult] = field(default_factory=dict)
     loops: dict[str, LoopResult] = field(default_factory=dict)
     scans: dict[str, list[LoopResult]] = field(default_factory=dict)
     sky_time: dict[str, Any] | None = None
+    notes: list[str] = field(default_factory=list)
     partial: bool = False
 
 
@@ -77,7 +78,11 @@ def reproduce_shwfs(
             # Imported here: most runs do without the campaign and its process pool.
             from escape_hw.runtime.sky_time import sky_time
 
-            result.sky_time = yield from sky_time(bench.config.system.name, plants=plants)
+            try:
+                result.sky_time = yield from sky_time(bench.config, plants=plants)
+            except CalibrationError as error:
+                # The rest of the result is whole without it.
+                result.notes.append(f"no curve of error against frames: {error}")
     except Aborted:
         result.partial = True
     return result

@@ -52,6 +52,7 @@ def keep_shwfs(
         "criteria": checks,
         "labels": labels,
         "partial": result.partial,
+        "notes": list(result.notes),
         **({"sky_time": result.sky_time} if result.sky_time else {}),
         **record.tail(wall_seconds),
     }

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
+import signal
 from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +20,11 @@ from escape_hw.calibration.bound import registration_bound
 from escape_hw.calibration.docrime import docrime_run
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
 from escape_hw.calibration.sprint import sprint
+from escape_hw.config.device_models import DeviceConfig
+from escape_hw.config.load import load_system, load_text
+from escape_hw.config.models import SystemConfig
 from escape_hw.errors import CalibrationError, TooFewFrames
-from escape_hw.runtime.system import open_system
+from escape_hw.runtime.system import System
 
 #: Half ranges of the random plants, in the units of the registration.
 RANGES = np.array([100.0, 100.0, 2.0, 4.0, 4.0])
@@ -54,17 +59,36 @@ def plant_overrides(plant: Registration) -> list[str]:
     return [f"twin.registration.{name}={value!r}" for name, value in plant.to_dict().items()]
 
 
+def twins_of(
+    system: str | SystemConfig, overrides: Sequence[str] = (), seed: int | None = None
+) -> SystemConfig:
+    """The configuration of a system with every device a twin, whatever its file says.
+
+    Parameters
+    ----------
+    system
+        Name or path of a system, or its configuration.
+    overrides, seed
+        As for :func:`~escape_hw.config.load.load_system`.
+    """
+    given = load_system(system) if isinstance(system, str) else system
+    alone = [name for name, device in given.devices if isinstance(device, DeviceConfig) and device.mode]
+    changes = [*(f"devices.{name}.mode=sim" for name in alone), *overrides]
+    return load_text(given.to_toml(), given.system.name, overrides=changes, seed=seed, mode="sim")
+
+
 def run_plant(
-    system: str, number: int, frames: Sequence[int] = FRAMES, overrides: Sequence[str] = ()
+    system: str | SystemConfig, number: int, frames: Sequence[int] = FRAMES, overrides: Sequence[str] = ()
 ) -> PlantErrors:
     """Record one run on one plant and estimate its registration from its first frames.
 
     The estimators get frames, indices and the commands sent; the plant is only compared at the end.
     """
     plant = random_plant(number)
+    config = twins_of(system, [*overrides, *plant_overrides(plant)], seed=number + 1)
     errors = np.full((len(ESTIMATORS), len(frames), 5), np.nan)
     sigmas, bound = errors.copy(), np.full(5, np.nan)
-    with open_system(system, set=[*overrides, *plant_overrides(plant)], seed=number + 1) as bench:
+    with System.from_config(config) as bench:
         c = bench.config.calibration
         run = bench.run(docrime_run(bench, frames=max(frames), record=True))
         if run.record is None:
@@ -88,12 +112,8 @@ def run_plant(
     return PlantErrors(errors, sigmas, bound)
 
 
-def _job(job: tuple[str, int, tuple[int, ...], tuple[str, ...]]) -> PlantErrors:
-    return run_plant(*job)
-
-
 def sky_time(
-    system: str,
+    system: str | SystemConfig,
     *,
     plants: int = 20,
     frames: Sequence[int] = FRAMES,
@@ -105,7 +125,7 @@ def sky_time(
     Parameters
     ----------
     system
-        Name or path of a system; its twins are used.
+        Name or path of a system, or its configuration; its twins are used.
     plants
         How many random plants.
     frames
@@ -118,20 +138,63 @@ def sky_time(
     Returns
     -------
     dict
-        See :func:`summary`.
+        See :func:`summary`. When a process died, it is about the plants that were finished by then,
+        and ``note`` says so.
+
+    Raises
+    ------
+    CalibrationError
+        A process died before any plant was finished.
     """
     report = Reporter("sky time", plants, "plant")
     done: list[PlantErrors] = []
-    jobs = [(system, number, tuple(frames), tuple(overrides)) for number in range(plants)]
-    # Fresh processes, ended at once when the campaign is: leaving the block terminates them.
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        results = pool.imap_unordered(_job, jobs)
-        while len(done) < plants:
-            with contextlib.suppress(multiprocessing.TimeoutError):
-                done.append(results.next(timeout=_PATIENCE_S))
-            if report.due():
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_ctrl_c_to_the_parent)
+    try:
+        left: set[Future[PlantErrors]] = {
+            pool.submit(run_plant, system, number, tuple(frames), tuple(overrides))
+            for number in range(plants)
+        }
+        while left:
+            ended, left = wait(left, timeout=_PATIENCE_S, return_when=FIRST_COMPLETED)
+            done += [future.result() for future in ended if not _broken(future)]
+            died = any(map(_broken, ended))
+            if died or report.due():
+                # Also when a process died: whoever pressed Ctrl-C meant to stop, and is heard here.
                 yield report(len(done))
-    return summary(done, frames)
+            if died:
+                # What ended at the same time has been taken already; the others never will.
+                break
+    finally:
+        _end(pool)
+    curves = summary(done, frames) if done else None
+    if len(done) == plants and curves is not None:
+        return curves
+    lost = (
+        f"a process of the campaign died (killed, or out of memory) after {len(done)} of {plants} plants; "
+        f"try fewer processes than {workers}"
+    )
+    if curves is None:
+        raise CalibrationError(lost)
+    return {**curves, "note": lost}
+
+
+def _broken(future: Future[PlantErrors]) -> bool:
+    """True when the process died; errors inside a plant are raised by its result."""
+    return isinstance(future.exception(), BrokenProcessPool)
+
+
+def _leave_ctrl_c_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """End the processes at once: nobody wants what they are at any more."""
+    # Python 3.14 has a method for it.
+    workers = list((getattr(pool, "_processes", None) or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    for worker in workers:
+        worker.terminate()
 
 
 def summary(plants: Sequence[PlantErrors], frames: Sequence[int]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from escape_hw.api.camera import Camera
 from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
-from escape_hw.api.screen import PhaseScreen, ScreenState
+from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.errors import FrameTimeout, SettingRejected
 from escape_hw.safety.limits import MirrorLimits
 
@@ -171,6 +171,11 @@ class SteadyScreen(PhaseScreen):
     def __init__(self, name: str = "screen") -> None:
         super().__init__(name)
         self._state = ScreenState(1, inserted=True, speed_m_s=0.0135)
+
+    @property
+    def info(self) -> ScreenInfo:
+        """Identity."""
+        return ScreenInfo("steady", "REF-SCREEN", simulated=True)
 
     @property
     def state(self) -> ScreenState:

@@ -7,10 +7,20 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from escape_hw.api.screen import ScreenState
+from escape_hw.api.screen import ScreenInfo, ScreenState
 from escape_hw.errors import SettingRejected
 from escape_hw.testing.checks import FULL, NORMAL, READS, Check, Factory, check, opened, refused, up_to
 from escape_hw.testing.common import COMMON
+
+
+@check(READS)
+def check_screen_info(factory: Factory) -> None:
+    """``info`` says what the changer is, and whether it is a twin."""
+    with opened(factory) as screen:
+        info = screen.info
+        assert isinstance(info, ScreenInfo), f"info is {type(info).__name__}, not ScreenInfo"
+        assert info.model.strip(), "info.model is empty; products could not say which changer it was"
+        assert type(info.simulated) is bool, f"info.simulated is {info.simulated!r}, neither true nor false"
 
 
 @check(READS)
@@ -83,6 +93,7 @@ def check_screen_reaches_every_screen(factory: Factory) -> None:
 
 SCREEN: tuple[Check, ...] = (
     *COMMON,
+    check_screen_info,
     check_screen_state_makes_sense,
     check_screen_refuses_meaningless,
     check_screen_set_keeps_the_rest,

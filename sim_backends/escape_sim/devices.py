@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from escape_hw.api.camera import Camera
 from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
 from escape_hw.api.mirror import DeformableMirror, DMInfo
-from escape_hw.api.screen import PhaseScreen, ScreenState
+from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.errors import ConfigError, FrameTimeout, SettingRejected
 from escape_sim.detector import Detector
 from escape_sim.influence import layout_positions
@@ -292,6 +292,12 @@ class SimPhaseScreen(PhaseScreen):
     def __init__(self, name: str, bench: SimBench) -> None:
         super().__init__(name)
         self._bench = bench
+
+    @property
+    def info(self) -> ScreenInfo:
+        """Identity."""
+        screen = self._bench.config.devices.screen
+        return ScreenInfo("simulated phase screens", screen.serial if screen else "", simulated=True)
 
     @property
     def state(self) -> ScreenState:

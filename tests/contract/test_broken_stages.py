@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from escape_hw.api.device import Device
+from escape_hw.api.screen import ScreenInfo
 from escape_hw.errors import SettingRejected
 from escape_hw.testing import modulator_checks, screen_checks
 from escape_hw.testing.common import COMMON
@@ -64,6 +65,7 @@ BROKEN: list[Broken] = [
         "modulator_is_parked_when_closed",
         {"_before_close": lambda self: None},
     ),
+    ("nobody's", SteadyScreen, "screen_info", {"info": ScreenInfo(" ", "1", True)}),
     ("counts from one", SteadyScreen, "screen_state_makes_sense", {"n_screens": property(lambda self: 1)}),
     ("takes anything", SteadyScreen, "screen_refuses_meaningless", {"set": repairs_screen}),
     ("forgets the rest", SteadyScreen, "screen_set_keeps_the_rest", {"set": forgets_the_rest}),

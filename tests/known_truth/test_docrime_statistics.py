@@ -38,11 +38,7 @@ def solve(slopes, pokes, order=ORDER, index=None):
 
 
 def split(s, truth):
-    """Common gain of an estimate, and its errors beside that gain in units of the stated ones.
-
-    The response is scaled to sum 1 and takes its error from few numbers, so it errs for all elements
-    alike; the stated errors are those of single elements.
-    """
+    """Common gain of an estimate, and its errors beside that gain in units of the stated ones."""
     gain = float(np.vdot(s.matrix, truth) / np.vdot(truth, truth))
     return gain, (s.matrix - gain * truth) / s.sigma
 
@@ -79,6 +75,22 @@ def test_normalised_errors_are_standard_normal():
     for axis in ((0, 1), (0, 2)):
         part = np.mean(z**2, axis=axis)
         assert np.abs(part - 1).max() < 5 * np.sqrt(2 * part.size / z.size)
+
+
+@pytest.mark.parametrize(("delay", "turbulence"), [(2.0, 0.1), (2.55, 0.1), (2.55, 0.3)])
+def test_the_stated_error_of_the_gain_is_its_scatter(delay, turbulence):
+    pulls = []
+    for seed in range(100, 124):
+        slopes, pokes, truth = run(seed, delay, turbulence=turbulence)
+        s = solve(slopes, pokes)
+        pulls.append((split(s, truth)[0] - 1) / s.gain_sigma)
+    # Chi-squared of 24 degrees of freedom scatters by 0.29 about one.
+    assert 0.3 < np.mean(np.square(pulls)) < 2.0
+
+
+def test_the_gain_is_known_better_from_more_frames():
+    few, many = (solve(*run(3, 2.55, frames=n)[:2]).gain_sigma for n in (FRAMES, 6000))
+    assert many == pytest.approx(few / 2, rel=0.3)
 
 
 @pytest.mark.parametrize("frames", [FRAMES, 4000])

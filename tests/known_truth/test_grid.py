@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import special
 from sensor_frames import N_PIX, WAVELENGTH, flat, pupil_amplitude, sensor
 
 from escape_hw.errors import CalibrationError
-from escape_hw.pipeline.grid import find_grid
+from escape_hw.pipeline.grid import _without_hot_pixels, find_grid
 from escape_sim.screen import RotatingScreen, von_karman_screen
 
 PITCH_TOLERANCE = 1e-3
@@ -167,3 +168,32 @@ def test_a_wrong_design_pitch_is_an_error(ratio):
 def test_an_unknown_choice_of_references_is_an_error():
     with pytest.raises(ValueError, match="references"):
         find(uniform(), references="middle")
+
+
+def test_a_dark_sub_aperture_with_a_hot_pixel_stays_dark():
+    optics, origin = sensor(24, 15.49, (-4.1, 2.6), (400, 400), 1.48)
+    frame = flat(optics, 250.0)
+    clean = find(frame)
+    # In the corner of the grid and just outside the pupil: nothing but a hot pixel in either.
+    dark = [(0, 0), (2, 4), (23, 12)]
+    assert not any(clean.valid[at] for at in dark)
+    for (row, column), level in zip(dark, (1023, 1023, 300), strict=True):
+        x, y = origin[0] + column * 15.49, origin[1] + row * 15.49
+        # One of them bright enough to hold more light than any spot.
+        assert level > 250
+        frame[round(y) + 3, round(x) - 2] += level
+    grid = find(frame)
+    assert (grid.valid == clean.valid).all()
+    assert grid.counts == pytest.approx(clean.counts, rel=0.01)
+
+
+@pytest.mark.parametrize("spot_px", [0.5, 1.0, 2.3])
+def test_sharp_spots_are_not_taken_for_hot_pixels(spot_px):
+    at, sigma = 20.3 + 15.49 * np.arange(24), spot_px / 2.355
+    edges = (np.arange(401)[:, None] - 0.5 - at) / sigma
+    comb = np.diff(special.ndtr(edges), axis=0).sum(axis=1)
+    frame = 700 * np.outer(comb, comb) / comb.max() ** 2
+    assert np.array_equal(_without_hot_pixels(frame, 24), frame)
+    grid = find(frame.astype(np.float32))
+    assert grid.valid.all()
+    assert_found(grid, 15.49, (20.3, 20.3))

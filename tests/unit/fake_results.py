@@ -16,7 +16,10 @@ from escape_hw.api.results import (
     TemporalResponse,
 )
 from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.io.provenance import Provenance
 
+#: Of the products that the tests save.
+ORIGIN = Provenance(basis="kl", seed=1)
 PLANTED = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
 SIGMA = np.array([0.4, 0.5, 0.012, 0.05, 0.06])
 

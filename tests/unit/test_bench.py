@@ -14,7 +14,7 @@ from escape_hw.api.camera import Camera
 from escape_hw.api.frames import CameraInfo, CameraSettings, Frame
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.procedure import Procedure, Progress
-from escape_hw.api.screen import PhaseScreen, ScreenState
+from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.bench import Bench, build_bench
 from escape_hw.config.load import load_system
 from escape_hw.config.models import SystemConfig
@@ -96,8 +96,12 @@ class FakeCamera(Camera):
 class FakeScreen(PhaseScreen):
     def __init__(self, name: str, config: SystemConfig, diary: Diary, simulated: bool) -> None:
         super().__init__(name)
-        self.diary = diary
+        self.diary, self.simulated = diary, simulated
         self._state = ScreenState(0, True, 1.0)
+
+    @property
+    def info(self) -> ScreenInfo:
+        return ScreenInfo("fake", "F3", self.simulated)
 
     @property
     def state(self) -> ScreenState:
@@ -131,7 +135,7 @@ def diary(monkeypatch: pytest.MonkeyPatch) -> Diary:
     """A registry that knows the fake devices only; every factory writes into this diary."""
     diary = Diary()
 
-    def device_factory(driver: str) -> Callable[..., object]:
+    def device_factory(driver: str, *, hardware: bool = False) -> Callable[..., object]:
         kind = KINDS.get(driver.removeprefix("sim-"))
         if kind is None:
             raise ConfigError(f"no device driver '{driver}' is installed")
@@ -248,10 +252,9 @@ def test_mode_chooses_driver_or_twin() -> None:
 
 
 @pytest.mark.usefixtures("diary")
-def test_a_driver_that_says_it_is_simulated_is_believed() -> None:
-    bench = build_bench(
-        load_system("razor-shwfs", mode="hardware", overrides=["devices.dm.driver=sim-alpao"])
-    )
+@pytest.mark.parametrize("driver", ["devices.dm.driver=sim-alpao", "devices.screen.driver=sim-screen"])
+def test_a_driver_that_says_it_is_simulated_is_believed(driver: str) -> None:
+    bench = build_bench(load_system("razor-shwfs", mode="hardware", overrides=[driver]))
     with bench:
         assert bench.simulated
 

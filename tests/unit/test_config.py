@@ -205,7 +205,7 @@ WRONG = {
         "dropped_modes = 14",
         "dropped_modes = 94",
         "dropped_modes",
-        "loop.dropped_modes: 94  leaves none of the 94 modes",
+        "loop.dropped_modes: 94  leaves none of the 94 modes; lower it",
     ),
     "basis file without kind": (
         'kind = "kl"',

@@ -113,3 +113,17 @@ def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPat
         registry.device_factory("bench-miror")
     with pytest.raises(ConfigError, match="'sim-alpao' is offered by an installed package"):
         registry.register_device("sim-alpao", factory)
+
+
+def test_a_twin_is_never_offered_instead_of_a_driver() -> None:
+    with pytest.raises(ConfigError) as refused:
+        registry.device_factory("alpao", hardware=True)
+    assert "no driver 'alpao' for real hardware is installed" in str(refused.value)
+    assert "sim-" not in str(refused.value)
+    assert "--mode sim" in str(refused.value)
+
+
+@pytest.mark.usefixtures("plug")
+def test_drivers_of_real_hardware_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"did you mean 'plug-mirror'\? installed: .*plug-mirror"):
+        registry.device_factory("plug-miror", hardware=True)

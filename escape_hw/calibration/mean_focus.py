@@ -1,0 +1,109 @@
+"""The turbulence's own share in the mean focus of a run, told from how it moves on."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.sensor import SubApertureGrid
+
+#: Length of a block in seconds: long for vibrations and pokes, short for the wind to cross the pupil.
+_BLOCK_S = 0.05
+#: Fewest rows of the regression, for its five unknowns.
+_LEAST_ROWS = 16
+#: Share of the variance of the focus that the wind must explain. One layer leaves 0.92 and more, two
+#: layers at right angles 0.8 and less, and there the plain mean is the better one (docs/decisions).
+_EXPLAINED = 0.9
+_FOCUS = 2
+
+
+class MeanFocus:
+    """Follows tilt, focus and astigmatism of the slopes and tells their mean focus without the wind's.
+
+    Turbulence that the wind carries past obeys ``d s / dt = -(v . grad) s``. With a weight w over the
+    pupil and its potential u (``grad u = -w r``, u = 0 at the rim), partial integration gives
+
+        d/dt sum(u s_x) = -v_x sum(w x s_x) - v_y sum(w y s_x),   and likewise for s_y.
+
+    So the rate at which the tilts change tells focus and astigmatism of the air alone: what stands
+    still in the instrument has no rate. And the instrument's square lattice has focus (its pitch), but
+    no astigmatism. Focus is therefore regressed on the rates of both tilts and on both astigmatisms,
+    and the intercept is the focus that stands still. Nothing about the wind need be known.
+
+    Parameters
+    ----------
+    grid
+        The sensor's grid.
+    frame_rate_hz
+        Of the sensor.
+    """
+
+    def __init__(self, grid: SubApertureGrid, frame_rate_hz: float) -> None:
+        self._grid = grid
+        self._weights = _weights(grid.valid).astype(np.float32)
+        self._size = max(1, round(_BLOCK_S * frame_rate_hz))
+        self._sum, self._count = np.zeros(grid.n_slopes, np.float32), 0
+        self._blocks: list[NDArray[np.float32]] = []
+
+    def add(self, slopes: NDArray[np.float32]) -> None:
+        """Take the slopes of the next frame ``(n_slopes,)``."""
+        self._sum += slopes
+        self._count += 1
+        if self._count == self._size:
+            self._blocks.append(self._weights @ (self._sum / np.float32(self._size)))
+            self._sum[:], self._count = 0, 0
+
+    def still(self) -> float | None:
+        """Focus that stands still, as slope per sub-aperture from the middle; ``None`` if unknown.
+
+        It is unknown when the run is too short, and when the wind does not explain how focus changes:
+        several layers, or no turbulence.
+        """
+        if len(self._blocks) - 2 < _LEAST_ROWS:
+            return None
+        blocks = np.array(self._blocks, dtype=np.float64)
+        # Smoothed alike, so that rates and values belong together.
+        value = (blocks[:-2] + 2 * blocks[1:-1] + blocks[2:]) / 4
+        rate = (blocks[2:, :_FOCUS] - blocks[:-2, :_FOCUS]) / 2
+        terms = np.column_stack([np.ones(len(value)), rate, value[:, _FOCUS + 1 :]])
+        focus = value[:, _FOCUS]
+        shares = np.linalg.lstsq(terms, focus, rcond=None)[0]
+        left = float(np.square(focus - terms @ shares).sum()) / (len(terms) - terms.shape[1])
+        if left > (1 - _EXPLAINED) * float(focus.var(ddof=1)):
+            return None
+        return float(shares[0])
+
+    def corrected(self, mean: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean slopes ``(n_slopes,)`` with the focus that stands still instead of the mean one.
+
+        Where that is unknown they stay as they are.
+        """
+        focus = self.still()
+        if focus is None:
+            return mean
+        rows, columns = np.nonzero(self._grid.valid)
+        weight = self._grid.flux[self._grid.valid].astype(float)
+        at = np.stack([columns, rows]) - np.array([[columns @ weight], [rows @ weight]]) / weight.sum()
+        lever = at.ravel()
+        both = np.concatenate([weight, weight])
+        stretch = float(both @ (lever * mean)) / float(both @ np.square(lever))
+        return np.asarray(mean + (focus - stretch) * lever)
+
+
+def _weights(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Weights ``(5, n_slopes)`` of both tilts, focus and both astigmatisms; w falls off to the rim."""
+    rows, columns = np.nonzero(valid)
+    x, y = columns - columns.mean(), rows - rows.mean()
+    r2 = x * x + y * y
+    # The rim lies half a sub-aperture beyond the outermost one's middle.
+    w = 1 - r2 / (np.sqrt(r2.max()) + 0.5) ** 2
+    u, none = np.square(w), np.zeros_like(w)
+    total = (w * r2).sum()
+    shapes = [
+        (u / u.sum(), none),
+        (none, u / u.sum()),
+        (w * x / total, w * y / total),
+        (w * x / total, -w * y / total),
+        (w * y / total, w * x / total),
+    ]
+    return np.array([np.concatenate(shape) for shape in shapes])

@@ -1,0 +1,48 @@
+"""Frames of a long run in memory that does not grow with it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Frames kept; more are averaged two by two.
+LIMIT = 4096
+
+
+class FrameStack:
+    """Keeps the frames of a run, or, once they are too many, the means of 2, 4, 8 ... neighbours.
+
+    Parameters
+    ----------
+    limit
+        Largest number of images kept, even.
+    """
+
+    def __init__(self, limit: int = LIMIT) -> None:
+        if limit < 2 or limit % 2:
+            raise ValueError(f"limit is {limit}; it must be even and at least 2")
+        self._limit, self._each = limit, 1
+        self._kept: list[NDArray[np.float32]] = []
+        self._sum: NDArray[np.float32] | None = None
+        self._summed = 0
+        #: Frames taken.
+        self.count = 0
+
+    def add(self, image: NDArray[np.integer]) -> None:
+        """Take one frame ``(rows, columns)``."""
+        self.count += 1
+        self._sum = image.astype(np.float32) if self._sum is None else self._sum + image
+        self._summed += 1
+        if self._summed < self._each:
+            return
+        self._kept.append(self._sum / np.float32(self._each))
+        self._sum, self._summed = None, 0
+        if len(self._kept) == self._limit:
+            self._kept = [
+                (a + b) / np.float32(2) for a, b in zip(self._kept[::2], self._kept[1::2], strict=True)
+            ]
+            self._each *= 2
+
+    def images(self) -> NDArray[np.float32]:
+        """What is kept ``(n, rows, columns)``, each the mean of equally many frames in their order."""
+        return np.stack(self._kept) if self._kept else np.zeros((0, 0, 0), np.float32)

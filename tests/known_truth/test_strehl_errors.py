@@ -1,0 +1,52 @@
+"""Stated errors of Strehl ratios against their scatter over stretches of a closed loop on the twin."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import escape_hw
+from escape_hw.calibration import closed_loop
+from escape_hw.pipeline.strehl import strehl
+
+#: 12 x 12 lenslets and 37 actuators: ten times as fast as the bundled bench, as correlated in time.
+SMALL = (
+    "sensor.n_sub=12",
+    "sensor.beam_radius_m=inf",
+    "devices.wfs.region=[220,156,200,200]",
+    'devices.dm.layout="circle-7"',
+    "devices.dm.pitches_across_pupil=5.0",
+    "devices.dm.pitch_m=2.7e-3",
+    "devices.screen.screen=2",
+    "basis.n_modes=30",
+    "loop.dropped_modes=4",
+    "twin.wfs.photons_per_frame=2.5e6",
+)
+#: Science frames of a loop of 1,000 frames.
+LENGTH = 85
+
+
+@pytest.mark.slow
+def test_errors_of_short_loops_are_their_scatter(monkeypatch):
+    scatter, stated = [], []
+    for seed in (1, 2, 3, 4):
+        taken = []
+
+        def keep(frames, model, taken=taken):
+            taken[:] = [frames, model]
+            return strehl(frames, model)
+
+        monkeypatch.setattr(closed_loop, "strehl", keep)
+        with escape_hw.open_system("razor-shwfs", set=SMALL, seed=seed) as bench:
+            found = bench.calibrate("push-pull")
+            psf = bench.take_model_psf()
+            bench.close_loop(found.matrix, found.grid, gain=0.5, frames=10 * 1000, model_psf=psf)
+        frames, model = taken
+        parts = [strehl(frames[k : k + LENGTH], model) for k in range(0, len(frames) - LENGTH + 1, LENGTH)]
+        scatter.append(np.var([part.peak.value for part in parts], ddof=1))
+        stated.append(np.mean([part.peak.sigma**2 for part in parts]))
+    # 4 x 10 degrees of freedom know the scatter to 11 %; two and a half of that, and what a series of this
+    # length cannot tell about itself.
+    assert 0.72 < math.sqrt(np.mean(stated) / np.mean(scatter)) < 1.5

@@ -1,0 +1,72 @@
+"""A campaign whose processes die."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from escape_hw.api.procedure import run
+from escape_hw.config.load import load_system
+from escape_hw.errors import CalibrationError
+from escape_hw.runtime import sky_time as campaign
+from escape_hw.runtime.sky_time import PlantErrors, sky_time, twins_of
+
+FRAMES = (300,)
+
+
+def plant(system: str, number: int, frames: Any, overrides: Any) -> PlantErrors:
+    """A plant that is done at once, or, told so, takes its process with it."""
+    if number >= int(system):
+        # The finished ones are on their way to the parent by then.
+        while len(list(Path(overrides[0]).iterdir())) < int(system):
+            pass
+        os.kill(os.getpid(), signal.SIGKILL)
+    (Path(overrides[0]) / str(number)).touch()
+    return PlantErrors(np.full((2, 1, 5), 0.001), np.full((2, 1, 5), 0.001), np.full(5, 0.001))
+
+
+def fails(*_: Any) -> PlantErrors:
+    raise CalibrationError("no spots on the wavefront sensor")
+
+
+@pytest.fixture(autouse=True)
+def _stand_in(monkeypatch):
+    monkeypatch.setattr(campaign, "run_plant", plant)
+
+
+def test_a_killed_process_ends_the_campaign_and_finished_plants_are_kept(tmp_path):
+    curves = run(sky_time("3", plants=8, frames=FRAMES, overrides=[str(tmp_path)]))
+    assert 1 <= curves["plants"] <= 3
+    assert f"died (killed, or out of memory) after {curves['plants']} of 8 plants" in curves["note"]
+    assert curves["fewest_frames"]["whitened"] == 300
+
+
+def test_a_campaign_without_a_finished_plant_is_an_error(tmp_path):
+    with pytest.raises(CalibrationError, match="after 0 of 4 plants; try fewer processes than 2"):
+        run(sky_time("0", plants=4, frames=FRAMES, overrides=[str(tmp_path)]))
+
+
+def test_a_campaign_without_accidents_has_no_note(tmp_path):
+    curves = run(sky_time("5", plants=5, frames=FRAMES, overrides=[str(tmp_path)]))
+    assert curves["plants"] == 5
+    assert "note" not in curves
+
+
+def test_an_error_in_a_plant_is_told(monkeypatch, tmp_path):
+    monkeypatch.setattr(campaign, "run_plant", fails)
+    with pytest.raises(CalibrationError, match="no spots"):
+        run(sky_time("1", plants=2, frames=FRAMES, overrides=[str(tmp_path)]))
+
+
+def test_only_twins_are_used_whatever_the_file_says():
+    config = load_system("razor-shwfs", mode="hardware", overrides=["devices.dm.mode=hardware"])
+    twins = twins_of(config, ["loop.gain=0.3"], seed=5)
+    assert twins.system.mode == "sim"
+    assert twins.devices.dm.mode == "sim"
+    assert (twins.loop.gain, twins.system.seed) == (0.3, 5)
+    assert twins_of("razor-shwfs").devices.dm.mode is None

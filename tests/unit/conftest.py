@@ -1,0 +1,57 @@
+"""What the tests of the command line share: fake devices, and ways to call it."""
+
+from __future__ import annotations
+
+import json
+
+import fake_bench
+import fake_results as fake
+import pytest
+
+from escape_hw.cli import main
+from escape_hw.io.fits import save_matrix
+from escape_hw.report.build import write_report
+
+
+@pytest.fixture
+def bench(monkeypatch, tmp_path):
+    """Fake devices and procedures, and no time spent on figures."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr("escape_hw.runtime.keep.write_report", lambda folder: folder)
+    return fake_bench.install(monkeypatch)
+
+
+@pytest.fixture
+def reports(bench, monkeypatch):
+    """The real report after all."""
+    monkeypatch.setattr("escape_hw.runtime.keep.write_report", write_report)
+
+
+@pytest.fixture
+def escape(capsys):
+    """Run the command; returns exit code, standard output and standard error."""
+
+    def call(*words: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main([str(word) for word in words])
+        out, err = capsys.readouterr()
+        return ended.value.code or 0, out, err
+
+    return call
+
+
+@pytest.fixture
+def document(escape):
+    """Run with ``--json``: exit code, the only document, standard error."""
+
+    def call(*words: object) -> tuple[int, dict, str]:
+        code, out, err = escape(*words, "--json")
+        return code, json.loads(out, parse_constant=pytest.fail), err
+
+    return call
+
+
+@pytest.fixture
+def im(tmp_path):
+    return save_matrix(tmp_path / "im.fits", fake.calibration("escape"), fake.ORIGIN)

@@ -1,0 +1,87 @@
+"""Ctrl-C in the middle of a command keeps what was measured and leaves the mirror flat."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import fake_bench
+import pytest
+
+from escape_hw.io.fits import load_matrix
+from escape_hw.io.psf import load_loop
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("method", ["push-pull", "docrime", "escape"])
+def test_ctrl_c_in_a_calibration_saves_what_there_is(document, bench, tmp_path, method, number):
+    bench.hook = lambda name: os.kill(os.getpid(), number)
+    before = signal.getsignal(number)
+    code, found, err = document("calibrate", "razor-shwfs", "--method", method, "--out", tmp_path / "run")
+    assert code == 130
+    assert found["error"]["type"] == "Aborted"
+    assert found["partial"] is True
+    path = Path(found["products"]["im"])
+    assert path.name == "im.partial.fits"
+    assert load_matrix(path).result.partial
+    assert "stopping" in err
+    assert bench.benches[0].closed
+    assert bench.benches[0].screen.state.inserted
+    assert signal.getsignal(number) is before
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["partial"] is True
+
+
+def test_ctrl_c_in_the_loop(document, bench, im, tmp_path):
+    bench.hook = lambda name: name == "closed_loop" and os.kill(os.getpid(), signal.SIGINT)
+    code, found, _ = document("loop", "razor-shwfs", "--im", im, "--out", tmp_path / "run")
+    assert code == 130
+    assert load_loop(found["products"]["loop"]).result.partial
+    assert bench.benches[0].closed
+
+
+def test_ctrl_c_before_anything_was_measured(document, bench, im, tmp_path):
+    bench.hook = lambda name: name == "model_psf" and os.kill(os.getpid(), signal.SIGINT)
+    code, found, _ = document("loop", "razor-shwfs", "--im", im, "--out", tmp_path / "run")
+    assert (code, found["error"]["type"]) == (130, "Aborted")
+    assert bench.benches[0].closed
+
+
+def test_second_ctrl_c_breaks_into_a_hanging_procedure(document, bench, tmp_path):
+    def hang(name: str) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    bench.hook = hang
+    code, found, _ = document("calibrate", "razor-shwfs", "--out", tmp_path / "run")
+    assert (code, found["error"]["type"]) == (130, "Aborted")
+    assert bench.benches[0].closed
+
+
+def test_ctrl_c_while_closing_does_not_keep_the_mirror_from_its_flat(document, bench, tmp_path, monkeypatch):
+    def close(self: object, *_: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        self.closed = True
+
+    monkeypatch.setattr(fake_bench.FakeBench, "__exit__", close)
+    code, _, err = document("calibrate", "razor-shwfs", "--out", tmp_path / "run")
+    assert code == 0
+    assert "being flattened" in err
+    assert bench.benches[0].closed
+
+
+@pytest.mark.parametrize("place", ["push-pull", "escape", "model_psf", "closed_loop"])
+def test_ctrl_c_in_a_reproduction_keeps_what_is_done(document, bench, tmp_path, place):
+    bench.hook = lambda name: name == place and os.kill(os.getpid(), signal.SIGINT)
+    code, found, _ = document("reproduce", "shwfs", "--out", tmp_path / "run", "--plants", 0)
+    assert code == 130
+    assert found["partial"] is True
+    assert found["criteria"] == []
+    done = {"push-pull": 0, "escape": 1, "model_psf": 3, "closed_loop": 3}[place]
+    paths = [
+        Path(path) for name, path in found["products"].items() if name in ("push_pull", "docrime", "escape")
+    ]
+    assert sum(not path.name.endswith(".partial.fits") for path in paths) == done
+    assert bench.benches[0].closed
+    assert bench.benches[0].screen.state.inserted

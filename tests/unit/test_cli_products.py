@@ -1,0 +1,45 @@
+"""Commands that read what others wrote."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import fake_results as fake
+import pytest
+
+from escape_hw.io.fits import save_matrix
+from escape_hw.io.psf import save_loop
+
+
+def test_show_and_compare(escape, document, im, tmp_path):
+    assert "SHA-256" in escape("show", im)[1]
+    code, found, _ = document("show", im)
+    assert (code, found["header"]["KIND"], found["metrics"]["poke"]) == (0, "IM", 0.02)
+    psf = save_loop(tmp_path / "psf.fits", fake.loop(), "razor-shwfs", True, fake.ORIGIN)
+    assert document("show", psf)[1]["strehl"]["peak"]["value"] == 0.62
+    other = save_matrix(tmp_path / "b.fits", fake.calibration("push-pull"), fake.ORIGIN)
+    code, found, _ = document("compare", im, other)
+    assert code == 0
+    assert len(found["correlation"]) == 94
+    assert found["correlation"][50] > 0.99
+    assert found["registration_difference"] is None
+    assert "relative rms difference" in escape("compare", im, im)[1]
+
+
+@pytest.mark.usefixtures("reports")
+def test_report_is_built_again_after_the_folder_has_moved(escape, document, tmp_path):
+    run = Path(
+        document("calibrate", "razor-shwfs", "--method", "docrime", "--out", tmp_path / "run")[1]["folder"]
+    )
+    before = (run / "report.html").read_text()
+    moved = run.rename(tmp_path / "moved")
+    (moved / "report.html").unlink()
+    code, found, _ = document("report", moved)
+    assert (code, found["report"]) == (0, str(moved / "report.html"))
+    # The run's log, shown in the report, has grown since; the figures are the same to the byte.
+    assert (moved / "report.html").read_text().split("<h2>Origin")[0] == before.split("<h2>Origin")[0]
+    assert document("show", moved)[1]["command"] == "calibrate"
+    # A calibration alone has no image to draw.
+    code, _, err = escape("report", moved, "--picture", tmp_path / "picture.png")
+    assert code == 2
+    assert "holds no matrix or no closed-loop image" in err

@@ -1,0 +1,77 @@
+"""What the command line refuses before anything is opened, and how it says so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import fake_results as fake
+import pytest
+
+from escape_hw.io.fits import save_matrix
+from escape_hw.io.provenance import Provenance
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("calibrate", "razor-shwf"),
+        ("calibrate", "razor-shwfs", "--method", "magic"),
+        ("calibrate", "razor-shwfs", "--set", "loop.gian=1"),
+        ("calibrate", "razor-shwfs", "--set", "loop.gain=99"),
+        ("calibrate", "razor-shwfs", "--poke", "nan"),
+        ("calibrate", "razor-shwfs", "--method", "docrime", "--accuracy", 1),
+        ("calibrate", "razor-shwfs", "--frames", 0),
+        ("calibrate", "razor-shwfs", "--frames", "many"),
+        ("calibrate", "razor-shwfs", "--no-such-option"),
+        ("calibrate",),
+        ("loop", "razor-shwfs"),
+        ("loop", "razor-shwfs", "--im", "absent.fits"),
+        ("show", "absent.fits"),
+        ("report", "absent"),
+        ("perf", "no-such-stage"),
+        ("nonsense",),
+    ],
+)
+def test_bad_usage_exits_2_with_one_line_and_nothing_opened(escape, document, bench, words):
+    code, out, err = escape(*words)
+    assert (code, out) == (2, "")
+    assert err.strip()
+    assert "Traceback" not in err
+    code, found, _ = document(*words)
+    assert code == 2
+    assert found["error"]["message"]
+    assert not bench.benches
+
+
+def test_matrix_of_another_system_basis_or_mode_is_refused(escape, bench, tmp_path):
+    def refused(name: str, matrix: object, origin: Provenance = fake.ORIGIN, *more: str) -> str:
+        result = fake.calibration("escape")
+        path = save_matrix(tmp_path / f"{name}.fits", replace(result, matrix=matrix, measured=None), origin)
+        code, _, err = escape("loop", "razor-shwfs", "--im", path, *more)
+        assert code == 2, err
+        assert not bench.benches
+        return err
+
+    good = fake.matrix("escape")
+    assert "'maps-vis'" in refused("system", replace(good, system="maps-vis"))
+    assert "modes" in refused("modes", fake.matrix("escape", n_modes=50))
+    assert "basis" in refused("basis", good, Provenance(basis="zonal"))
+    assert "actuators" in refused("dm", replace(good, m2c=good.m2c[:50]))
+    hardware = ("--mode", "hardware", "--set", 'devices.screen.driver="manual"')
+    assert "simulation" in refused("sim", good, fake.ORIGIN, *hardware)
+
+
+def test_damaged_matrix_is_refused(document, bench, im):
+    content = bytearray(im.read_bytes())
+    content[len(content) // 2] ^= 4
+    im.write_bytes(content)
+    code, found, err = document("loop", "razor-shwfs", "--im", im)
+    assert (code, found["error"]["type"]) == (2, "ProductError")
+    assert "im.fits: damaged" in err
+
+
+def test_unwritable_folder_exits_2_before_anything_opens(document, bench, tmp_path):
+    (tmp_path / "file").write_text("")
+    code, found, _ = document("calibrate", "razor-shwfs", "--out", tmp_path / "file" / "run")
+    assert (code, found["error"]["type"]) == (2, "StorageError")
+    assert not bench.benches
