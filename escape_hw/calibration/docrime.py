@@ -24,9 +24,6 @@ from escape_hw.calibration.sensor_setup import (
 )
 from escape_hw.errors import Aborted, TooFewFrames
 
-#: Seconds of turbulence over which the mean tilt and focus in the references average out well enough.
-_REFERENCE_S = 10.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DocrimeRun:
@@ -60,7 +57,7 @@ def docrime_run(
     poke = c.poke if poke is None else poke
     m2c = modal_basis(bench)
     amplitude = poke_amplitudes(bench, m2c, poke)
-    needed = _least_frames(m2c.shape[1], c.whiten_order if whiten else 0, c.lags)
+    needed = least_frames(bench, m2c.shape[1], whiten)
     if n_frames < needed:
         raise TooFewFrames(
             f"{n_frames} frames cannot constrain {m2c.shape[1]} modes; ask for at least {needed} frames, "
@@ -99,13 +96,8 @@ def _result(
     notes = []
     if float(np.median(matrix.snr())) < 1:
         notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
+    notes += session.notes()
     seconds = (solution.frames + solution.lost_frames) / session.bench.wfs.settings.frame_rate_hz
-    if session.focus is not None and seconds < _REFERENCE_S and session.focus.still() is None:
-        notes.append(
-            f"the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio "
-            "and which the wind does not explain; the matrix is not touched by it: close the loop on "
-            "references taken over a longer time"
-        )
     return CalibrationResult(
         matrix,
         session.finished_grid(),
@@ -167,6 +159,7 @@ def docrime(
     return run.result
 
 
-def _least_frames(n_modes: int, order: int, lags: int) -> int:
-    """Fewest frames worth starting with: twice the unknowns per slope."""
-    return 2 * (n_modes + order + lags)
+def least_frames(bench: Bench, n_modes: int, whiten: bool = True) -> int:
+    """Fewest frames that a matrix is worth starting with: twice the unknowns per slope."""
+    c = bench.config.calibration
+    return 2 * (n_modes + (c.whiten_order if whiten else 0) + c.lags)

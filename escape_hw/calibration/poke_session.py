@@ -18,6 +18,9 @@ from escape_hw.calibration.mean_focus import MeanFocus
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, setup_from_frames
 from escape_hw.errors import Aborted
 
+#: Seconds of turbulence over which the mean tilt and focus in the references average out well enough.
+_REFERENCE_S = 10.0
+
 Record = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -130,6 +133,17 @@ class PokeSession:
             raise RuntimeError("the sensor was never set up")
         grid = self.motion.of(self.grid)
         return grid if self.mean_frame is None else self.motion.references(grid, self.focus)
+
+    def notes(self) -> tuple[str, ...]:
+        """What to know of the references before closing a loop on them."""
+        seconds = self.taken / self.bench.wfs.settings.frame_rate_hz
+        if self.focus is None or seconds >= _REFERENCE_S or self.focus.still() is not None:
+            return ()
+        return (
+            f"the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio "
+            "and which the wind does not explain; the matrix is not touched by it: close the loop on "
+            "references taken over a longer time",
+        )
 
     def _feed(self, frame: Frame, poke: NDArray[np.float64]) -> None:
         if self.slopes_of is None or self.motion is None or self.light is None:

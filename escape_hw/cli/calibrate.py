@@ -34,6 +34,10 @@ def calibrate(
     plain: Annotated[
         bool, typer.Option("--plain", help="The paper's estimator, turbulence not whitened (docrime).")
     ] = False,
+    estimator: Annotated[
+        str | None,
+        typer.Option("--estimator", help="What ESCAPE fits: auto, matrix or telemetry (few frames)."),
+    ] = None,
     out: options.Out = None,
     set: options.Set = None,
     seed: options.Seed = None,
@@ -47,7 +51,7 @@ def calibrate(
         if modes is not None:
             choice = _with_modes(one, choice, modes)
         config = one.configured(choice)
-        start = _procedure(method, frames, poke, accuracy, plain)
+        start = _procedure(method, frames, poke, accuracy, plain, estimator)
         with one.run_folder(config, f"calibrate-{method}", out) as folder:
             with one.bench(choice) as bench:
                 from escape_hw.runtime.records import BenchRecord
@@ -76,9 +80,15 @@ def _with_modes(one: Session, choice: options.Choice, modes: int) -> options.Cho
 
 
 def _procedure(
-    method: str, frames: int | None, poke: float | None, accuracy: float | None, plain: bool
+    method: str,
+    frames: int | None,
+    poke: float | None,
+    accuracy: float | None,
+    plain: bool,
+    estimator: str | None,
 ) -> Callable[[Bench], Procedure[CalibrationResult]]:
     """The chosen procedure; refuses what does not go together before anything is opened."""
+    from escape_hw.config.models import ESTIMATORS
     from escape_hw.errors import ConfigError
     from escape_hw.runtime.procedures import METHODS, calibrate_by
 
@@ -90,8 +100,13 @@ def _procedure(
         raise ConfigError("--accuracy: it goes with --method escape and must be positive")
     if plain and method != "docrime":
         raise ConfigError("--plain: it goes with --method docrime")
-
-    return lambda bench: calibrate_by(bench, method, frames=frames, poke=poke, whiten=not plain)
+    if estimator is not None and (method != "escape" or estimator not in ESTIMATORS):
+        raise ConfigError(
+            f"--estimator {estimator}: it goes with --method escape and is one of {', '.join(ESTIMATORS)}"
+        )
+    return lambda bench: calibrate_by(
+        bench, method, frames=frames, poke=poke, whiten=not plain, estimator=estimator
+    )
 
 
 def _finish(

@@ -17,6 +17,11 @@ from escape_hw.errors import ConfigError
 S = TypeVar("S", bound=SensorSection)
 
 
+Estimator = Literal["auto", "matrix", "telemetry"]
+#: What SPRINT can fit within ESCAPE.
+ESTIMATORS: tuple[str, ...] = get_args(Estimator)
+
+
 class SystemSection(Section):
     """What the system is."""
 
@@ -89,6 +94,10 @@ class CalibrationSection(Section):
         6, ge=0, le=64, description="past frames that predict the turbulence; 0: plain estimator"
     )
     lags: int = Field(5, ge=1, le=64, description="frames over which the temporal response is estimated")
+    estimator: Estimator = Field(
+        "auto",
+        description="what SPRINT fits: the 'matrix' or the whitened 'telemetry'; 'auto': the telemetry",
+    )
     sprint_modes: int = Field(50, ge=1, le=10000, description="SPRINT: largest number of modes used")
     learning_rate: float = Field(1.0, gt=0, le=1, description="SPRINT: share of each step that is taken")
     model: str = Field(

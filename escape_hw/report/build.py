@@ -76,7 +76,7 @@ def _facts(run: RunContent) -> dict[str, str]:
     # A matrix and what was computed from it share their frames: one number for both.
     shared: dict[str, list[str]] = {}
     for label, result in run.calibrations.items():
-        text = f"{result.frames:,} ({result.sky_seconds:.1f} s)".replace(",", "\u2009")
+        text = f"{result.frames:,} ({result.sky_seconds:.3g} s)".replace(",", "\u2009")
         shared.setdefault(text, []).append(label)
     for text, labels in shared.items():
         found[f"{' and '.join(labels)}: frames"] = text

@@ -24,6 +24,7 @@ def calibrate_by(
     poke: float | None = None,
     grid: SensorGeometry | None = None,
     whiten: bool = True,
+    estimator: str | None = None,
 ) -> Procedure[CalibrationResult]:
     """A calibration by the name of its method.
 
@@ -44,6 +45,8 @@ def calibrate_by(
         The sensor's grid, when it is known already.
     whiten
         False: the paper's plain estimator of ``docrime`` and ``escape``.
+    estimator
+        What ``escape`` fits: ``"matrix"``, ``"telemetry"`` or ``"auto"``; as configured by default.
 
     Raises
     ------
@@ -66,7 +69,9 @@ def calibrate_by(
     if method == "escape":
         from escape_hw.calibration.escape import escape
 
-        return (yield from escape(bench, frames=frames, poke=poke, grid=grid, whiten=whiten))
+        return (
+            yield from escape(bench, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator)
+        )
     raise ConfigError(f"calibration method '{method}' is unknown; it is one of {', '.join(METHODS)}")
 
 

@@ -108,6 +108,7 @@ class System(Bench):
         poke: float | None = None,
         grid: SensorGeometry | None = None,
         whiten: bool = True,
+        estimator: str | None = None,
         progress: bool = False,
     ) -> CalibrationResult:
         """Measure an interaction matrix and, with ``"escape"``, the registration behind it.
@@ -125,6 +126,9 @@ class System(Bench):
             The sensor's grid, when it is known already; found on the frames by default.
         whiten
             False: the paper's plain estimator of ``"docrime"`` and ``"escape"``.
+        estimator
+            What ``"escape"`` fits: ``"matrix"``, ``"telemetry"`` (fewer frames than modes are enough)
+            or ``"auto"``; as configured by default.
         progress
             Show a bar with the time left.
 
@@ -144,7 +148,9 @@ class System(Bench):
         """
         from escape_hw.runtime.procedures import calibrate_by
 
-        procedure = calibrate_by(self, method, frames=frames, poke=poke, grid=grid, whiten=whiten)
+        procedure = calibrate_by(
+            self, method, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator
+        )
         return self.run(procedure, progress=progress)
 
     def find_registration(self, matrix: InteractionMatrix, grid: SensorGeometry) -> RegistrationEstimate:
