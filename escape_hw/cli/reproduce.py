@@ -79,7 +79,7 @@ def sky_time(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Error of the registration against frames, plain, whitened and from telemetry, with the Cramer-Rao bound."""
+    """Error of the registration against frames, by estimator, with the Cramer-Rao bound."""
     with session("reproduce sky-time", json=json, quiet=quiet) as one:
         from escape_hw.io import documents
         from escape_hw.runtime import sky_time as campaign
