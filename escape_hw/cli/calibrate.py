@@ -21,8 +21,13 @@ if TYPE_CHECKING:
 
 def calibrate(
     system: options.System,
-    method: Annotated[str, typer.Option("--method", help="push-pull, docrime or escape.")] = "escape",
-    frames: Annotated[int | None, typer.Option("--frames", min=1, help="Frames to measure with.")] = None,
+    method: Annotated[
+        str, typer.Option("--method", help="push-pull, modulated, docrime or escape.")
+    ] = "escape",
+    frames: Annotated[
+        int | None,
+        typer.Option("--frames", min=1, help="Frames (push-pull: per push and pull; modulated: per batch)."),
+    ] = None,
     poke: Annotated[
         float | None, typer.Option("--poke", help="Poke, rms surface as a fraction of full stroke.")
     ] = None,

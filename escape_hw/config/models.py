@@ -90,6 +90,9 @@ class CalibrationSection(Section):
     push_pull_frames: int = Field(
         20, ge=1, le=1_000_000, description="push-pull: frames per push and per pull"
     )
+    modulated_frames: int = Field(
+        500, ge=50, le=1_000_000, description="modulation: frames per batch of modes driven at once"
+    )
     whiten_order: int = Field(
         6, ge=0, le=64, description="past frames that predict the turbulence; 0: plain estimator"
     )

@@ -22,6 +22,7 @@ from escape_hw.io.run_folder import read_result
 #: How methods are called in figures and tables.
 METHOD_LABELS = {
     "push-pull": "push-pull",
+    "modulated": "modulation",
     "docrime": "DO-CRIME",
     "docrime-whitened": "DO-CRIME",
     "escape": "ESCAPE",

@@ -13,7 +13,7 @@ from escape_hw.errors import ConfigError
 from escape_hw.runtime.records import without_turbulence
 
 #: The calibration methods, by the names that the command line knows as well.
-METHODS = ("push-pull", "docrime", "escape")
+METHODS = ("push-pull", "modulated", "docrime", "escape")
 
 
 def calibrate_by(
@@ -29,7 +29,7 @@ def calibrate_by(
     """A calibration by the name of its method.
 
     Push-pull needs a source: the phase screen, where the bench moves one, is out of the beam
-    meanwhile. The other two take the light as it is.
+    meanwhile. The others take the light as it is.
 
     Parameters
     ----------
@@ -62,6 +62,10 @@ def calibrate_by(
 
         with without_turbulence(bench):
             return (yield from push_pull(bench, frames=frames, poke=poke, grid=grid))
+    if method == "modulated":
+        from escape_hw.calibration.modulated import modulated
+
+        return (yield from modulated(bench, frames=frames, poke=poke, grid=grid))
     if method == "docrime":
         from escape_hw.calibration.docrime import docrime
 

@@ -117,9 +117,11 @@ class System(Bench):
         ----------
         method
             ``"push-pull"`` (needs a source: the phase screen, where the bench moves one, is out of
-            the beam meanwhile), ``"docrime"`` or ``"escape"`` (both under turbulence).
+            the beam meanwhile), ``"modulated"`` (with or without one), ``"docrime"`` or ``"escape"``
+            (both under turbulence).
         frames
-            Frames to measure with (push-pull: per push and per pull); as configured by default.
+            Frames to measure with (push-pull: per push and per pull; modulated: per batch of modes);
+            as configured by default.
         poke
             Rms surface as fraction of full stroke; as configured by default.
         grid
