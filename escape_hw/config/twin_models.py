@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from escape_hw.api.registration import Registration
 from escape_hw.config.section import Breach, Listed, Section, enforce
+from escape_hw.config.twin_sky import TwinAtmosphere, TwinContamination, TwinStar
 
 
 class TwinRegistration(Section):
@@ -136,3 +137,8 @@ class TwinConfig(Section):
     )
     vibration: TwinVibration = Field(default_factory=TwinVibration, description="tip-tilt vibration")
     ncpa: TwinNcpa = Field(default_factory=TwinNcpa, description="non-common-path aberration")
+    atmosphere: TwinAtmosphere | None = Field(None, description="open air above a telescope; absent: none")
+    star: TwinStar | None = Field(None, description="star and sky; absent: light as in twin.wfs")
+    contamination: TwinContamination = Field(
+        default_factory=TwinContamination, description="dust and uneven light on the pupil"
+    )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.errors import ConfigError
+from escape_sim.atmosphere import Atmosphere
 from escape_sim.detector import Detector
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.influence import InfluenceFunctions, MirrorSurface
@@ -39,8 +40,8 @@ class SimBench:
 
     def __init__(self, config: SystemConfig) -> None:
         self.config = config
-        streams = np.random.SeedSequence(config.system.seed).spawn(6)
-        plates, hidden, latency, frames, wfs_noise, science_noise = streams
+        streams = np.random.SeedSequence(config.system.seed).spawn(7)
+        plates, hidden, latency, frames, wfs_noise, science_noise, sky = streams
         self.latency_rng, self.frame_rng = np.random.default_rng(latency), np.random.default_rng(frames)
         truth = np.random.default_rng(hidden)
         self.pupil = pupil_geometry(config)
@@ -67,6 +68,7 @@ class SimBench:
         self._science_rng = np.random.default_rng(science_noise)
         self._exposures: _Exposures | None = None
         self.plates = PhasePlates(config, self.pupil, plates)
+        self.air = twin.atmosphere and Atmosphere(twin.atmosphere, self.pupil.pixel_m, self.pupil.lit, sky)
         self.beam_blocked = False
 
     # ------------------------------------------------------------------ clock
@@ -98,6 +100,8 @@ class SimBench:
         opd = self._surface(self.dynamics.mean(start_s, end_s))
         opd *= self._metres
         self.plates.add(middle, opd)
+        if self.air is not None:
+            self.air.add(middle, opd)
         tip, tilt = self._vibration(middle)
         if tip or tilt:
             x = self.pupil.coordinates_m.astype(np.float32)
