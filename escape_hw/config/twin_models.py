@@ -64,6 +64,9 @@ class TwinCamera(Section):
     read_noise_e: float = Field(0.0, ge=0, le=1000, description="read noise of a pixel, e- rms")
     full_well_e: float = Field(10000.0, ge=100, le=1e7, description="signal of a pixel at full scale, e-")
     dark_e: float = Field(0.0, ge=0, le=1e5, description="dark signal of a pixel in one exposure, e-")
+    excess_noise: float = Field(
+        1.0, ge=1, le=1.4143, description="excess noise factor of a multiplying detector; 1: none"
+    )
     background: float = Field(
         0.0, ge=0, le=1e5, description="constant level under the image (offset), e- per pixel and frame"
     )

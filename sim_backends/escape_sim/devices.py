@@ -201,9 +201,9 @@ class SimWavefrontSensorCamera(_SimCamera):
                 break
         image, opd = bench.wfs_image(start, end)
         bench.observe(opd, end)
-        electrons = twin.wfs.photons_per_frame * s.exposure_s / bench.config.devices.wfs.exposure_s
-        electrons *= 0.0 if bench.beam_blocked else 10 ** (s.gain_db / 20)
-        data, saturated = bench.wfs_detector.expose(image, electrons)
+        gain = 10 ** (s.gain_db / 20)
+        source, sky = bench.wfs_light(s.exposure_s)
+        data, saturated = bench.wfs_detector.expose(image, source * gain, sky * gain)
         r, n = s.region, self._nominal
         data = data[r.y - n.y : r.y - n.y + r.height, r.x - n.x : r.x - n.x + r.width]
         data.flags.writeable = False

@@ -63,12 +63,14 @@ class SimBench:
         self.wfs_detector = Detector(
             (config.devices.wfs.region[3], config.devices.wfs.region[2]), config.devices.wfs.bit_depth,
             twin.wfs.full_well_e, twin.wfs.read_noise_e, twin.wfs.dark_e, twin.wfs.background,
-            twin.wfs.fixed_pattern, np.random.default_rng(wfs_noise),
+            twin.wfs.fixed_pattern, np.random.default_rng(wfs_noise), twin.wfs.excess_noise,
         )  # fmt: skip
         self._science_rng = np.random.default_rng(science_noise)
         self._exposures: _Exposures | None = None
         self.plates = PhasePlates(config, self.pupil, plates)
-        self.air = twin.atmosphere and Atmosphere(twin.atmosphere, self.pupil.pixel_m, self.pupil.lit, sky)
+        self.air: Atmosphere | None = None
+        if twin.atmosphere is not None:
+            self.air = Atmosphere(twin.atmosphere, self.pupil.pixel_m, self.pupil.lit, sky)
         self.beam_blocked = False
 
     # ------------------------------------------------------------------ clock
@@ -120,6 +122,16 @@ class SimBench:
             sensor.frame(opd + self._ncpa, image)
         return (image / np.float32(steps) if steps > 1 else image), opd
 
+    def wfs_light(self, exposure_s: float) -> tuple[float, float]:
+        """Electrons of an exposure: from the source over the whole sensor, from the sky on each pixel."""
+        twin, camera = self.config.twin, self.config.devices.wfs
+        if self.beam_blocked:
+            return 0.0, 0.0
+        if twin.star is None:
+            return twin.wfs.photons_per_frame * exposure_s / camera.exposure_s, 0.0
+        pixels = camera.region[2] * camera.region[3]
+        return twin.star.electrons(exposure_s), twin.star.sky_electrons(exposure_s) / pixels
+
     def sensor(self) -> SensorOptics:
         """The sensor's optics, built when first used."""
         if self._sensor is None:
@@ -146,7 +158,7 @@ class SimBench:
             raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
         return Detector(
             shape, science.bit_depth, twin.full_well_e, twin.read_noise_e, twin.dark_e,
-            twin.background, twin.fixed_pattern, self._science_rng,
+            twin.background, twin.fixed_pattern, self._science_rng, twin.excess_noise,
         )  # fmt: skip
 
     # ------------------------------------------------------------------ science camera

@@ -24,7 +24,7 @@ def spline_weights(shift: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def spline_gain(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+def spline_gain(frequency: NDArray[np.floating]) -> NDArray[np.float64]:
     """Gain that a component of the coefficients needs for its readings to have its power.
 
     At the pixels a spline through given values reproduces them; between the pixels it loses power,

@@ -137,5 +137,5 @@ class TurbulenceSource:
         power[0, 0] = 0.0
         # Where a column is its own mirror image, the transform keeps half of what it is given.
         power[:, [0, -1]] *= 2
-        gain = spline_gain(fy * self.pixel_m)[:, None] * spline_gain(fx * self.pixel_m)
-        return (np.sqrt(power / 2) * gain).astype(np.float32)
+        gain_x, gain_y = spline_gain(fx * self.pixel_m), spline_gain(fy * self.pixel_m)
+        return np.asarray(np.sqrt(power / 2) * np.outer(gain_y, gain_x), dtype=np.float32)
