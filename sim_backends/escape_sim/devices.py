@@ -13,7 +13,6 @@ from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.screen import PhaseScreen, ScreenState
 from escape_hw.errors import ConfigError, FrameTimeout, SettingRejected
 from escape_sim.detector import Detector
-from escape_sim.influence import layout_positions
 from escape_sim.psf import FocalPlane
 from escape_sim.sim_bench import SimBench
 
@@ -59,10 +58,9 @@ class SimMirror(DeformableMirror):
         super().__init__(name, bench.config.devices.dm.limits.to_limits())
         self._bench = bench
         dm = bench.config.devices.dm
-        layout = dm.actuator_map()
         self._info = DMInfo(
-            "simulated ALPAO DM97-15", dm.serial, int(layout.sum()), layout,
-            layout_positions(layout, dm.pitch_m), dm.stroke_m, True,
+            "simulated ALPAO DM97-15", dm.serial, dm.n_act, dm.actuator_map(), dm.positions() * dm.pitch_m,
+            dm.stroke_m, True,
         )  # fmt: skip
 
     @property

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_sim.influence import layout_positions
+from escape_sim.telescope_pupil import passed_share, soiled_share
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
@@ -53,7 +53,7 @@ class PupilGeometry:
 
 
 def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeometry:
-    """The pupil that the configuration describes: round, lit by a Gaussian beam.
+    """The pupil that the configuration describes: round, lit by a Gaussian beam, partly obscured.
 
     Parameters
     ----------
@@ -69,12 +69,22 @@ def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeome
     x = (np.arange(n) - (n - 1) / 2) * d / n_pix
     r2 = x[:, None] ** 2 + x[None, :] ** 2
     amplitude = np.where(r2 <= (diameter / 2) ** 2, np.exp(-r2 / config.sensor.beam_radius_m**2), 0.0)
+    if config.telescope.obscuration or config.telescope.spiders_deg:
+        # A sample that is covered in part keeps its share of the light, not of the amplitude.
+        amplitude *= np.sqrt(passed_share(config.telescope, diameter, x))
     return PupilGeometry(n_sub, n_pix, d, x, amplitude.astype(np.float32))
+
+
+def soiled_pupil(config: SystemConfig, rng: np.random.Generator) -> PupilGeometry:
+    """The pupil of the twin, with whatever ``twin.contamination`` puts on it."""
+    pupil, dirt = pupil_geometry(config), config.twin.contamination
+    share = soiled_share(dirt, config.system.pupil_m, pupil.coordinates_m, rng)
+    return replace(pupil, amplitude=(pupil.amplitude * np.sqrt(share)).astype(np.float32))
 
 
 def actuator_positions(config: SystemConfig) -> NDArray[np.float64]:
     """Actuator positions ``(n_act, 2)`` as (x, y) in metres on the pupil."""
-    return layout_positions(config.devices.dm.actuator_map(), pitch_on_pupil(config))
+    return config.devices.dm.positions() * pitch_on_pupil(config)
 
 
 def pitch_on_pupil(config: SystemConfig) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from escape_hw.errors import ConfigError
 from escape_sim.atmosphere import Atmosphere
 from escape_sim.detector import Detector
-from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry, soiled_pupil
 from escape_sim.influence import InfluenceFunctions, MirrorSurface
 from escape_sim.mirror_dynamics import MirrorDynamics
 from escape_sim.phase_plates import PhasePlates
@@ -40,11 +40,14 @@ class SimBench:
 
     def __init__(self, config: SystemConfig) -> None:
         self.config = config
-        streams = np.random.SeedSequence(config.system.seed).spawn(7)
-        plates, hidden, latency, frames, wfs_noise, science_noise, sky = streams
+        streams = np.random.SeedSequence(config.system.seed).spawn(8)
+        plates, hidden, latency, frames, wfs_noise, science_noise, sky, dirt = streams
         self.latency_rng, self.frame_rng = np.random.default_rng(latency), np.random.default_rng(frames)
         truth = np.random.default_rng(hidden)
-        self.pupil = pupil_geometry(config)
+        self.pupil = soiled_pupil(config, np.random.default_rng(dirt))
+        clean = np.square(pupil_geometry(config).amplitude, dtype=float).sum()
+        #: Share of the light that the soiled pupil lets through.
+        self._passed = float(np.square(self.pupil.amplitude, dtype=float).sum() / clean)
         self._clock_ns = 0
         self._wall_start = time.monotonic()
         dm, twin = config.devices.dm, config.twin
@@ -128,9 +131,9 @@ class SimBench:
         if self.beam_blocked:
             return 0.0, 0.0
         if twin.star is None:
-            return twin.wfs.photons_per_frame * exposure_s / camera.exposure_s, 0.0
-        pixels = camera.region[2] * camera.region[3]
-        return twin.star.electrons(exposure_s), twin.star.sky_electrons(exposure_s) / pixels
+            return self._passed * twin.wfs.photons_per_frame * exposure_s / camera.exposure_s, 0.0
+        sky = twin.star.sky_electrons(exposure_s) / (camera.region[2] * camera.region[3])
+        return self._passed * twin.star.electrons(exposure_s), self._passed * sky
 
     def sensor(self) -> SensorOptics:
         """The sensor's optics, built when first used."""
