@@ -34,7 +34,7 @@ def sections_of(annotation: Any) -> dict[str, type[BaseModel]]:
     """
     found: dict[str, type[BaseModel]] = {}
     for option in typing.get_args(annotation) if _is_union(annotation) else (annotation,):
-        marks: tuple[Any, ...] = ()
+        marks: list[Any] = []
         if typing.get_origin(option) is typing.Annotated:
             option, *marks = typing.get_args(option)
         if isinstance(option, type) and issubclass(option, BaseModel):

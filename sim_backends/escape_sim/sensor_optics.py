@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from escape_sim.shack_hartmann import ShackHartmannOptics
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
+    from escape_sim.modulation import Modulation
     from escape_sim.pyramid import PyramidOptics
 
 
@@ -25,6 +26,13 @@ class SensorOptics(Protocol):
     ) -> NDArray[np.float32]:
         """Add the intensity to ``image`` and return it."""
         ...
+
+
+@runtime_checkable
+class ModulatedOptics(SensorOptics, Protocol):
+    """Optics of a pyramid: the beam's points on it may be changed at any time."""
+
+    modulation: Modulation
 
 
 def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOptics:
@@ -47,7 +55,7 @@ def make_pyramid(
     """A pyramid with its images where they really fall, not modulated yet."""
     if config.system.optics != "fast":
         raise ConfigError(f"system.optics = '{config.system.optics}' has no pyramid; use 'fast'")
-    from escape_sim.modulation import modulation_points
+    from escape_sim.modulation import Modulation
     from escape_sim.pyramid import PyramidOptics
 
     twin = config.twin.pyramid
@@ -58,7 +66,7 @@ def make_pyramid(
         config.system.wavelength_m,
         np.add(sensor.pupils_px, twin.centre_offsets_px),
         (height, width),
-        modulation_points(0.0),
+        Modulation.circle(0.0),
         rooftop=twin.rooftop,
     )
 
