@@ -216,9 +216,9 @@ def _bench(run: RunContent) -> str:
     if loop is not None and loop.last_frame is not None:
         drawing = figures_bench.sensor(loop.last_frame, None, "one frame")
         parts.append(html.figure("frame", drawing, f"The last sensor frame of the {label} loop."))
-    drawing = None if loop is None else _mirror(run, loop.last_command)
-    if drawing is not None:
-        parts.append(html.figure("mirror", drawing, f"The last mirror command of the {label} loop."))
+    shape = None if loop is None else _mirror(run, loop.last_command)
+    if shape is not None:
+        parts.append(html.figure("mirror", shape, f"The last mirror command of the {label} loop."))
     response = next((r.response for r in run.calibrations.values() if r.response is not None), None)
     if response is not None:
         caption = "Temporal response of mirror and sensor, from the pokes themselves, with standard errors."

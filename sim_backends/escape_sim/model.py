@@ -110,13 +110,14 @@ class ShackHartmannModel:
         x = self._pupil.coordinates_m
         along_x, along_y = self._influence(width).factors(registration, self.sub_aperture_m, x, x)
         p, n = self._pupil.n_pix, self._pupil.n_sub
-        gx, gy = along_x[:, :, 0].reshape(n, p, -1), along_y[:, :, 0].reshape(n, p, -1)
         out = np.zeros((2, self._rows.size, self.n_act))
-        for (down, right), block in self._weights.items():
-            here = gx[np.clip(self._columns + right, 0, n - 1)]
-            there = gy[np.clip(self._rows + down, 0, n - 1)]
-            for axis in range(2):
-                out[axis] += np.einsum("kqa,kqa->ka", there, block[axis] @ here)
+        for term in range(along_x.shape[2]):
+            gx, gy = along_x[:, :, term].reshape(n, p, -1), along_y[:, :, term].reshape(n, p, -1)
+            for (down, right), block in self._weights.items():
+                here = gx[np.clip(self._columns + right, 0, n - 1)]
+                there = gy[np.clip(self._rows + down, 0, n - 1)]
+                for axis in range(2):
+                    out[axis] += np.einsum("kqa,kqa->ka", there, block[axis] @ here)
         return np.asarray(out.reshape(-1, self.n_act) * self._metres)
 
     def variants(self) -> list[ShackHartmannModel]:

@@ -89,6 +89,7 @@ def mis_registration(registration: Registration, sub_aperture_m: float) -> Any:
     out.rotationAngle = registration.rotation
     out.radialScaling = registration.radial_scaling / 100
     out.tangentialScaling = registration.tangential_scaling / 100
+    out.anamorphosisAngle = registration.anamorphosis_angle
     return out
 
 

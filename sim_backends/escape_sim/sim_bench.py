@@ -15,8 +15,10 @@ from escape_sim.atmosphere import Atmosphere
 from escape_sim.beam_circle import BeamCircle
 from escape_sim.detector import Detector
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry, soiled_pupil
-from escape_sim.influence import InfluenceFunctions, MirrorSurface
+from escape_sim.influence import InfluenceFunctions
+from escape_sim.measured_influence import MeasuredInfluence, read_influence
 from escape_sim.mirror_dynamics import MirrorDynamics
+from escape_sim.mirror_surface import InfluenceShapes, mirror_surface
 from escape_sim.phase_plates import PhasePlates
 from escape_sim.psf import FocalPlane
 from escape_sim.sensor_optics import ModulatedOptics, SensorOptics, make_sensor_optics
@@ -55,7 +57,7 @@ class SimBench:
         self.influence = self._true_influence(truth)
         self.registration = twin.registration.to_registration()
         x = self.pupil.coordinates_m
-        self._surface = MirrorSurface(self.influence, self.registration, self.pupil.sub_aperture_m, x, x)
+        self._surface = mirror_surface(self.influence, self.registration, self.pupil.sub_aperture_m, x, x)
         self.dynamics = MirrorDynamics(
             self.influence.n_act, twin.mirror.settling_s, twin.mirror.creep_fraction, twin.mirror.creep_time_s
         )
@@ -206,10 +208,13 @@ class SimBench:
         return exposures.take(number)
 
     # ------------------------------------------------------------------ construction
-    def _true_influence(self, truth: np.random.Generator) -> InfluenceFunctions:
+    def _true_influence(self, truth: np.random.Generator) -> InfluenceShapes:
         mirror = self.config.twin.mirror
         positions = actuator_positions(self.config)
         n = len(positions)
+        if mirror.influence_file and mirror.influence_pixel_m is not None:
+            gain = 1 + mirror.gain_scatter * truth.standard_normal(n)
+            return MeasuredInfluence(read_influence(mirror.influence_file, n), mirror.influence_pixel_m, gain)
         return InfluenceFunctions(
             positions,
             pitch_on_pupil(self.config),
