@@ -162,6 +162,8 @@ class DeformableMirror(Device):
     def flatten(self) -> None:
         """Ramp to the flat shape in steps of at most :data:`RAMP_STEP`; legal whenever open.
 
+        A mirror that lies at rest has no shape, and is left alone.
+
         Raises
         ------
         NotOpen, DeviceError
@@ -169,6 +171,8 @@ class DeformableMirror(Device):
         """
         with self._lock:
             guard = self._checked()
+            if not self._movable():
+                return
             target = self.flat
             step = min(self.RAMP_STEP, self.limits.max_slew or self.RAMP_STEP)
             distance = float(np.abs(target - guard.last).max(initial=0.0))
@@ -215,6 +219,10 @@ class DeformableMirror(Device):
         ``None`` means unknown: it is taken for zeros, and ``flatten`` always sends.
         """
         return None
+
+    def _movable(self) -> bool:
+        """False while the mirror lies at rest and follows no commands."""
+        return True
 
     @abc.abstractmethod
     def _send(self, command: NDArray[np.float64]) -> None:
