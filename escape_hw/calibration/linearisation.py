@@ -43,6 +43,13 @@ class State:
         )
 
 
+def _near(rows: NDArray[np.intp], columns: NDArray[np.intp], reach: float) -> NDArray[np.float64]:
+    """How near slopes are ``(n_slopes, n_slopes)``: 1 in one place, falling to 0 at ``reach`` lenslets."""
+    down, right = (np.abs(at[:, None] - at[None, :]) / reach for at in (rows, columns))
+    weight = np.maximum(1 - down, 0.0) * np.maximum(1 - right, 0.0)
+    return np.tile(weight, (2, 2))
+
+
 class Problem:
     """One matrix, one model, and the weights between them."""
 
@@ -69,7 +76,7 @@ class Problem:
         # x slopes share what their column does to them, y slopes what their row does.
         self.lines = np.unique(np.concatenate([cols, matrix.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
-        self.patches = np.tile(np.unique(rows // 2 * 1000 + cols // 2, return_inverse=True)[1], 2)
+        self.near = _near(rows, cols, max(matrix.valid.shape) / 2)
         self.precision = np.concatenate(
             [
                 np.zeros(6),
