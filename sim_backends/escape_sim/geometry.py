@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,8 +16,9 @@ if TYPE_CHECKING:
 
 #: Pupil samples across one lenslet: alias-free to +-4 lambda/d, several times the largest tilt.
 PUPIL_SAMPLES = 8
-#: Pupil samples across one sub-aperture, by kind of sensor; a pyramid's is a pixel of the pupil image.
-_SAMPLES = {"shack-hartmann": PUPIL_SAMPLES, "pyramid": 1}
+#: Pupil samples across one actuator pitch that a pyramid needs at least: a Gaussian influence function
+#: keeps less than a ten-thousandth of its amplitude beyond their highest frequency.
+SAMPLES_PER_PITCH = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +64,7 @@ def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeome
     n_pix
         Samples across a sub-aperture; as usual for the kind of sensor by default.
     """
-    n_pix = n_pix or _SAMPLES[config.sensor.kind]
+    n_pix = n_pix or usual_samples(config)
     n_sub, diameter = config.sensor.n_sub, config.system.pupil_m
     d = diameter / n_sub
     n = n_sub * n_pix
@@ -73,6 +75,17 @@ def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeome
         # A sample that is covered in part keeps its share of the light, not of the amplitude.
         amplitude *= np.sqrt(passed_share(config.telescope, diameter, x))
     return PupilGeometry(n_sub, n_pix, d, x, amplitude.astype(np.float32))
+
+
+def usual_samples(config: SystemConfig) -> int:
+    """Pupil samples across a sub-aperture: as many as the mirror or the lenslets ask for.
+
+    A pyramid's sub-aperture is a pixel of the pupil image, which may be wider than an actuator pitch.
+    """
+    if config.sensor.kind != "pyramid":
+        return PUPIL_SAMPLES
+    least = SAMPLES_PER_PITCH * config.devices.dm.pitches_across_pupil / config.sensor.n_sub
+    return max(1, math.ceil(least))
 
 
 def soiled_pupil(config: SystemConfig, rng: np.random.Generator) -> PupilGeometry:

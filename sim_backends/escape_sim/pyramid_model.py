@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 def nominal_pupils(config: SystemConfig) -> PyramidPupils:
     """The design's pupil images, valid where the design beam is bright enough."""
     sensor, pupil = config.sensor_as(PyramidSection), pupil_geometry(config)
-    flux = np.square(pupil.amplitude, dtype=float)
+    n, p = pupil.n_sub, pupil.n_pix
+    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).mean(axis=(1, 3))
     flux /= np.percentile(flux[flux > 0], 95)
     valid = flux >= sensor.min_flux
     centres = np.array(sensor.pupils_px)
@@ -46,7 +47,7 @@ class PyramidModel:
         self._optics = PyramidOptics(
             self._pupil.amplitude, float(n), config.system.wavelength_m,
             np.asarray(pupils.corners_px + (n - 1) / 2, float), config.devices.wfs.region[:1:-1],
-            Modulation.circle(pupils.modulation),
+            Modulation.circle(pupils.modulation), samples=self._pupil.n_pix,
         )  # fmt: skip
 
     @property

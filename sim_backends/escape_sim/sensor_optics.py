@@ -62,12 +62,13 @@ def make_pyramid(
     width, height = config.devices.wfs.region[2:]
     return PyramidOptics(
         amplitude,
-        float(pupil.n_sub * pupil.n_pix),
+        float(pupil.n_sub),
         config.system.wavelength_m,
         np.add(sensor.pupils_px, twin.centre_offsets_px),
         (height, width),
         Modulation.circle(0.0),
         rooftop=twin.rooftop,
+        samples=pupil.n_pix,
     )
 
 
