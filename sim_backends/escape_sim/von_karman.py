@@ -15,8 +15,8 @@ from escape_sim.spline import spline_gain
 _POINTS = 16
 #: Frequency cells on either side of zero whose power is summed instead of taken at their centres.
 _NEAR = 4
-#: Most thirds that the cell at zero frequency is divided into: waves of 3^8 screens.
-_MOST_LEVELS = 8
+#: Most times that the cell at zero frequency is divided into thirds: waves of 3^20 screens.
+_MOST_LEVELS = 20
 
 
 def power_spectrum(f2: NDArray[np.float64], r0_m: float, outer_scale_m: float) -> NDArray[np.float64]:
