@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_sim.fourier_filter import good_length, is_good
 from escape_sim.modulation import Modulation
 from escape_sim.prism import Prism
 from escape_sim.pyramid_fourier import FourierKernel
@@ -216,19 +217,6 @@ class Window:
         image[self._region] += part
 
 
-def good_length(shortest: int, samples: int = 1) -> int:
-    """The next number of pixels whose samples FFTW transforms at its best without trial runs."""
-    length = shortest
-    while not _is_good(length * samples):
-        length += 1
-    return length
-
-
-def _is_good(samples: int) -> bool:
-    """Whether the length is a power of two, at least 4, times 1, 3, 5, 9 or 25."""
-    return samples % 4 == 0 and samples // (samples & -samples) in (1, 3, 5, 9, 25)
-
-
 def _products_are_faster(n: int, n_grid: int) -> bool:
     """Whether matrix products beat transforms, by the operations of both and their measured rates.
 
@@ -236,6 +224,6 @@ def _products_are_faster(n: int, n_grid: int) -> bool:
     does not suit them, and need 0.8 ns for each sample of the grid in between.
     """
     products = 4 * (n * n * n_grid + n * n_grid**2) / 85e9 + 20e-6
-    rate = 40e9 if _is_good(n_grid) else 17e9
+    rate = 40e9 if is_good(n_grid) else 17e9
     transforms = (n + 3 * n_grid) * 5 * n_grid * np.log2(n_grid) / rate + 0.8e-9 * n_grid**2
     return bool(products < transforms)
