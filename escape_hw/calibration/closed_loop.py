@@ -13,14 +13,13 @@ from escape_hw.api.frames import Frame
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import LoopResult, StrehlEstimate
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, next_frame, some_frames
-from escape_hw.calibration.sensor_setup import extractor
+from escape_hw.calibration.sensor_setup import extractor, prepare_sensor
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, IncompatibleProduct
 from escape_hw.pipeline.integrator import LeakyIntegrator, gain_limit
 from escape_hw.pipeline.reconstructor import reconstructor
-from escape_hw.pipeline.slopes import SlopeExtractor
 from escape_hw.pipeline.strehl import has_light, strehl, without_background
 
 #: Seconds after closing during which the science frames do not count.
@@ -84,7 +83,7 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
 def closed_loop(
     bench: Bench,
     matrix: InteractionMatrix,
-    grid: SubApertureGrid,
+    grid: SensorGeometry,
     *,
     gain: float | None = None,
     leak: float | None = None,
@@ -137,9 +136,10 @@ def closed_loop(
             f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
         )
     if not np.array_equal(matrix.valid, grid.valid):
-        raise IncompatibleProduct("the matrix and the grid mark different sub-apertures as valid")
+        raise IncompatibleProduct(f"the matrix and the geometry mark different {grid.elements} as valid")
     stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
     control = LeakyIntegrator(reconstructor(matrix.data, scale=stroke, dropped_modes=dropped), gain, leak)
+    prepare_sensor(bench)
     slopes_of = extractor(bench, grid)
     record, partial = _Record(), False
     science = bench.science if model_psf is not None else None
@@ -189,7 +189,7 @@ def closed_loop(
 def _run(
     bench: Bench,
     matrix: InteractionMatrix,
-    slopes_of: SlopeExtractor,
+    slopes_of: SlopeFunction,
     control: LeakyIntegrator,
     frames: int,
     watch: bool,
@@ -249,7 +249,7 @@ def _percentiles(latency_ns: list[int]) -> dict[str, float]:
 def best_gain(
     bench: Bench,
     matrix: InteractionMatrix,
-    grid: SubApertureGrid,
+    grid: SensorGeometry,
     *,
     gains: tuple[float, ...] | None = None,
     frames: int = 1500,

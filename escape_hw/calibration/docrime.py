@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from escape_hw.api.frames import Frame
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import (
     LightWatch,
@@ -26,10 +26,10 @@ from escape_hw.calibration.sensor_setup import (
     extractor,
     modal_basis,
     poke_amplitudes,
+    prepare_sensor,
     setup_from_frames,
 )
 from escape_hw.errors import Aborted, TooFewFrames
-from escape_hw.pipeline.slopes import SlopeExtractor
 
 #: Seconds of turbulence over which the mean tilt and focus in the references average out well enough.
 _REFERENCE_S = 10.0
@@ -58,11 +58,11 @@ class _Session:
     estimator_order: int
     lags: int
     n_modes: int
-    grid: SubApertureGrid | None
+    grid: SensorGeometry | None
     setup_frames: int
     correlations: bool
     mean_frame: NDArray[np.float32] | None = None
-    slopes_of: SlopeExtractor | None = None
+    slopes_of: SlopeFunction | None = None
     estimator: DocrimeEstimator | None = None
     motion: Motion | None = None
     light: LightWatch | None = None
@@ -103,7 +103,7 @@ class _Session:
             self._feed(frame, poke)
         self.waiting = []
 
-    def finished_grid(self) -> SubApertureGrid:
+    def finished_grid(self) -> SensorGeometry:
         """The grid with all that the run taught about it; given references stay as they were."""
         if self.grid is None or self.motion is None:
             raise RuntimeError("the sensor was never set up")
@@ -133,7 +133,7 @@ def docrime_run(
     frames: int | None = None,
     poke: float | None = None,
     whiten: bool = True,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
     record: bool = False,
     correlations: bool = True,
 ) -> Procedure[DocrimeRun]:
@@ -162,6 +162,7 @@ def docrime_run(
     report = Reporter("DO-CRIME", n_frames)
     try:
         bench.dm.flatten()
+        prepare_sensor(bench)
         try:
             for done in range(n_frames):
                 frame = next_frame(bench)
@@ -221,7 +222,7 @@ def docrime(
     frames: int | None = None,
     poke: float | None = None,
     whiten: bool = True,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
 ) -> Procedure[CalibrationResult]:
     """Measure the interaction matrix by random pokes, under turbulence or not.
 
@@ -252,7 +253,7 @@ def docrime(
     TooFewFrames
         Too few frames for the number of modes; nothing moved.
     CalibrationError
-        No spots, no light, no response, or pokes that do not span the modes.
+        No spots or pupil images, no light, no response, or pokes that do not span the modes.
     Aborted
         Stopped before a matrix could be solved.
     """

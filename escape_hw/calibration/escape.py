@@ -11,7 +11,7 @@ from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix
 from escape_hw.calibration.docrime import docrime_run
@@ -58,7 +58,7 @@ def pseudo_synthetic(
 
 
 def synthesise(
-    bench: Bench, grid: SubApertureGrid, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+    bench: Bench, grid: SensorGeometry, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
 ) -> CalibrationResult:
     """A calibration made of a registration alone, with nothing moved.
 
@@ -83,7 +83,7 @@ def escape(
     *,
     frames: int | None = None,
     poke: float | None = None,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
     whiten: bool = True,
 ) -> Procedure[CalibrationResult]:
     """Calibrate without a source: measure under turbulence, find the registration, synthesise.

@@ -161,7 +161,12 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
     from escape_hw.runtime.keep import finish
     from escape_hw.runtime.records import config_record
 
-    product = load_matrix(im, expect_system=config.system.name, expect_actuators=config.devices.dm.n_act)
+    product = load_matrix(
+        im,
+        expect_system=config.system.name,
+        expect_sensor=config.sensor.kind,
+        expect_actuators=config.devices.dm.n_act,
+    )
     measured = product.result.measured or product.matrix
     model = model_factory(config.calibration.model)(config, product.grid)
     settings = config.calibration

@@ -148,6 +148,20 @@ class ScienceConfig(CameraConfig):
     psf_px: float = Field(ge=0.5, le=100, description="lambda/D in camera pixels")
 
 
+class ModulatorConfig(DeviceConfig):
+    """The tip-tilt stage that turns the beam on a pyramid."""
+
+    frequency_hz: float = Field(
+        gt=0, le=5000, description="turns per second that are asked for, hertz; the stage's clock rounds them"
+    )
+    rad_per_lambda_d: float = Field(
+        gt=0, le=0.1, description="mirror tilt that moves the beam by 1 lambda/D on the pyramid, radians"
+    )
+    max_tilt_rad: float = Field(
+        gt=0, le=0.1, description="largest tilt of the mirror from its centre, radians"
+    )
+
+
 class ScreenConfig(DeviceConfig):
     """The changer of rotating phase screens: the bench's turbulence."""
 
@@ -175,3 +189,6 @@ class DevicesConfig(Section):
     wfs: CameraConfig = Field(description="camera of the wavefront sensor")
     science: ScienceConfig | None = Field(None, description="science camera; absent: there is none")
     screen: ScreenConfig | None = Field(None, description="phase screens; absent: there are none")
+    modulator: ModulatorConfig | None = Field(
+        None, description="tip-tilt modulator of a pyramid; absent: there is none"
+    )

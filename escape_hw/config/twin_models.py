@@ -82,6 +82,32 @@ class TwinSensor(TwinCamera):
     )
 
 
+Offset = Listed[tuple[Annotated[float, Field(ge=-20, le=20)], Annotated[float, Field(ge=-20, le=20)]]]
+
+
+class TwinPyramid(Section):
+    """How the twin's pyramid and its modulator differ from the design."""
+
+    centre_offsets_px: Listed[tuple[Offset, Offset, Offset, Offset]] = Field(
+        ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
+        description="offset of each pupil image from sensor.pupils_px, (x, y) in pixels",
+    )
+    rooftop: float = Field(
+        0.0, ge=0, le=5, description="length of the edge that stands in for the pyramid's tip, lambda/D"
+    )
+    ellipse: float = Field(
+        0.0, ge=-0.5, le=0.5, description="difference of the modulation's radii along x and y, fraction"
+    )
+    phase: float = Field(
+        0.0, ge=-60, le=60, description="what the modulation's axes lack of a quarter turn, degrees"
+    )
+    drift: float = Field(
+        0.0, ge=0, le=5, description="amplitude of the slow drift of the modulation's centre, lambda/D"
+    )
+    drift_time_s: float = Field(600.0, gt=0, le=1e6, description="period of that drift, seconds")
+    start_s: float = Field(0.0, ge=0, le=60, description="time that the modulator takes to start, seconds")
+
+
 class TwinVibration(Section):
     """Tip-tilt vibration of the bench: sinusoids, one entry of each list per line."""
 
@@ -133,6 +159,9 @@ class TwinConfig(Section):
     wfs: TwinSensor = Field(default_factory=TwinSensor, description="light and noise of the sensor's camera")
     science: TwinCamera = Field(
         default_factory=TwinCamera, description="light and noise of the science camera"
+    )
+    pyramid: TwinPyramid = Field(
+        default_factory=TwinPyramid, description="imperfections of a pyramid and its modulator"
     )
     vibration: TwinVibration = Field(default_factory=TwinVibration, description="tip-tilt vibration")
     ncpa: TwinNcpa = Field(default_factory=TwinNcpa, description="non-common-path aberration")

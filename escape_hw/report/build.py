@@ -197,7 +197,7 @@ def _bench(run: RunContent) -> str:
     calibration = next((r for r in run.calibrations.values() if r.mean_frame is not None), None)
     if calibration is not None and calibration.mean_frame is not None:
         drawing = figures_bench.sensor(calibration.mean_frame, calibration.grid, "mean frame")
-        parts.append(html.figure("mean", drawing, "Mean sensor frame and the lenslet grid found on it."))
+        parts.append(html.figure("mean", drawing, "Mean sensor frame and what was found on it."))
     label, loop = next(reversed(run.loops.items()), ("", None))
     if loop is not None and loop.last_frame is not None:
         drawing = figures_bench.sensor(loop.last_frame, None, "one frame")

@@ -9,13 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from escape_hw.api.results import LoopResult, StrehlEstimate, TemporalResponse
-from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.report import style
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.report import outlines, style
 from escape_hw.report.tables import percent
 
 #: Half width of the PSF cut-outs in pixels, and decades of the log stretch.
@@ -155,9 +154,9 @@ def mirror(command: NDArray[np.float64], layout: NDArray[np.bool_], title: str =
 
 
 def sensor(
-    frame: NDArray[np.generic], grid: SubApertureGrid | None = None, title: str = "sensor frame"
+    frame: NDArray[np.generic], grid: SensorGeometry | None = None, title: str = "sensor frame"
 ) -> Figure:
-    """A frame of the wavefront sensor with the sub-apertures that were found on it."""
+    """A frame of the wavefront sensor with what was found on it."""
     image = np.asarray(frame, float)
     figure = style.new_figure(4.9, 4.2)
     axes = style.tidy(figure.subplots(), grid=False)
@@ -167,14 +166,7 @@ def sensor(
     scaled = np.sqrt(np.clip((image - low) / max(high - low, 1e-12), 0, 1))
     axes.imshow(scaled, cmap=_FRAME_MAP, interpolation="nearest", norm=Normalize(0, 1))
     if grid is not None:
-        half = grid.pitch_px / 2
-        for x, y in grid.centres_px():
-            axes.add_patch(
-                Rectangle(
-                    (x - half, y - half), 2 * half, 2 * half, fill=False, ec="#7fd6c0", lw=0.35, alpha=0.7
-                )
-            )
-        title = f"{title}, {grid.n_valid} valid sub-apertures of {grid.pitch_px:.2f} pixels"
+        title = f"{title}, {outlines.draw(grid, axes)}"
     axes.set_title(title, fontsize=9.5)
     axes.set(xlabel="x [pixel]", ylabel="y [pixel]")
     return figure

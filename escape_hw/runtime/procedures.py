@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.errors import ConfigError
 from escape_hw.runtime.records import without_turbulence
@@ -22,7 +22,7 @@ def calibrate_by(
     *,
     frames: int | None = None,
     poke: float | None = None,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
     whiten: bool = True,
 ) -> Procedure[CalibrationResult]:
     """A calibration by the name of its method.

@@ -37,7 +37,7 @@ class BenchRecord:
     def of(cls, bench: Bench) -> BenchRecord:
         """Take it from an open bench."""
         config = bench.config
-        named = {"dm": bench.dm, "wfs": bench.wfs, "science": bench.science}
+        named = {"dm": bench.dm, "wfs": bench.wfs, "modulator": bench.modulator, "science": bench.science}
         simulated = bool(bench.simulated)
         science = config.devices.science
         return cls(

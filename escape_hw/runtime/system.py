@@ -14,13 +14,12 @@ from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Observer, Procedure
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.config.load import load_system
 
 if TYPE_CHECKING:
     from escape_hw.calibration.sensor_setup import SensorSetup
-    from escape_hw.pipeline.slopes import SlopeExtractor
 
 T = TypeVar("T")
 
@@ -89,7 +88,7 @@ class System(Bench):
 
         return self.run(find_sensor(self, frames=frames), progress=progress)
 
-    def slopes_of(self, grid: SubApertureGrid) -> SlopeExtractor:
+    def slopes_of(self, grid: SensorGeometry) -> SlopeFunction:
         """A function that takes ``frame.data`` and returns slopes ``(n_slopes,)`` in pixels.
 
         Parameters
@@ -107,7 +106,7 @@ class System(Bench):
         *,
         frames: int | None = None,
         poke: float | None = None,
-        grid: SubApertureGrid | None = None,
+        grid: SensorGeometry | None = None,
         whiten: bool = True,
         progress: bool = False,
     ) -> CalibrationResult:
@@ -148,7 +147,7 @@ class System(Bench):
         procedure = calibrate_by(self, method, frames=frames, poke=poke, grid=grid, whiten=whiten)
         return self.run(procedure, progress=progress)
 
-    def find_registration(self, matrix: InteractionMatrix, grid: SubApertureGrid) -> RegistrationEstimate:
+    def find_registration(self, matrix: InteractionMatrix, grid: SensorGeometry) -> RegistrationEstimate:
         """Where the mirror sits on the sensor, from a measured matrix (SPRINT); nothing moves.
 
         ``calibrate("escape")`` does this as well, and its error bars are the better ones: it still
@@ -201,7 +200,7 @@ class System(Bench):
     def close_loop(
         self,
         matrix: InteractionMatrix,
-        grid: SubApertureGrid,
+        grid: SensorGeometry,
         *,
         gain: float | None = None,
         leak: float | None = None,
@@ -248,7 +247,7 @@ class System(Bench):
     def find_best_gain(
         self,
         matrix: InteractionMatrix,
-        grid: SubApertureGrid,
+        grid: SensorGeometry,
         *,
         gains: tuple[float, ...] | None = None,
         frames: int = 1500,

@@ -15,14 +15,20 @@ if TYPE_CHECKING:
 
 #: Pupil samples across one lenslet: alias-free to +-4 lambda/d, several times the largest tilt.
 PUPIL_SAMPLES = 8
+#: Pupil samples across one sub-aperture, by kind of sensor; a pyramid's is a pixel of the pupil image.
+_SAMPLES = {"shack-hartmann": PUPIL_SAMPLES, "pyramid": 1}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PupilGeometry:
-    """Sampled pupil of a Shack-Hartmann system.
+    """Sampled pupil of a system.
 
     Parameters
     ----------
+    n_sub, n_pix
+        Sub-apertures across the pupil, and samples across each of them.
+    sub_aperture_m
+        Size of a sub-aperture in metres.
     coordinates_m
         Coordinates of the samples along either axis ``(n,)`` in metres, from the grid's centre.
     amplitude
@@ -46,8 +52,17 @@ class PupilGeometry:
         return np.asarray(self.amplitude > 0)
 
 
-def pupil_geometry(config: SystemConfig, n_pix: int = PUPIL_SAMPLES) -> PupilGeometry:
-    """The pupil that the configuration describes: round, lit by a Gaussian beam."""
+def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeometry:
+    """The pupil that the configuration describes: round, lit by a Gaussian beam.
+
+    Parameters
+    ----------
+    config
+        The system.
+    n_pix
+        Samples across a sub-aperture; as usual for the kind of sensor by default.
+    """
+    n_pix = n_pix or _SAMPLES[config.sensor.kind]
     n_sub, diameter = config.sensor.n_sub, config.system.pupil_m
     d = diameter / n_sub
     n = n_sub * n_pix

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
+from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, of_kind
+from escape_hw.config.sensor_models import ShackHartmannSection
 from escape_hw.errors import CalibrationError
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.model import nominal_grid
@@ -15,7 +17,6 @@ from escape_sim.oopao_bridge import make_lenslets, make_light, mis_registration,
 from escape_sim.oopao_readout import SAMPLING, window_levers
 
 if TYPE_CHECKING:
-    from escape_hw.api.sensor import SubApertureGrid
     from escape_hw.config.models import SystemConfig
 
 #: Surface in metres of the push and of the pull: a thousandth of a wave, so that what is not
@@ -25,17 +26,18 @@ STEP_M = 0.5e-9
 _BATCH = 16
 
 
-def make_model(config: SystemConfig, grid: SubApertureGrid | None) -> OOPAOModel:
+def make_model(config: SystemConfig, grid: SensorGeometry | None) -> OOPAOModel:
     """Entry point ``oopao``; without a grid, the nominal one of the design.
 
     Raises
     ------
     ConfigError
-        OOPAO is not installed.
+        OOPAO is not installed, or the system has no Shack-Hartmann sensor.
     CalibrationError
         The grid does not fit the design.
     """
-    return OOPAOModel(config, grid or nominal_grid(config))
+    config.sensor_as(ShackHartmannSection)
+    return OOPAOModel(config, nominal_grid(config) if grid is None else of_kind(grid, SubApertureGrid))
 
 
 class OOPAOModel:
@@ -77,7 +79,11 @@ class OOPAOModel:
             )
         self._n_slopes = grid.n_slopes
         self._levers = window_levers(
-            grid, np.asarray(lit), config.devices.wfs.region[:1:-1], pupil.n_pix, config.sensor.spot_px
+            grid,
+            np.asarray(lit),
+            config.devices.wfs.region[:1:-1],
+            pupil.n_pix,
+            config.sensor_as(ShackHartmannSection).spot_px,
         )
         self._mirrors: dict[float, Any] = {}
 

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.errors import ConfigError
+from escape_sim.beam_circle import BeamCircle
 from escape_sim.detector import Detector
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.influence import InfluenceFunctions, MirrorSurface
 from escape_sim.mirror_dynamics import MirrorDynamics
 from escape_sim.phase_plates import PhasePlates
 from escape_sim.psf import FocalPlane
-from escape_sim.sensor_optics import SensorOptics, make_sensor_optics
+from escape_sim.sensor_optics import ModulatedOptics, SensorOptics, make_sensor_optics
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
@@ -59,6 +60,8 @@ class SimBench:
         self._ncpa = self._aberration(truth, twin.ncpa.rms_m, twin.ncpa.n_modes)
         self._vibration_phase = truth.uniform(0, 2 * np.pi, (2, len(twin.vibration.frequency_hz)))
         self._sensor: SensorOptics | None = None
+        self.beam_circle = BeamCircle(config, truth.uniform(0, 2 * np.pi, 2))
+        self._circle_in_force: object = self
         self.wfs_detector = Detector(
             (config.devices.wfs.region[3], config.devices.wfs.region[2]), config.devices.wfs.bit_depth,
             twin.wfs.full_well_e, twin.wfs.read_noise_e, twin.wfs.dark_e, twin.wfs.background,
@@ -113,14 +116,25 @@ class SimBench:
         opd = np.zeros(self.pupil.amplitude.shape, np.float32)
         for a, b in pairwise(edges):
             opd = self.optical_path(float(a), float(b))
-            sensor.frame(opd + self._ncpa, image)
+            sensor.frame(opd + self._ncpa + self._drift(float(a)), image)
         return (image / np.float32(steps) if steps > 1 else image), opd
 
     def sensor(self) -> SensorOptics:
         """The sensor's optics, built when first used."""
         if self._sensor is None:
             self._sensor = make_sensor_optics(self.config, self.pupil)
+        circle = self.beam_circle.modulation
+        if isinstance(self._sensor, ModulatedOptics) and circle is not self._circle_in_force:
+            self._sensor.modulation, self._circle_in_force = self.beam_circle.points(), circle
         return self._sensor
+
+    def _drift(self, time_s: float) -> NDArray[np.float32] | np.float32:
+        """Tilt ``(n, n)`` in metres of the beam on a pyramid, whose modulation's centre wanders."""
+        if not self.config.twin.pyramid.drift:
+            return np.float32(0)
+        x, y = self.beam_circle.drift(time_s) * self.config.system.wavelength_m / self.config.system.pupil_m
+        at = self.pupil.coordinates_m
+        return np.asarray(x * at[None, :] + y * at[:, None], np.float32)
 
     def focal_plane(self, shape: tuple[int, int]) -> FocalPlane:
         """The science camera's optics for a region."""
