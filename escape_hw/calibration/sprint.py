@@ -16,6 +16,7 @@ from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, SprintIteration
+from escape_hw.calibration.covariance import sandwich
 from escape_hw.calibration.linearisation import GAIN, WIDTH, Problem, State
 from escape_hw.calibration.misfit import NormalEquations, Priors
 from escape_hw.errors import CalibrationError, IncompatibleProduct
@@ -26,10 +27,6 @@ _LARGEST = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
 _SMALL = np.array([5e-3, 5e-3, 2e-4, 2e-3, 2e-3])
 #: Share of what noise leaves to explain that the model must explain to be believed.
 _EXPLAINED = 0.8
-#: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
-#: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
-_FLOOR = np.array([0.04, 0.04, 3e-4, 0.035, 0.018])
-
 
 def choose_modes(matrix: InteractionMatrix, n_modes: int) -> NDArray[np.intp]:
     """The ``n_modes`` modes with the highest signal-to-noise ratio, in their own order.
@@ -123,9 +120,9 @@ def sprint_steps(
     if not matrix.data[:, columns].any():
         raise CalibrationError("the interaction matrix is zero; does the sensor see the mirror?")
     problem = Problem(matrix, model, columns, priors or Priors())
-    if not np.isfinite(problem.data).all():
+    if not np.isfinite(problem.weighted.data).all():
         raise CalibrationError("the interaction matrix's standard errors are not finite; measure it again")
-    if problem.measured_errors and float(matrix.snr()[columns].max()) < 0.1:
+    if problem.weighted.measured and float(matrix.snr()[columns].max()) < 0.1:
         raise CalibrationError(
             "the interaction matrix holds nothing but noise; use more frames or larger pokes"
         )
@@ -137,10 +134,10 @@ def sprint_steps(
         if progress := report.step():
             yield progress
         system = problem.linearise(state)
-        step = np.linalg.solve(system.matrix, system.right)
+        step = system.solve()
         if not np.isfinite(step).all():
             break
-        spread = np.sqrt(np.abs(np.diag(np.linalg.inv(_reduced(system)))))[1:6]
+        spread = np.sqrt(np.abs(np.diag(np.linalg.inv(system.information()))))[1:6]
         relative = np.abs(step[1:6]) / np.maximum(_SMALL, 0.02 * spread)
         history.append(_record(state, system, float(np.linalg.norm(step[1:6] / _LARGEST))))
         if relative.max() < 1.0:
@@ -177,53 +174,9 @@ def _check_fit(matrix: InteractionMatrix, model: SyntheticModel) -> None:
         )
 
 
-def _reduced(system: NormalEquations) -> NDArray[np.float64]:
-    """Information on the common parameters, the random effects integrated out."""
-    k = system.n_common
-    a, b, c = system.matrix[:k, :k], system.matrix[:k, k:], system.matrix[k:, k:]
-    return np.asarray(a - b @ np.linalg.solve(c, b.T))
-
-
 def _record(state: State, system: NormalEquations, norm: float) -> SprintIteration:
     chi2 = float(np.mean(np.square(system.residual)))
     return SprintIteration(Registration.from_array(state.alpha), state.gain, norm, chi2)
-
-
-def _covariance(
-    problem: Problem, system: NormalEquations, noise: NDArray[np.float64] | None
-) -> NDArray[np.float64]:
-    """Sandwich covariance of the common parameters, in units of their own.
-
-    The middle holds the noise's correlation between patches, where it is known, and else the
-    scatter of the scores from mode to mode, which shows what moved all slopes together while one
-    mode was measured. To it comes the scatter from patch to patch of 2 x 2 sub-apertures as it is
-    found, which includes what the model still misses: neighbouring lenslets fall on the pixels in
-    opposite ways, so that much of it cancels within a patch. What is common to the whole pupil no
-    scatter can show; :data:`_FLOOR` stands for it.
-    """
-    bread = np.linalg.inv(_reduced(system))
-    scores = system.efficient()
-    each = scores * system.residual
-    by_slope = each.sum(axis=2)
-    by_patch = np.zeros((by_slope.shape[0], int(problem.patches.max()) + 1))
-    np.add.at(by_patch.T, problem.patches, by_slope.T)
-    meat = by_patch @ by_patch.T
-    if noise is None:
-        by_mode = each.sum(axis=1)
-        meat += by_mode @ by_mode.T
-    else:
-        # Within a patch the scatter holds the noise already.
-        apart = problem.patches[:, None] != problem.patches[None, :]
-        whole = np.where(apart, noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise))), 0.0)
-        # Only what adds to the errors counts: negative correlations are too uncertain to trade on.
-        shares, directions = np.linalg.eigh(np.einsum("psm,st,qtm->pq", scores, whole, scores, optimize=True))
-        meat += (directions * np.maximum(shares, 0.0)) @ directions.T
-    found = bread @ meat @ bread
-    # Never better than the noise alone allows.
-    scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))
-    covariance = found * np.outer(scale, scale)
-    covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(_FLOOR)
-    return np.asarray(covariance)
 
 
 def _estimate(
@@ -236,21 +189,16 @@ def _estimate(
     noise: NDArray[np.float64] | None,
 ) -> RegistrationEstimate:
     chi2 = float(np.mean(np.square(system.residual)))
-    covariance = _covariance(problem, system, noise)
-    if not problem.measured_errors:
-        covariance = covariance * chi2
+    covariance = sandwich(problem.weighted, system, noise)
     warnings = []
     if not settled:
         warnings.append(f"the steps did not shrink within {len(history)} iterations")
-    model = problem.data - system.residual
-    explained = 1 - float(np.square(system.residual).sum() / np.square(problem.data).sum())
-    expected = (
-        1 - problem.data.size / float(np.square(problem.data).sum()) if problem.measured_errors else 1.0
-    )
-    if explained < _EXPLAINED * max(expected, 0.0) or np.vdot(model, problem.data) <= 0:
+    model = problem.weighted.data - system.residual
+    explained, explicable = problem.weighted.explained(system.residual), problem.weighted.explicable
+    if explained < _EXPLAINED * explicable or np.vdot(model, problem.weighted.data) <= 0:
         warnings.append(
             f"the model explains {max(explained, 0.0):.0%} of the matrix "
-            f"where noise leaves {max(expected, 0.0):.0%} "
+            f"where noise leaves {explicable:.0%} "
             "to explain; wrong layout, flip or basis, or a registration beyond capture"
         )
     sigma = np.sqrt(np.diag(covariance))
