@@ -28,6 +28,7 @@ _SMALL = np.array([5e-3, 5e-3, 2e-4, 2e-3, 2e-3])
 #: Share of what noise leaves to explain that the model must explain to be believed.
 _EXPLAINED = 0.8
 
+
 def choose_modes(matrix: InteractionMatrix, n_modes: int) -> NDArray[np.intp]:
     """The ``n_modes`` modes with the highest signal-to-noise ratio, in their own order.
 

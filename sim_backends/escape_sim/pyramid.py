@@ -84,7 +84,7 @@ class PyramidOptics:
             raise ValueError(f"{samples} samples per pixel over {diameter_px} pixels; both must be positive")
         self.shape = shape
         self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
-        self._diameter, self._per_wave = diameter_px * samples, 1 / wavelength_m
+        self._diameter, self.wavelength_m = diameter_px * samples, wavelength_m
         grid = good_length(max(shape), samples) if grid_px is None else grid_px
         if grid * samples < n or grid * samples % 2:
             raise ValueError(
@@ -139,7 +139,10 @@ class PyramidOptics:
         out = np.zeros(self.shape, np.float32) if image is None else image
         opd = np.ascontiguousarray(opd_m, dtype=np.float32)
         pupil_field(
-            opd.ravel(), self._per_wave, self.amplitude.ravel(), self._field.view(np.float32).reshape(-1, 2)
+            opd.ravel(),
+            1 / self.wavelength_m,
+            self.amplitude.ravel(),
+            self._field.view(np.float32).reshape(-1, 2),
         )
         others = [self._helpers.submit(self._share, k) for k in range(1, WORKERS)]
         self._share(0)
@@ -192,7 +195,7 @@ class Window:
         for axis, length in enumerate(shape[::-1]):
             if grid >= length:
                 first[axis] = np.clip(first[axis], length - grid, 0)
-        self._samples, self._first = samples, first
+        self._samples, self.first = samples, first
         self._centres = centres_px
         lo = np.maximum(first, 0)
         hi = np.minimum(first + grid, shape[::-1])
@@ -205,7 +208,7 @@ class Window:
 
     def shifts(self, n: int) -> NDArray[np.float64]:
         """Shift ``(4, 2)`` in samples from a pupil of ``n`` samples at the square's corner to its images."""
-        middles = (self._centres - self._first + 0.5) * self._samples - 0.5
+        middles = (self._centres - self.first + 0.5) * self._samples - 0.5
         return np.asarray(middles - (n - 1) / 2)
 
     def add(self, power: NDArray[np.floating], image: NDArray[np.float32]) -> None:
