@@ -105,7 +105,7 @@ class DifferentiableModel(SyntheticModel, Protocol):
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Slopes per unit of each mode ``(n_slopes, n_modes)``, and derivatives ``(6, n_slopes, n_modes)``."""
+        """Slopes per unit of each mode ``(n_slopes, n_modes)``, derivatives ``(6, n_slopes, n_modes)``."""
         ...
 
     def zonal_jacobian(

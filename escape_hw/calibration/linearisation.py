@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.derivatives import modal_matrix, zonal_jacobian
@@ -46,14 +45,14 @@ class Problem:
     """One matrix, one model, and the weights between them."""
 
     def __init__(
-        self, matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], priors: Priors
+        self, weighted: WeightedMatrix, valid: NDArray[np.bool_], model: SyntheticModel, priors: Priors
     ) -> None:
-        self.weighted = WeightedMatrix.of(matrix, columns)
+        self.weighted = weighted
         self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
-        rows, cols = np.nonzero(matrix.valid)
+        rows, cols = np.nonzero(valid)
         # x slopes share what their column does to them, y slopes what their row does.
-        self.lines = np.unique(np.concatenate([cols, matrix.valid.shape[1] + rows]), return_inverse=True)[1]
+        self.lines = np.unique(np.concatenate([cols, valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
         self.precision = np.concatenate(
             [
@@ -63,7 +62,7 @@ class Problem:
                 np.full(self.n_lines, priors.sampling**-2),
                 np.full(model.n_act, priors.actuator_gain**-2),
                 np.full(model.n_act, priors.actuator_width**-2),
-                np.full(matrix.n_slopes, priors.slope_gain**-2),
+                np.full(weighted.data.shape[0], priors.slope_gain**-2),
             ]
         )
 

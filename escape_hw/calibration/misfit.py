@@ -92,7 +92,7 @@ class NormalEquations:
         return np.concatenate([first, scaled - self.across @ first / self.diagonal])
 
     def information(self) -> NDArray[np.float64]:
-        """Information on the common parameters ``(n_common, n_common)``, the random effects integrated out."""
+        """Information on the common parameters ``(n_common, n_common)``, random effects integrated out."""
         k, whole = self.n_common, self._without_slopes()
         return np.asarray(whole[:k, :k] - whole[:k, k:] @ np.linalg.solve(whole[k:, k:], whole[k:, :k]))
 

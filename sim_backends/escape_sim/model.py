@@ -84,9 +84,7 @@ class ShackHartmannModel:
         self._config, self._grid = config, grid
         self._variants: list[ShackHartmannModel] | None = None
         weights = slope_weights(config, grid, self._pupil)
-        self._slopes = SlopeOperator(
-            weights, *np.nonzero(grid.valid), self._pupil.n_sub, self._pupil.sub_aperture_m
-        )
+        self._slopes = SlopeOperator(weights, grid.valid, self._pupil.sub_aperture_m)
 
     @property
     def n_act(self) -> int:
@@ -136,7 +134,7 @@ class ShackHartmannModel:
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> NDArray[np.float64]:
-        """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`; single precision."""
+        """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
         factors = self._factors(registration, width, np.float32)
         if m2c.shape[1] <= _FEW:
             return np.asarray(self._slopes.slopes(mode_surfaces(factors, m2c)) * self._metres, dtype=float)
@@ -156,7 +154,7 @@ class ShackHartmannModel:
                     out[p] += part @ (share[:, None] * modes)
         for part, shares in zip(parts[3:], factors.spread.T, strict=True):
             wider = part @ modes
-            for p in np.flatnonzero(shares):
+            for p in np.flatnonzero(shares).tolist():
                 out[p] += wider * shares[p]
         return np.asarray(parts[0] @ modes, dtype=float), out
 

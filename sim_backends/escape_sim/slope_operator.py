@@ -26,10 +26,8 @@ class SlopeOperator:
     weights
         ``(2, n_valid, p, p)`` for each step (rows down, columns right) to a lenslet around: slopes
         per unit of surface on each pupil sample, x then y.
-    rows, columns
-        Lenslets of the windows ``(n_valid,)``.
-    n_sub
-        Lenslets across.
+    valid
+        Lenslets with a window ``(n_sub, n_sub)``.
     sub_aperture_m
         Size of a sub-aperture in metres.
     """
@@ -37,11 +35,11 @@ class SlopeOperator:
     def __init__(
         self,
         weights: dict[tuple[int, int], NDArray[np.float64]],
-        rows: NDArray[np.intp],
-        columns: NDArray[np.intp],
-        n_sub: int,
+        valid: NDArray[np.bool_],
         sub_aperture_m: float,
     ) -> None:
+        rows, columns = np.nonzero(valid)
+        n_sub = len(valid)
         p = next(iter(weights.values())).shape[-1]
         nodes, carry = _nodes(p)
         k = nodes.size
@@ -53,7 +51,7 @@ class SlopeOperator:
         lattice = np.arange(-1, n_sub + 1) - (n_sub - 1) / 2
         self.nodes_m = ((lattice[:, None] + nodes) * sub_aperture_m).ravel()
         self._first_y, self._first_x = (rows * k).astype(np.int64), (columns * k).astype(np.int64)
-        self._cast: dict[np.dtype[np.floating], NDArray[np.floating]] = {}
+        self._cast: dict[str, NDArray[np.floating]] = {}
 
     @property
     def n_slopes(self) -> int:
@@ -86,9 +84,9 @@ class SlopeOperator:
         return out.reshape(len(out), self.n_slopes, -1)
 
     def _weights(self, dtype: DTypeLike) -> NDArray[np.floating]:
-        kind = np.dtype(dtype)
+        kind = np.dtype(dtype).str
         if kind not in self._cast:
-            self._cast[kind] = np.ascontiguousarray(self._table, dtype=kind)
+            self._cast[kind] = np.ascontiguousarray(self._table, dtype=np.dtype(kind))
         return self._cast[kind]
 
 
@@ -125,17 +123,13 @@ def _apply(table, first_y, first_x, surfaces, out):  # type: ignore[no-untyped-d
 def _zonal(table, first_y, first_x, side, y, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Sums over both factors; ``side (n_x, kinds * n_act)``, ``y (3, n_y, n_act)``."""
     size, n_act = table.shape[2], y.shape[2]
-    line = np.zeros(side.shape[1], side.dtype)
+    # Products this small stay on one thread in any linear-algebra library.
+    lines = np.empty((2 * size, side.shape[1]), side.dtype)
     for s in range(table.shape[0]):
+        np.dot(table[s].reshape(2 * size, size), side[first_x[s] : first_x[s] + size], lines)
         for axis in range(2):
             for q in range(size):
-                line[:] = 0
-                for r in range(size):
-                    w = table[s, axis, q, r]
-                    at = side[first_x[s] + r]
-                    for a in range(line.size):
-                        line[a] += w * at[a]
-                row = first_y[s] + q
+                line, row = lines[axis * size + q], first_y[s] + q
                 for a in range(n_act):
                     out[0, axis, s, a] += y[0, row, a] * line[a]
                 if out.shape[0] > 1:
