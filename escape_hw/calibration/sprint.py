@@ -34,7 +34,6 @@ from escape_hw.errors import CalibrationError, IncompatibleProduct
 _LARGEST = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
 
 
-
 def choose_modes(matrix: InteractionMatrix, n_modes: int) -> NDArray[np.intp]:
     """The ``n_modes`` modes with the highest signal-to-noise ratio, in their own order.
 

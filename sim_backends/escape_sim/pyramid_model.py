@@ -24,9 +24,9 @@ from escape_sim.mode_surfaces import (
 from escape_sim.modulation import Modulation
 from escape_sim.prism import Prism
 from escape_sim.pyramid import PyramidOptics, Window
-from escape_sim.pyramid_response import SlopeResponse, slope_response
+from escape_sim.pyramid_response import slope_response
 from escape_sim.pyramid_turbulence import distances, strength
-from escape_sim.surface_nodes import on_nodes, surface_nodes
+from escape_sim.surface_nodes import surface_nodes
 from escape_sim.turbulence_statistics import structure_function
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ _OUTER_SCALE = 4.0
 #: Turbulence weaker than this many r0 across the pupil leaves the response what it is at rest.
 _CALM = 0.5
 #: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
-_STRENGTH_DOUBT, _ELLIPSE = 0.25, 0.05
+_STRENGTH_DOUBT, _ELLIPSE = 0.4, 0.05
 
 
 def nominal_pupils(config: SystemConfig) -> PyramidPupils:
@@ -105,11 +105,11 @@ class PyramidModel:
             turbulence = strength(self._optics(), pupils, _OUTER_SCALE)
         self.turbulence = turbulence if turbulence >= _CALM else 0.0
         sigma = self._pitch / np.sqrt(2 * np.log(1 / self._coupling))
-        self._nodes, carry = surface_nodes(pupil.coordinates_m, sigma)
+        self._nodes, self._carry = surface_nodes(pupil.coordinates_m, sigma)
         # A surface changes the path by twice as much.
         scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
-        response = self._by_phase()
-        self._response = on_nodes(response.by_phase, response.lit, carry) * np.float32(scale)
+        self._response = self._by_phase()
+        self._response *= np.float32(scale)
         self._variants: list[PyramidModel] | None = None
 
     @property
@@ -176,8 +176,8 @@ class PyramidModel:
         return list(self._variants)
 
     # ------------------------------------------------------------------ construction
-    def _by_phase(self) -> SlopeResponse:
-        """The slopes' derivatives by the phase."""
+    def _by_phase(self) -> NDArray[np.float32]:
+        """The slopes' derivatives by the phase at the nodes ``(n_slopes, m * m)``."""
         pupils, pupil = self._pupils, self._pupil
         n, samples = len(pupil.coordinates_m), pupil.n_pix
         shape = self._config.devices.wfs.region[:1:-1]
@@ -190,8 +190,8 @@ class PyramidModel:
         return slope_response(
             pupil.amplitude, Prism(window.shifts(n), pupil.n_sub * samples), grid * samples,
             pupils.corners_px - window.first, pupils.valid, self._modulation, structure,
-            samples=samples, local=pupils.normalisation == "local",
-        )  # fmt: skip
+            carry=self._carry, samples=samples, local=pupils.normalisation == "local",
+        ).by_phase  # fmt: skip
 
     def _optics(self) -> PyramidOptics:
         """The sensor of the design, with the images where they were found."""

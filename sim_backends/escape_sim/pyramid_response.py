@@ -20,27 +20,24 @@ _SIGNS = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _respond(spread, row, column, light, seen, spans, weights, x, y, total):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add ``-2 Im(spread light seen)`` of the lit samples, by ``weights``, to ``x``, ``y``, ``total``.
+def _respond(spread, row, column, light, seen, spans, weights, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add ``-2 Im(spread light seen)``, by ``weights``, to ``sums (3, n, n)``: x, y and total.
 
     Returns the intensity of the pixel: the sum of the real part.
     """
-    k = 0
     intensity = np.float64(0)
     for i in range(light.shape[0]):
         line, field, amplitude = spread[row - i], seen[i], light[i]
+        to_x, to_y, to_total = sums[0, i], sums[1, i], sums[2, i]
         power = np.float32(0)
-        first, count = spans[i, 0], spans[i, 1] - spans[i, 0]
-        to_x, to_y, to_total = x[k : k + count], y[k : k + count], total[k : k + count]
-        for j in range(count):
-            value = line[column - first - j] * field[first + j] * amplitude[first + j]
+        for j in range(spans[i, 0], spans[i, 1]):
+            value = line[column - j] * field[j] * amplitude[j]
             power += value.real
             slope = np.float32(-2) * value.imag
             to_x[j] += weights[0] * slope
             to_y[j] += weights[1] * slope
             to_total[j] += slope
         intensity += power
-        k += count
     return intensity
 
 
@@ -53,14 +50,11 @@ class SlopeResponse:
     flat
         Slopes ``(n_slopes,)``, all x then all y.
     by_phase
-        Derivatives ``(n_slopes, n_lit)`` in 1 / rad, by the samples of ``lit`` in row-major order.
-    lit
-        Samples of the pupil between the first and the last that carry light in a row ``(n, n)``.
+        Derivatives ``(n_slopes, m * m)`` in 1 / rad, by the phase at the nodes, rows along y.
     """
 
     flat: NDArray[np.float64]
     by_phase: NDArray[np.float32]
-    lit: NDArray[np.bool_]
 
 
 def slope_response(
@@ -72,10 +66,11 @@ def slope_response(
     modulation: Modulation,
     structure: NDArray[np.float64] | None = None,
     *,
+    carry: NDArray[np.float32] | None = None,
     samples: int = 1,
     local: bool = False,
 ) -> SlopeResponse:
-    """Derivatives of all slopes by all lit samples of the phase.
+    """Derivatives of all slopes by the phase.
 
     With ``a(d)`` the spread of the prism, the field of one modulation point is ``E(u) = sum_p
     a(u - p) f(p)``, so ``dI(u)/dphi(p) = -2 Im(a(u - p) conj(E(u)) f(p))``. The mean of ``conj(E(u))
@@ -101,6 +96,9 @@ def slope_response(
     structure
         Structure function ``(2 n - 1, 2 n - 1)`` in square radians of the turbulence to average
         over, at distances from ``-(n - 1)`` to ``n - 1`` samples along y and x; none by default.
+    carry
+        Matrix ``(n, m)`` from the phase at nodes to the phase at samples, along either axis; by
+        default the nodes are the samples.
     samples
         Pupil samples across a camera pixel.
     local
@@ -116,12 +114,11 @@ def slope_response(
     at = (corners[:, None, ::-1] + places) * samples
     if at.min() < 0 or at.max() + samples > n_grid:
         raise ValueError("the pupil images leave the grid that the light is followed on")
-    spans = _spans(light)
-    width = int((spans[:, 1] - spans[:, 0]).sum())
+    m = len(light) if carry is None else carry.shape[1]
     sums = _Sums(
-        np.zeros((2, len(places), width), np.float32),
+        np.empty((2, len(places), m, m), np.float32),
         np.zeros((3, len(places))),
-        np.zeros((len(places) if local else _WORKERS, width), np.float32),
+        np.zeros((len(places) if local else _WORKERS, m, m), np.float32),
     )
     spread = _spread(prism, len(light), n_grid)
     beams: list[Beams]
@@ -130,21 +127,19 @@ def slope_response(
     else:
         mean = coherence(len(light), prism.diameter, modulation, structure)
         beams = [Turbulent(light, spread, mean) for _ in range(_WORKERS)]
-    job = _Job(spread, light, spans, at, samples, sums)
+    job = _Job(spread, light, _spans(light), at, samples, carry, sums)
     parts = np.array_split(np.arange(len(places)), _WORKERS)
     with ThreadPoolExecutor(_WORKERS) as pool:
         for done in [pool.submit(job.run, beams[k], part, k) for k, part in enumerate(parts)]:
             done.result()
-    columns = np.arange(len(light))
-    lit = (columns >= spans[:, :1]) & (columns < spans[:, 1:])
-    return SlopeResponse(*sums.normalised(local), lit)
+    return sums.normalised(local)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sums:
     """Differences of images and their derivatives, not normalised yet.
 
-    ``by_phase (2, n_valid, n_lit)`` for x and y; ``light (3, n_valid)`` is the x difference, the y
+    ``by_phase (2, n_valid, m, m)`` for x and y; ``light (3, n_valid)`` is the x difference, the y
     difference and the sum; ``total`` holds the derivative of each pixel's sum, or of all pixels' sum
     in as many parts as there are workers.
     """
@@ -153,16 +148,17 @@ class _Sums:
     light: NDArray[np.float64]
     total: NDArray[np.float32]
 
-    def normalised(self, local: bool) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    def normalised(self, local: bool) -> SlopeResponse:
         """Slopes and their derivatives; works in place."""
         n = self.light.shape[1]
         norm = self.light[2] if local else np.full(n, self.light[2].mean())
         flat = self.light[:2] / norm
         by_norm = self.total if local else self.total.sum(axis=0, keepdims=True) / np.float32(n)
-        for axis in range(2):
-            self.by_phase[axis] -= flat[axis].astype(np.float32)[:, None] * by_norm
-            self.by_phase[axis] /= norm.astype(np.float32)[:, None]
-        return flat.ravel(), self.by_phase.reshape(2 * n, -1)
+        for axis, by_phase in enumerate(self.by_phase):
+            for k, row in enumerate(by_phase):
+                row -= np.float32(flat[axis, k]) * by_norm[k if local else 0]
+                row /= np.float32(norm[k])
+        return SlopeResponse(flat.ravel(), self.by_phase.reshape(2 * n, -1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,31 +170,41 @@ class _Job:
     spans: NDArray[np.intp]
     at: NDArray[np.intp]
     samples: int
+    carry: NDArray[np.float32] | None
     sums: _Sums
 
     def run(self, beams: Beams, pixels: NDArray[np.intp], worker: int) -> None:
         """Add up ``pixels``."""
-        n, s = len(self.light), self.samples
+        n, s, out = len(self.light), self.samples, self.sums
+        local = len(out.total) == out.light.shape[1]
         inner = np.stack(np.divmod(np.arange(s * s), s), axis=1)
-        by_x, by_y = self.sums.by_phase
-        local = len(self.sums.total) == len(by_x)
+        sums = np.zeros((3, n, n), np.float32)
         for k in pixels:
-            total = self.sums.total[k if local else worker]
+            sums[: 3 if local else 2] = 0
             places = (self.at[:, k, None] + inner).reshape(-1, 2)
             for i, seen in enumerate(beams.seen(places)):
                 row, column = places[i] + (n - 1)
                 signs = _SIGNS[i // (s * s)]
-                light = _respond(
-                    self.spread, row, column, self.light, seen, self.spans, signs, by_x[k], by_y[k], total
-                )
-                self.sums.light[:, k] += signs[0] * light, signs[1] * light, light
+                light = _respond(self.spread, row, column, self.light, seen, self.spans, signs, sums)
+                out.light[:, k] += signs[0] * light, signs[1] * light, light
+            out.by_phase[:, k] = self._on_nodes(sums[:2])
+            if local:
+                out.total[k] = self._on_nodes(sums[2])
+        if not local:
+            out.total[worker] = self._on_nodes(sums[2])
+
+    def _on_nodes(self, by_sample: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Derivatives by the phase at nodes, of derivatives by the phase at samples."""
+        if self.carry is None:
+            return by_sample
+        return np.asarray(self.carry.T @ (by_sample @ self.carry))
 
 
 def _spans(light: NDArray[np.float32]) -> NDArray[np.intp]:
     """First lit column of each row and the one behind its last ``(n, 2)``."""
-    lit: NDArray[np.bool_] = np.asarray(light > 0)
-    last = lit.shape[1] - lit[:, ::-1].argmax(axis=1)
-    return np.where(lit.any(axis=1)[:, None], np.stack([lit.argmax(axis=1), last], axis=1), 0)
+    lit: NDArray[np.bool_] = np.array(light > 0)
+    last = light.shape[1] - np.flip(lit, axis=1).argmax(axis=1)
+    return np.where(np.any(lit, axis=1)[:, None], np.stack([lit.argmax(axis=1), last], axis=1), 0)
 
 
 def _spread(prism: Prism, n: int, n_grid: int) -> NDArray[np.complex64]:

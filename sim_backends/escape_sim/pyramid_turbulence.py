@@ -10,9 +10,9 @@ from escape_hw.pipeline.pyramid_slopes import slopes_of_image
 from escape_sim.pyramid import PyramidOptics
 
 #: Strengths tried, as pupil diameters over r0.
-_STRENGTHS = 2.0 ** np.arange(-1, 7)
+_STRENGTHS = 2.0 ** np.arange(-1, 5.5, 0.5)
 #: Pairs of phase screens tried with each.
-_PAIRS = 8
+_PAIRS = 6
 #: Side of the screens in pupils: the outer scale must fit in.
 _SIDE = 8
 
@@ -26,9 +26,10 @@ def distances(n: int, pixel_m: float) -> NDArray[np.float64]:
 def strength(optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float) -> float:
     """Pupil diameters over r0 at the sensor's wavelength, from ``pupils.motion``.
 
-    The slopes of a pyramid saturate, so there is no formula: frames under a few random phases of
-    each strength are made and their slopes' rms over time compared. Always the same phases, so that
-    equal motions give equal strengths.
+    There is no formula: frames under a few random phases of each strength are made and their slopes'
+    rms over time compared. Always the same phases, so that equal motions give equal strengths. The
+    slopes of a pyramid saturate and finally move less again, so that from about 20 r0 across the
+    pupil the motion hardly tells the strength any more.
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ def strength(optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float) -
     Returns
     -------
     float
-        Between 0 (no motion) and the largest strength tried.
+        Between 0 (no motion) and the strength that moves the slopes most.
     """
     if not pupils.motion:
         return 0.0
@@ -55,11 +56,13 @@ def strength(optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float) -
             for path in paths
         ]
         moved.append(float(np.sqrt(np.var(slopes, axis=0, ddof=1).mean())))
-    # Weak turbulence moves slopes in proportion to the phase; strong, ever less.
-    rising = np.maximum.accumulate(moved)
-    if pupils.motion <= rising[0]:
-        return float(_STRENGTHS[0] * (pupils.motion / rising[0]) ** (6 / 5))
-    return float(2 ** np.interp(pupils.motion, rising, np.log2(_STRENGTHS)))
+        if len(moved) > 1 and moved[-1] <= moved[-2]:
+            moved.pop()
+            break
+    if pupils.motion <= moved[0]:
+        # Weak turbulence moves slopes in proportion to the phase.
+        return float(_STRENGTHS[0] * (pupils.motion / moved[0]) ** (6 / 5))
+    return float(2 ** np.interp(pupils.motion, moved, np.log2(_STRENGTHS[: len(moved)])))
 
 
 def _unit_screens(n: int, outer_scale: float) -> NDArray[np.float64]:

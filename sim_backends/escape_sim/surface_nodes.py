@@ -13,7 +13,7 @@ _PER_SIGMA = 6.0
 
 def surface_nodes(
     samples_m: NDArray[np.float64], sigma_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
     """Nodes along an axis, and the matrix from values there to values at the samples.
 
     Chebyshev nodes and barycentric interpolation (Berrut and Trefethen 2004), or the samples
@@ -30,11 +30,12 @@ def surface_nodes(
     -------
     nodes_m : ndarray, ``(m,)``
     carry : ndarray, ``(n, m)``
+        None where the nodes are the samples.
     """
     middle, half = (samples_m[0] + samples_m[-1]) / 2, (samples_m[-1] - samples_m[0]) / 2
     m = int(np.ceil(_PER_SIGMA * half / sigma_m)) + 1
     if m >= samples_m.size:
-        return samples_m, np.eye(samples_m.size, dtype=np.float32)
+        return samples_m, None
     angle = (2 * np.arange(m) + 1) * np.pi / (2 * m)
     nodes = middle - half * np.cos(angle)
     weights = np.sin(angle) * (-1.0) ** np.arange(m)
@@ -45,26 +46,3 @@ def surface_nodes(
     hit = on_node.any(axis=1)
     carry[hit] = on_node[hit]
     return nodes, carry.astype(np.float32)
-
-
-def on_nodes(
-    by_sample: NDArray[np.float32], lit: NDArray[np.bool_], carry: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """A linear map of values at the lit samples as one of values at the nodes, ``(k, m * m)``.
-
-    Parameters
-    ----------
-    by_sample
-        The map ``(k, n_lit)``.
-    lit
-        Lit samples ``(n, n)``, one unbroken run in each row; rows along y.
-    carry
-        From :func:`surface_nodes` ``(n, m)``, the same along both axes.
-    """
-    n, m = carry.shape
-    along_x = np.zeros((len(by_sample), n, m), np.float32)
-    end = 0
-    for row, line in enumerate(lit):
-        first, end = end, end + int(line.sum())
-        along_x[:, row] = by_sample[:, first:end] @ carry[line]
-    return np.matmul(carry.T, along_x).reshape(len(by_sample), m * m)
