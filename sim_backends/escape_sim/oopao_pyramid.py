@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_sim.fourier_filter import good_length
 from escape_sim.modulation import Modulation
 from escape_sim.oopao_bridge import make_light, make_pyramid, oopao, quiet
 from escape_sim.prism import Prism
-from escape_sim.pyramid import Window, good_length
+from escape_sim.pyramid import Window
 
 #: OOPAO's faces, numbered from the lower right on clockwise, in our order.
 _FACES = (2, 3, 1, 0)

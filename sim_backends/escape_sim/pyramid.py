@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_sim.fourier_filter import good_length, is_good
 from escape_sim.modulation import Modulation
 from escape_sim.prism import Prism
 from escape_sim.pyramid_fourier import FourierKernel
@@ -83,7 +84,7 @@ class PyramidOptics:
             raise ValueError(f"{samples} samples per pixel over {diameter_px} pixels; both must be positive")
         self.shape = shape
         self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
-        self._diameter, self._per_wave = diameter_px * samples, 1 / wavelength_m
+        self._diameter, self.wavelength_m = diameter_px * samples, wavelength_m
         grid = good_length(max(shape), samples) if grid_px is None else grid_px
         if grid * samples < n or grid * samples % 2:
             raise ValueError(
@@ -138,7 +139,10 @@ class PyramidOptics:
         out = np.zeros(self.shape, np.float32) if image is None else image
         opd = np.ascontiguousarray(opd_m, dtype=np.float32)
         pupil_field(
-            opd.ravel(), self._per_wave, self.amplitude.ravel(), self._field.view(np.float32).reshape(-1, 2)
+            opd.ravel(),
+            1 / self.wavelength_m,
+            self.amplitude.ravel(),
+            self._field.view(np.float32).reshape(-1, 2),
         )
         others = [self._helpers.submit(self._share, k) for k in range(1, WORKERS)]
         self._share(0)
@@ -191,7 +195,7 @@ class Window:
         for axis, length in enumerate(shape[::-1]):
             if grid >= length:
                 first[axis] = np.clip(first[axis], length - grid, 0)
-        self._samples, self._first = samples, first
+        self._samples, self.first = samples, first
         self._centres = centres_px
         lo = np.maximum(first, 0)
         hi = np.minimum(first + grid, shape[::-1])
@@ -204,7 +208,7 @@ class Window:
 
     def shifts(self, n: int) -> NDArray[np.float64]:
         """Shift ``(4, 2)`` in samples from a pupil of ``n`` samples at the square's corner to its images."""
-        middles = (self._centres - self._first + 0.5) * self._samples - 0.5
+        middles = (self._centres - self.first + 0.5) * self._samples - 0.5
         return np.asarray(middles - (n - 1) / 2)
 
     def add(self, power: NDArray[np.floating], image: NDArray[np.float32]) -> None:
@@ -216,19 +220,6 @@ class Window:
         image[self._region] += part
 
 
-def good_length(shortest: int, samples: int = 1) -> int:
-    """The next number of pixels whose samples FFTW transforms at its best without trial runs."""
-    length = shortest
-    while not _is_good(length * samples):
-        length += 1
-    return length
-
-
-def _is_good(samples: int) -> bool:
-    """Whether the length is a power of two, at least 4, times 1, 3, 5, 9 or 25."""
-    return samples % 4 == 0 and samples // (samples & -samples) in (1, 3, 5, 9, 25)
-
-
 def _products_are_faster(n: int, n_grid: int) -> bool:
     """Whether matrix products beat transforms, by the operations of both and their measured rates.
 
@@ -236,6 +227,6 @@ def _products_are_faster(n: int, n_grid: int) -> bool:
     does not suit them, and need 0.8 ns for each sample of the grid in between.
     """
     products = 4 * (n * n * n_grid + n * n_grid**2) / 85e9 + 20e-6
-    rate = 40e9 if _is_good(n_grid) else 17e9
+    rate = 40e9 if is_good(n_grid) else 17e9
     transforms = (n + 3 * n_grid) * 5 * n_grid * np.log2(n_grid) / rate + 0.8e-9 * n_grid**2
     return bool(products < transforms)

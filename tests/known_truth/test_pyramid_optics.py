@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from escape_sim.fourier_filter import good_length
 from escape_sim.modulation import Modulation
 from escape_sim.oopao_bridge import make_light, make_pyramid, oopao, quiet
 from escape_sim.oopao_pyramid import OOPAOPyramid
 from escape_sim.prism import Prism
-from escape_sim.pyramid import PyramidOptics, good_length
+from escape_sim.pyramid import PyramidOptics
 
 WAVELENGTH = 635e-9
 #: Single precision of the fast optics, relative to the brightest pixel.
