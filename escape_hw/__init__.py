@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from escape_hw import errors, testing
+    from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
     from escape_hw.api.camera import Camera
     from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
     from escape_hw.api.matrix import InteractionMatrix
@@ -45,6 +46,7 @@ __version__ = "0.1.0"
 #: Public name -> module that defines it (a module of that very name is published as a whole). Add a
 #: line here, to ``__all__`` and to the block for type checkers above to publish a name.
 _HOME = {
+    "AdaptiveSecondary": "escape_hw.api.adaptive_secondary",
     "Camera": "escape_hw.api.camera",
     "CameraInfo": "escape_hw.api.frames",
     "CameraSettings": "escape_hw.api.frames",
@@ -66,6 +68,8 @@ _HOME = {
     "ScreenInfo": "escape_hw.api.screen",
     "ScreenState": "escape_hw.api.screen",
     "SendReport": "escape_hw.api.mirror",
+    "ShellHealth": "escape_hw.api.adaptive_secondary",
+    "ShellState": "escape_hw.api.adaptive_secondary",
     "SubApertureGrid": "escape_hw.api.sensor",
     "System": "escape_hw.runtime.system",
     "best_gain": "escape_hw.calibration.closed_loop",
@@ -89,6 +93,7 @@ _HOME = {
 }
 
 __all__ = [
+    "AdaptiveSecondary",
     "CalibrationResult",
     "Camera",
     "CameraInfo",
@@ -110,6 +115,8 @@ __all__ = [
     "ScreenInfo",
     "ScreenState",
     "SendReport",
+    "ShellHealth",
+    "ShellState",
     "SubApertureGrid",
     "System",
     "__version__",

@@ -71,7 +71,8 @@ class MirrorConfig(DeviceConfig):
 
     layout: str = Field(
         pattern=layouts.PATTERN,
-        description="where the actuators stand: 'circle-N' or 'square-N' on an N x N grid",
+        description="where the actuators stand: 'circle-N' or 'square-N' on an N x N grid, "
+        "'rings-336' or 'rings-672' on rings",
     )
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
     pitches_across_pupil: float = Field(
@@ -88,9 +89,13 @@ class MirrorConfig(DeviceConfig):
         """Number of actuators."""
         return layouts.count(self.layout)
 
-    def actuator_map(self) -> NDArray[np.bool_]:
-        """Boolean map ``(N, N)``, true where an actuator stands."""
-        return layouts.actuator_map(self.layout)
+    def actuator_map(self) -> NDArray[np.bool_] | None:
+        """Boolean map ``(N, N)``, true where an actuator stands; ``None`` when there is no grid."""
+        return layouts.actuator_map(self.layout) if layouts.on_grid(self.layout) else None
+
+    def positions(self) -> NDArray[np.float64]:
+        """Actuator positions ``(n_act, 2)`` as (x, y) from the mirror's centre, in pitches."""
+        return layouts.positions(self.layout)
 
     @model_validator(mode="after")
     def _rules(self) -> Self:

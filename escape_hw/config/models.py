@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from escape_hw.config.device_models import DeviceConfig, DevicesConfig, Mode
 from escape_hw.config.section import Breach, Section, enforce
 from escape_hw.config.sensor_models import AnySensor, PyramidSection, SensorSection
+from escape_hw.config.telescope_models import TelescopeSection
 from escape_hw.config.toml_text import dump_toml
 from escape_hw.config.twin_models import TwinConfig, TwinPyramid
 from escape_hw.errors import ConfigError
@@ -113,6 +114,9 @@ class SystemConfig(Section):
 
     schema_version: Literal[1] = Field(1, alias="schema", description="version of these keys")
     system: SystemSection = Field(description="what the system is")
+    telescope: TelescopeSection = Field(
+        default_factory=TelescopeSection, description="what stands in the light before the pupil"
+    )
     sensor: AnySensor = Field(description="the wavefront sensor")
     devices: DevicesConfig = Field(description="the devices")
     basis: BasisSection = Field(description="modal basis")

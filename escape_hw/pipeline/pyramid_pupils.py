@@ -76,9 +76,9 @@ def find_pupils(
         raise ValueError(f"references is {references!r}; choose 'mean' or 'design'")
     image = np.asarray(mean_frame, dtype=np.float64)
     rough = _search(image, n_sub, np.asarray(nominal_px, float))
-    fits = np.array([_fit_rim(image, rough, k, n_sub / 2) for k in range(4)])
-    centres, diameter = fits[:, :2], 2 * float(np.median(fits[:, 2]))
-    _check_fit(centres, diameter, fits[:, 2], n_sub, image.shape)
+    centres, radius = _fit_rims(image, rough, n_sub / 2)
+    diameter = 2 * radius
+    _check_fit(centres, rough, diameter, n_sub, image.shape)
     corners = boxes(centres, n_sub)
     light = np.sum([image[y : y + n_sub, x : x + n_sub] for x, y in corners], axis=0)
     counts = float(np.percentile(light[light > 0.02 * np.percentile(light, 99)], 95))
@@ -153,40 +153,55 @@ def _check_light(
         )
 
 
-def _fit_rim(
-    image: NDArray[np.float64], rough: NDArray[np.float64], number: int, radius: float
-) -> tuple[float, float, float]:
-    """Centre (x, y) and radius of one of the images, from its rim alone.
+def _fit_rims(
+    image: NDArray[np.float64], rough: NDArray[np.float64], nominal: float
+) -> tuple[NDArray[np.float64], float]:
+    """Centres ``(4, 2)`` and the common radius of the images, from their rims alone."""
+    centres, radius = rough.copy(), nominal
+    for iteration in range(_ITERATIONS):
+        # A wide ring captures, a narrow one is precise.
+        width = min(_RING * (2 if iteration < _ITERATIONS // 3 else 1), nominal / 2)
+        moves = np.array(
+            [_rim_step(image, centres, k, radius, width, nominal + _NEIGHBOUR) for k in range(4)]
+        )
+        limited = np.clip(moves, -1.5, 1.5)
+        centres += limited[:, :2]
+        radius = max(radius + float(np.median(limited[:, 2])), nominal / 2)
+    return centres, radius
+
+
+def _rim_step(
+    image: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    number: int,
+    radius: float,
+    width: float,
+    apart: float,
+) -> NDArray[np.float64]:
+    """Gauss-Newton step ``(3,)`` of one image's centre (x, y) and radius.
 
     In a ring around the rim the light is taken for ``outside(angle) + inside(angle, depth) * edge``,
-    all of which is linear but for the edge's place, which is found by Gauss-Newton steps.
+    all of which is linear but for the edge's place. Pixels ``apart`` or less from another image's
+    centre are left out.
     """
-    x, y = map(float, rough[number])
-    others, nominal = np.delete(rough, number, axis=0), radius
+    x, y = centres[number]
+    pixels, light = _ring(image, x, y, radius, width)
+    others = np.delete(centres, number, axis=0)
+    alone = np.hypot(*(pixels[:, None] - others.T[:, :, None])).min(axis=0) > apart
+    (dx, dy), light = pixels[:, alone] - centres[number][:, None], light[alone]
+    r = np.hypot(dx, dy)
     # A rim of few pixels tells few harmonics.
-    order = min(_HARMONICS, int(radius // 3))
-    for step in range(_ITERATIONS):
-        # A wide ring captures, a narrow one is precise.
-        width = min(_RING * (2 if step < _ITERATIONS // 3 else 1), radius / 2)
-        pixels, light = _ring(image, x, y, radius, width)
-        # Where another image is near, the light is its.
-        alone = np.hypot(*(pixels[:, None] - others.T[:, :, None])).min(axis=0) > nominal + _NEIGHBOUR
-        pixels, light = pixels[:, alone], light[alone]
-        dx, dy = pixels[0] - x, pixels[1] - y
-        r = np.hypot(dx, dy)
-        waves = _harmonics(np.arctan2(dy, dx), order)
-        depth = (radius - r) / _SOFT
-        edge = special.ndtr(depth)
-        steepness = np.exp(-(depth**2) / 2) / (np.sqrt(2 * np.pi) * _SOFT)
-        slant = (depth * edge)[:, None] * waves[:, :5]
-        known = np.concatenate([waves, waves * edge[:, None], slant], axis=1)
-        shares = np.linalg.lstsq(known, light, rcond=None)[0]
-        bright = (waves @ shares[waves.shape[1] : 2 * waves.shape[1]]) * steepness
-        moves = np.stack([bright * dx / r, bright * dy / r, bright], axis=1)
-        answer = np.linalg.lstsq(np.concatenate([known, moves], axis=1), light, rcond=None)[0][-3:]
-        limited = np.clip(answer, -1.5, 1.5)
-        x, y, radius = x + limited[0], y + limited[1], radius + limited[2]
-    return x, y, radius
+    waves = _harmonics(np.arctan2(dy, dx), min(_HARMONICS, int(radius // 3)))
+    depth = (radius - r) / _SOFT
+    edge = special.ndtr(depth)
+    steepness = np.exp(-(depth**2) / 2) / (np.sqrt(2 * np.pi) * _SOFT)
+    slant = (depth * edge)[:, None] * waves[:, :5]
+    known = np.concatenate([waves, waves * edge[:, None], slant], axis=1)
+    shares = np.linalg.lstsq(known, light, rcond=None)[0]
+    n = waves.shape[1]
+    bright = (waves @ shares[n : 2 * n]) * steepness
+    moving = np.stack([bright * dx / r, bright * dy / r, bright], axis=1)
+    return np.asarray(np.linalg.lstsq(np.concatenate([known, moving], axis=1), light, rcond=None)[0][-3:])
 
 
 def _harmonics(angle: NDArray[np.float64], order: int) -> NDArray[np.float64]:
@@ -214,25 +229,29 @@ def _ring(
 
 def _check_fit(
     centres: NDArray[np.float64],
+    rough: NDArray[np.float64],
     diameter: float,
-    radii: NDArray[np.float64],
     n_sub: int,
     shape: tuple[int, ...],
 ) -> None:
-    """Raise unless the images are whole and of the design's size."""
-    off = np.abs(2 * radii - n_sub)
-    if not off.max() <= _DIAMETER_RANGE * n_sub + _DIAMETER_PX:
-        worst = int(np.argmax(off))
-        raise CalibrationError(
-            f"the {IMAGES[worst]} pupil image is {2 * radii[worst]:.1f} pixels across, "
-            f"sensor.n_sub says {n_sub}; check sensor.n_sub and the binning, or whether the region cuts it"
-        )
+    """Raise unless the images are whole, round, and of the design's size."""
     low, high = centres - diameter / 2, centres + diameter / 2
-    # Half a pixel lies between a pixel's centre and its edge.
-    cut = (low < -1.0).any(axis=1) | (high > np.array(shape[::-1])).any(axis=1)
+    # Half a pixel lies between a pixel's centre and its edge, and diffraction widens the rest.
+    cut = (low < -2.0).any(axis=1) | (high > np.array(shape[::-1]) + 1.0).any(axis=1)
     if cut.any():
         names = " and ".join(IMAGES[k] for k in np.flatnonzero(cut))
         raise CalibrationError(
             f"the camera's region of {shape[1]} x {shape[0]} pixels cuts the {names} pupil image; "
             "move the region (devices.wfs.region)"
+        )
+    if not abs(diameter - n_sub) <= _DIAMETER_RANGE * n_sub + _DIAMETER_PX:
+        raise CalibrationError(
+            f"the pupil images are {diameter:.1f} pixels across, sensor.n_sub says {n_sub}; "
+            "check sensor.n_sub and the binning"
+        )
+    lost = np.hypot(*(centres - rough).T) > max(4.0, 0.1 * n_sub)
+    if lost.any():
+        names = " and ".join(IMAGES[k] for k in np.flatnonzero(lost))
+        raise CalibrationError(
+            f"the {names} pupil image has no clear rim; use more frames, or check the light on it"
         )

@@ -66,6 +66,12 @@ class RunContent:
         rows = self.document.get("bench", {}).get("layout")
         return np.array([[c == "1" for c in row] for row in rows], bool) if rows else None
 
+    @property
+    def places_m(self) -> NDArray[np.float64] | None:
+        """Where actuators without a grid stand ``(n_act, 2)``, in metres on the mirror."""
+        places = self.document.get("bench", {}).get("places_m")
+        return np.array(places, float).reshape(-1, 2) if places else None
+
     def matrices(self) -> dict[str, InteractionMatrix]:
         """All matrices by label: measured ones before what was computed from them."""
         found: dict[str, InteractionMatrix] = {}

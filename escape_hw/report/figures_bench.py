@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.patches import Circle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
@@ -144,13 +146,44 @@ def mirror(command: NDArray[np.float64], layout: NDArray[np.bool_], title: str =
     """
     values = np.full(layout.shape, np.nan)
     values[layout] = 100 * np.asarray(command, float)
+    figure, axes, limit = _mirror_axes(values, title)
+    axes.imshow(style.paint(values, style.DIVERGING, -limit, limit, ~layout), interpolation="nearest")
+    return figure
+
+
+def mirror_without_grid(
+    command: NDArray[np.float64], places_m: NDArray[np.float64], title: str = "mirror command"
+) -> Figure:
+    """A mirror command where the actuators stand, in percent of full stroke.
+
+    Parameters
+    ----------
+    command
+        ``(n_act,)``.
+    places_m
+        Actuator positions ``(n_act, 2)`` as (x, y), y along the rows of other figures.
+    """
+    values = 100 * np.asarray(command, float)
+    figure, axes, limit = _mirror_axes(values, title)
+    distance = np.hypot(*(places_m[:, None, k] - places_m[:, k] for k in (0, 1)))
+    np.fill_diagonal(distance, np.inf)
+    radius = 0.5 * float(np.median(distance.min(axis=1))) if len(places_m) > 1 else 1.0
+    spots = PatchCollection([Circle((x, y), radius) for x, y in places_m], linewidths=0)
+    spots.set_facecolor([tuple(c) for c in style.paint(values, style.DIVERGING, -limit, limit)])
+    axes.add_collection(spots)
+    reach = float(np.abs(places_m).max(initial=0.0)) + radius
+    axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
+    return figure
+
+
+def _mirror_axes(values: NDArray[np.float64], title: str) -> tuple[Figure, Axes, float]:
+    """Figure, axes and the ends of the colour scale for a command in percent."""
     limit = max(float(np.nanmax(np.abs(values), initial=0.0)), 1.0)
     figure = style.new_figure(4.4, 3.7)
     axes = style.bare(figure.subplots())
-    axes.imshow(style.paint(values, style.DIVERGING, -limit, limit, ~layout), interpolation="nearest")
     axes.set_title(title, color=style.INK, fontsize=9.5)
     style.colour_bar(figure, [axes], style.DIVERGING, (-limit, limit), "command [% of full stroke]")
-    return figure
+    return figure, axes, limit
 
 
 def sensor(

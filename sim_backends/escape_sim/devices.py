@@ -14,7 +14,6 @@ from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.errors import ConfigError, FrameTimeout, SettingRejected
 from escape_sim.detector import Detector
-from escape_sim.influence import layout_positions
 from escape_sim.psf import FocalPlane
 from escape_sim.sim_bench import SimBench
 
@@ -60,10 +59,9 @@ class SimMirror(DeformableMirror):
         super().__init__(name, bench.config.devices.dm.limits.to_limits())
         self._bench = bench
         dm = bench.config.devices.dm
-        layout = dm.actuator_map()
         self._info = DMInfo(
-            "simulated ALPAO DM97-15", dm.serial, int(layout.sum()), layout,
-            layout_positions(layout, dm.pitch_m), dm.stroke_m, True,
+            "simulated ALPAO DM97-15", dm.serial, dm.n_act, dm.actuator_map(), dm.positions() * dm.pitch_m,
+            dm.stroke_m, True,
         )  # fmt: skip
 
     @property
@@ -232,9 +230,9 @@ class SimWavefrontSensorCamera(_SimCamera):
                 break
         image, opd = bench.wfs_image(start, end)
         bench.observe(opd, end)
-        electrons = twin.wfs.photons_per_frame * s.exposure_s / bench.config.devices.wfs.exposure_s
-        electrons *= 0.0 if bench.beam_blocked else 10 ** (s.gain_db / 20)
-        data, saturated = bench.wfs_detector.expose(image, electrons)
+        gain = 10 ** (s.gain_db / 20)
+        source, sky = bench.wfs_light(s.exposure_s)
+        data, saturated = bench.wfs_detector.expose(image, source * gain, sky * gain)
         r, n = s.region, self._nominal
         data = data[r.y - n.y : r.y - n.y + r.height, r.x - n.x : r.x - n.x + r.width]
         data.flags.writeable = False

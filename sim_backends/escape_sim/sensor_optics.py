@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.config.sensor_models import PyramidSection, ShackHartmannSection
-from escape_hw.errors import ConfigError
 from escape_sim.geometry import PupilGeometry
+from escape_sim.modulation import Modulation
+from escape_sim.pyramid import PyramidOptics
 from escape_sim.shack_hartmann import ShackHartmannOptics
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
-    from escape_sim.modulation import Modulation
-    from escape_sim.pyramid import PyramidOptics
+    from escape_sim.oopao_pyramid import OOPAOPyramid
 
 
 class SensorOptics(Protocol):
@@ -36,13 +36,7 @@ class ModulatedOptics(SensorOptics, Protocol):
 
 
 def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOptics:
-    """The twin's sensor as it really stands, which the design does not know exactly.
-
-    Raises
-    ------
-    ConfigError
-        ``system.optics`` has no such sensor.
-    """
+    """The twin's sensor as it really stands, which the design does not know exactly."""
     amplitude = pupil.amplitude / np.sqrt(np.sum(np.square(pupil.amplitude, dtype=float)))
     if isinstance(config.sensor, PyramidSection):
         return make_pyramid(config, config.sensor, pupil, amplitude.astype(np.float32))
@@ -51,23 +45,25 @@ def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOpti
 
 def make_pyramid(
     config: SystemConfig, sensor: PyramidSection, pupil: PupilGeometry, amplitude: NDArray[np.float32]
-) -> PyramidOptics:
+) -> PyramidOptics | OOPAOPyramid:
     """A pyramid with its images where they really fall, not modulated yet."""
-    if config.system.optics != "fast":
-        raise ConfigError(f"system.optics = '{config.system.optics}' has no pyramid; use 'fast'")
-    from escape_sim.modulation import Modulation
-    from escape_sim.pyramid import PyramidOptics
+    make: type[PyramidOptics | OOPAOPyramid] = PyramidOptics
+    if config.system.optics == "oopao":
+        # Imported here: OOPAO loads for two seconds and 1,600 modules.
+        from escape_sim.oopao_pyramid import OOPAOPyramid
 
+        make = OOPAOPyramid
     twin = config.twin.pyramid
     width, height = config.devices.wfs.region[2:]
-    return PyramidOptics(
+    return make(
         amplitude,
-        float(pupil.n_sub * pupil.n_pix),
+        float(pupil.n_sub),
         config.system.wavelength_m,
         np.add(sensor.pupils_px, twin.centre_offsets_px),
         (height, width),
         Modulation.circle(0.0),
         rooftop=twin.rooftop,
+        samples=pupil.n_pix,
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from escape_hw.config.load import load_system
 from escape_hw.config.models import SystemConfig
 from escape_hw.testing import Check, Factory, parametrize_device_checks
-from escape_sim import devices
+from escape_sim import devices, sim_secondary
 
 
 @cache
@@ -23,6 +23,7 @@ def fresh(make: Any, name: str) -> Any:
 
 TWINS: dict[str, Factory] = {
     "sim-alpao": partial(fresh, devices.make_mirror, "dm"),
+    "sim-asm": partial(fresh, sim_secondary.make_secondary, "dm"),
     "sim-ximea": partial(fresh, devices.make_wfs_camera, "wfs"),
     "sim-science": partial(fresh, devices.make_science_camera, "science"),
     "sim-screen": partial(fresh, devices.make_screen, "screen"),
