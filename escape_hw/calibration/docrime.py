@@ -30,6 +30,7 @@ from escape_hw.calibration.sensor_setup import (
     poke_amplitudes,
     setup_from_frames,
 )
+from escape_hw.config.models import CalibrationSection
 from escape_hw.errors import Aborted, TooFewFrames
 from escape_hw.pipeline.slopes import SlopeExtractor
 
@@ -153,12 +154,7 @@ def docrime_run(
     poke = c.poke if poke is None else poke
     m2c = modal_basis(bench)
     amplitude = poke_amplitudes(bench, m2c, poke)
-    needed = _least_frames(m2c.shape[1], c.whiten_order if whiten else 0, c.lags)
-    if n_frames < needed:
-        raise TooFewFrames(
-            f"{n_frames} frames cannot constrain {m2c.shape[1]} modes; ask for at least {needed} frames, "
-            "or for fewer modes (basis.n_modes)"
-        )
+    require_frames(c, n_frames, m2c.shape[1], whiten)
     to_modes = np.linalg.pinv(m2c)
     session = _Session(
         bench, c.whiten_order if whiten else 0, c.lags, m2c.shape[1], grid, min(SETUP_FRAMES, n_frames),
@@ -277,6 +273,17 @@ def docrime(
     return run.result
 
 
-def _least_frames(n_modes: int, order: int, lags: int) -> int:
-    """Fewest frames worth starting with: twice the unknowns per slope."""
-    return 2 * (n_modes + order + lags)
+def require_frames(settings: CalibrationSection, frames: int, n_modes: int, whiten: bool = True) -> None:
+    """Raise unless the frames are twice the unknowns per slope.
+
+    Raises
+    ------
+    TooFewFrames
+        Says how many are worth starting with.
+    """
+    needed = 2 * (n_modes + (settings.whiten_order if whiten else 0) + settings.lags)
+    if frames < needed:
+        raise TooFewFrames(
+            f"{frames} frames cannot constrain {n_modes} modes; ask for at least {needed} frames, "
+            "or for fewer modes (basis.n_modes)"
+        )
