@@ -97,6 +97,11 @@ class Bench:
             raise ConfigError(f"devices.{name}.{key}: ''  names no driver, and no system works without one")
         return cls(config, dm, wfs, science, screen, modulator)
 
+    def __repr__(self) -> str:
+        kind = "simulated" if self.simulated else "hardware"
+        state = "open" if self.is_open else "closed"
+        return f"<{type(self).__name__} {self.config.system.name}, {kind}, {state}>"
+
     @property
     def devices(self) -> tuple[Device, ...]:
         """The devices present, in the order of opening."""

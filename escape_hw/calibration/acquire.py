@@ -20,13 +20,15 @@ DARK_SHARE = 0.02
 
 
 def some_frames(frames: int, name: str = "frames") -> int:
-    """The number of frames, if there is at least one.
+    """The number of frames, if it is a whole number and at least one.
 
     Raises
     ------
     ConfigError
-        There is none.
+        It is not.
     """
+    if isinstance(frames, bool) or not isinstance(frames, int | np.integer):
+        raise ConfigError(f"{name} is {frames!r}; it must be a whole number")
     if frames < 1:
         raise ConfigError(f"{name} is {frames}; it must be at least 1")
     return frames

@@ -22,6 +22,7 @@ from escape_hw.calibration.sensor_setup import (
     modal_basis,
     poke_amplitudes,
 )
+from escape_hw.config.models import CalibrationSection
 from escape_hw.errors import Aborted, TooFewFrames
 
 
@@ -57,12 +58,7 @@ def docrime_run(
     poke = c.poke if poke is None else poke
     m2c = modal_basis(bench)
     amplitude = poke_amplitudes(bench, m2c, poke)
-    needed = least_frames(bench, m2c.shape[1], whiten)
-    if n_frames < needed:
-        raise TooFewFrames(
-            f"{n_frames} frames cannot constrain {m2c.shape[1]} modes; ask for at least {needed} frames, "
-            "or for fewer modes (basis.n_modes)"
-        )
+    require_frames(c, n_frames, m2c.shape[1], whiten)
     order, lags = c.whiten_order if whiten else 0, c.lags
 
     def estimator(n_slopes: int) -> DocrimeEstimator:
@@ -159,7 +155,22 @@ def docrime(
     return run.result
 
 
-def least_frames(bench: Bench, n_modes: int, whiten: bool = True) -> int:
+def least_frames(settings: CalibrationSection, n_modes: int, whiten: bool = True) -> int:
     """Fewest frames that a matrix is worth starting with: twice the unknowns per slope."""
-    c = bench.config.calibration
-    return 2 * (n_modes + (c.whiten_order if whiten else 0) + c.lags)
+    return 2 * (n_modes + (settings.whiten_order if whiten else 0) + settings.lags)
+
+
+def require_frames(settings: CalibrationSection, frames: int, n_modes: int, whiten: bool = True) -> None:
+    """Raise unless the frames are twice the unknowns per slope.
+
+    Raises
+    ------
+    TooFewFrames
+        Says how many are needed.
+    """
+    needed = least_frames(settings, n_modes, whiten)
+    if frames < needed:
+        raise TooFewFrames(
+            f"{frames} frames cannot constrain {n_modes} modes; ask for at least {needed} frames, "
+            "or for fewer modes (basis.n_modes)"
+        )

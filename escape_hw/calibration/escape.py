@@ -61,7 +61,7 @@ def escape(
         raise ConfigError(f"estimator '{estimator}' is unknown; it is one of {', '.join(ESTIMATORS)}")
     from_matrix = estimator == "matrix" or not whiten
     n_frames = c.frames if frames is None else frames
-    if not from_matrix and n_frames < least_frames(bench, bench.config.basis.n_modes):
+    if not from_matrix and n_frames < least_frames(c, bench.config.basis.n_modes):
         return (yield from escape_from_few(bench, frames=n_frames, poke=poke, grid=grid))
     run = yield from docrime_run(bench, frames=frames, poke=poke, grid=grid, whiten=whiten)
     measured, solution = run.result, run.solution

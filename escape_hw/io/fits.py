@@ -159,7 +159,8 @@ def load_matrix(
     _expect(path, "kind of sensor", product.grid.kind, expect_sensor)
     _expect(path, "kind of basis", header["BASIS"], expect_basis)
     _expect(path, "number of actuators", matrix.m2c.shape[0], expect_actuators)
-    _expect(path, "number of modes", matrix.n_modes, expect_modes)
+    way = f"basis.n_modes={matrix.n_modes} would take this one"
+    _expect(path, "number of modes", matrix.n_modes, expect_modes, way)
     _expect(path, "grid of sub-apertures", matrix.valid.shape, expect_sub_apertures)
     if expect_m2c is not None:
         _expect_basis(path, matrix.m2c, np.asarray(expect_m2c, float))
@@ -213,9 +214,10 @@ def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> C
     )
 
 
-def _expect(path: Path, what: str, found: object, wanted: object) -> None:
+def _expect(path: Path, what: str, found: object, wanted: object, way: str = "") -> None:
     if wanted is not None and found != wanted:
-        raise IncompatibleProduct(f"{path}: its {what} is {found!r}; {wanted!r} is needed")
+        out = f" ({way})" if way else ""
+        raise IncompatibleProduct(f"{path}: its {what} is {found!r}; {wanted!r} is needed{out}")
 
 
 def _expect_basis(path: Path, found: NDArray[np.float64], wanted: NDArray[np.float64]) -> None:

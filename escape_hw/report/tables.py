@@ -42,7 +42,9 @@ def with_error(value: Measured) -> str:
 
 
 def percent(value: Measured) -> str:
-    """A ratio and its error in percent."""
+    """A ratio and its error in percent; a question mark where the run was too short for an error."""
+    if not math.isfinite(value.sigma):
+        return f"{100 * value.value:5.1f} ± ? %"
     return f"{100 * value.value:5.1f} ± {100 * value.sigma:.1f} %"
 
 

@@ -68,8 +68,10 @@ def loops(results: Mapping[str, LoopResult]) -> list[dict[str, Any]]:
     """Every loop is stable; ESCAPE is not below push-pull beyond the error bar."""
     checks = [check(f"{label}: loop stable", loop.stable) for label, loop in results.items()]
     escape, baseline = results.get("ESCAPE"), results.get("push-pull")
-    if escape is None or baseline is None or escape.strehl is None or baseline.strehl is None:
+    if escape is None or baseline is None or escape.model_psf is None or baseline.model_psf is None:
         return checks
+    if escape.strehl is None or baseline.strehl is None or not math.isfinite(escape.strehl.peak.sigma):
+        return [*checks, check("Strehl of ESCAPE and push-pull compared: their loops were too short", False)]
     for way, name in (("peak", "peak"), ("otf", "OTF"), ("encircled", "encircled")):
         ours, theirs = getattr(escape.strehl, way), getattr(baseline.strehl, way)
         error = math.hypot(ours.sigma, theirs.sigma)

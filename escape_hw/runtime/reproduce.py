@@ -68,7 +68,17 @@ def reproduce_shwfs(
     plants
         Random plants for the curve of error against frames; none by default. They run on twins of
         their own, whatever the bench is.
+
+    Raises
+    ------
+    TooFewFrames
+        For the number of modes; nothing moved.
     """
+    # Imported here, as every calibration is where it is used.
+    from escape_hw.calibration.docrime import require_frames
+
+    # Now, and not after the baseline was measured.
+    require_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
     result = ShwfsResult()
     try:
         yield from _calibrate(bench, frames, result)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
-from small_bench import PLANTED, small
+from small_bench import PLANTED, assert_flat, small
 
 from escape_hw.calibration.docrime import docrime_run
 from escape_hw.calibration.sprint import sprint
 from escape_hw.errors import TooFewFrames
+from escape_hw.runtime.reproduce import reproduce_shwfs
 
 #: Fewest frames that 30 modes with a filter of 6 and 5 lags may start with, and a few more.
 JUST_ENOUGH = (82, 130)
@@ -87,3 +90,25 @@ def test_loss_that_leaves_too_few_complete_frames_is_an_error():
         with pytest.raises(TooFewFrames, match=r"complete frames cannot constrain 30 modes; at least \d+"):
             bench.run(docrime_run(bench, frames=100))
         assert not bench.dm.shape.any()
+
+
+def test_a_reproduction_with_too_few_frames_is_refused_before_its_baseline(bench):
+    frame = bench.wfs.next_frame(1.0).index
+    with pytest.raises(TooFewFrames, match="50 frames cannot constrain 30 modes"):
+        bench.run(reproduce_shwfs(bench, frames=50))
+    assert bench.wfs.next_frame(1.0).index <= frame + 2
+    assert_flat(bench)
+
+
+def test_a_loop_too_short_for_its_strehl_ratio_says_how_long_it_must_be(good, shared):
+    def run(frames):
+        return shared.close_loop(good.matrix, good.grid, frames=frames, model_psf=good.psf)
+
+    nothing, little, enough = run(100), run(220), run(270)
+    assert nothing.strehl is None
+    assert "too short for Strehl ratios: 0 frames" in nothing.notes[0]
+    assert "at least 270 frames" in nothing.notes[0]
+    assert math.isnan(little.strehl.peak.sigma)
+    assert "too short for an error of the Strehl ratios" in little.notes[0]
+    assert math.isfinite(enough.strehl.peak.sigma)
+    assert not enough.notes

@@ -337,3 +337,10 @@ def test_run_drives_a_procedure_and_stops_it() -> None:
         with pytest.raises(Aborted):
             bench.run(counting(4, finished), abort=stop, observers=(lambda p: stop.set(),))
     assert finished == [4, 1]
+
+
+@pytest.mark.usefixtures("diary")
+def test_a_bench_says_what_it_is() -> None:
+    with build_bench(load_system("razor-shwfs", mode="hardware")) as bench:
+        assert repr(bench) == "<Bench razor-shwfs, hardware, open>"
+    assert repr(build_bench(load_system("razor-shwfs"))) == "<Bench razor-shwfs, simulated, closed>"

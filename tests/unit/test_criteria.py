@@ -1,0 +1,44 @@
+"""What a reproduced result must meet, where the runs leave it open."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import fake_results as fake
+
+from escape_hw.api.results import Measured, StrehlEstimate
+from escape_hw.report.tables import strehl_table
+from escape_hw.runtime import criteria
+
+UNKNOWN = Measured(0.6, math.nan)
+
+
+def met(escape=None) -> list[bool]:
+    """Which of the criteria a loop with ESCAPE's matrix meets beside a usual one with push-pull's."""
+    found = criteria.loops({"push-pull": fake.loop("push-pull"), "ESCAPE": escape or fake.loop("escape")})
+    return [check["met"] for check in found]
+
+
+def test_loops_of_the_same_strehl_ratio_meet_all():
+    assert met() == [True] * 5
+
+
+def test_loops_too_short_for_a_strehl_ratio_do_not_count_as_compared():
+    assert met(escape=replace(fake.loop(), strehl=None)) == [True, True, False]
+    unknown = StrehlEstimate(UNKNOWN, UNKNOWN, UNKNOWN)
+    assert met(escape=replace(fake.loop(), strehl=unknown)) == [True, True, False]
+
+
+def test_without_a_science_camera_there_is_nothing_to_compare():
+    assert met(escape=replace(fake.loop(), strehl=None, model_psf=None)) == [True, True]
+
+
+def test_a_worse_strehl_ratio_is_not_met():
+    assert met(escape=fake.loop(strehl=0.5)) == [True, True, False, False, False]
+
+
+def test_a_ratio_without_an_error_says_so_in_the_table():
+    unknown = StrehlEstimate(UNKNOWN, UNKNOWN, UNKNOWN)
+    row = strehl_table({"ESCAPE": replace(fake.loop(), strehl=unknown)}).rows[0]
+    assert row[1] == "60.0 ± ?"
