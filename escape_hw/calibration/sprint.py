@@ -164,7 +164,7 @@ def _steps(
         begin = light.alpha
     if misfit:
         found = yield from _with_misfit(
-            Problem(weighted, matrix.valid, model, priors or Priors()),
+            Problem(weighted, model, priors or Priors()),
             Registration.from_array(begin), max_iterations, learning_rate, report, history,
         )  # fmt: skip
     else:
