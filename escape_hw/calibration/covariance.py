@@ -73,6 +73,4 @@ def sandwich(
     scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))
     covariance = found * np.outer(scale, scale)
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(_FLOOR)
-    if not weighted.measured:
-        covariance = covariance * np.mean(np.square(system.residual))
-    return np.asarray(covariance)
+    return np.asarray(covariance * weighted.noise(system.residual) ** 2)

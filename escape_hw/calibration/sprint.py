@@ -206,6 +206,7 @@ def _with_misfit(
         if not np.isfinite(step).all():
             break
         spread = np.sqrt(np.abs(np.diag(np.linalg.inv(system.information()))))[1:6]
+        spread *= problem.weighted.noise(system.residual)
         relative = np.abs(step[1:6]) / np.maximum(SMALL, 0.02 * spread)
         norm = float(np.linalg.norm(step[1:6] / _LARGEST))
         history.append(_record(state.alpha, state.gain, system.residual, norm))
