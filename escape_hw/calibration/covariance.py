@@ -31,6 +31,16 @@ class Linearised(Protocol):
         ...
 
 
+def nearness(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """How near valid sub-apertures are to each other ``(n_valid, n_valid)``.
+
+    1 in one place, falling linearly along rows and along columns to 0 at half the larger side of ``valid``.
+    """
+    rows, columns = np.nonzero(valid)
+    down, right = (np.abs(at[:, None] - at[None, :]) / (max(valid.shape) / 2) for at in (rows, columns))
+    return np.asarray(np.maximum(1 - down, 0.0) * np.maximum(1 - right, 0.0))
+
+
 def sandwich(
     weighted: WeightedMatrix, system: Linearised, noise: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
@@ -54,16 +64,17 @@ def sandwich(
         Covariance of the slopes' noise ``(n_slopes, n_slopes)`` up to a factor, where it is known.
     """
     bread = np.linalg.inv(system.information())
-    scores, near = system.efficient(), weighted.near()
+    scores, near = system.efficient(), nearness(weighted.valid)
     each = scores * system.residual
-    by_slope = each.sum(axis=2)
-    meat = by_slope @ near @ by_slope.T
+    # Slopes along x and along y of one sub-aperture stand in one place.
+    by_place = each.sum(axis=2).reshape(len(each), 2, -1).sum(axis=1)
+    meat = by_place @ near @ by_place.T
     if noise is None:
         by_mode = each.sum(axis=1)
         meat += by_mode @ by_mode.T
     else:
         # What is near is in the scatter already.
-        whole = (1 - near) * noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
+        whole = (1 - np.tile(near, (2, 2))) * noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
         spread = np.matmul(whole, scores).reshape(len(scores), -1)
         # Only what adds to the errors counts: negative correlations are too uncertain to trade on.
         shares, directions = np.linalg.eigh(scores.reshape(len(scores), -1) @ spread.T)
@@ -73,4 +84,6 @@ def sandwich(
     scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))
     covariance = found * np.outer(scale, scale)
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(_FLOOR)
-    return np.asarray(covariance * weighted.noise(system.residual) ** 2)
+    if not weighted.measured:
+        covariance = covariance * np.mean(np.square(system.residual))
+    return np.asarray(covariance)

@@ -50,8 +50,8 @@ class WeightedMatrix:
         else:
             by_slope = np.ones(data.shape[0])
             by_mode = np.full(data.shape[1], max(float(data.std()), 1e-30))
-        weighted = data / by_slope[:, None] / by_mode
-        return cls(weighted, by_slope, by_mode, matrix.m2c[:, columns], measured, matrix.valid)
+        m2c = matrix.m2c[:, columns]
+        return cls(data / by_slope[:, None] / by_mode, by_slope, by_mode, m2c, measured, matrix.valid)
 
     @property
     def modes(self) -> NDArray[np.float64]:
@@ -61,12 +61,6 @@ class WeightedMatrix:
     def weigh(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Slopes ``(..., n_slopes, n)`` in units of their noise."""
         return np.asarray(slopes / self.by_slope[:, None])
-
-    def near(self) -> NDArray[np.float64]:
-        """How near slopes are ``(n_slopes, n_slopes)``: 1 in one place, falling to 0 at half the pupil."""
-        reach = max(self.valid.shape) / 2
-        down, right = (np.abs(at[:, None] - at[None, :]) / reach for at in np.nonzero(self.valid))
-        return np.tile(np.maximum(1 - down, 0.0) * np.maximum(1 - right, 0.0), (2, 2))
 
     @property
     def explicable(self) -> float:

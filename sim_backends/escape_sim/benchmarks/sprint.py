@@ -83,8 +83,8 @@ class Ours:
         def solve(data: NDArray[np.float64]) -> Answer:
             sigma = np.full(data.shape, _sigma(data) if noise else 0.0, np.float32)
             matrix = InteractionMatrix(
-                data.astype(np.float32), sigma, self.m2c, grid.valid, self.config.system.name, "push-pull", True,
-            )  # fmt: skip
+                data.astype(np.float32), sigma, self.m2c, grid.valid, "razor-shwfs", "push-pull", True
+            )
             found = sprint(matrix, model, misfit=misfit)
             return Answer(found.registration, found.converged)
 
