@@ -22,7 +22,7 @@ _PACKAGES = ("escape-hw", "numpy", "scipy", "numba", "OOPAO", "pyrtcao", "specul
 
 def conditions() -> dict[str, Any]:
     """Machine, load and versions, plain for JSON."""
-    versions = {}
+    versions: dict[str, str | None] = {}
     for name in _PACKAGES:
         try:
             versions[name] = version(name)

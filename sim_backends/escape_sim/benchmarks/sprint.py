@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.benchmark import BenchmarkRow, alternate
+from escape_hw.api.benchmark import BenchmarkRow, alternate, product_rate
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.registration import Registration
+from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.calibration.modes import karhunen_loeve
 from escape_hw.calibration.sprint import sprint
 from escape_hw.config.load import load_system
 from escape_sim.benchmarks.oopao_sprint import Answer, Mirror, OopaoPeer
 from escape_sim.benchmarks.specula_sprint import MISSING, specula_peer
 from escape_sim.model import make_model, nominal_grid
+from escape_sim.slope_operator import NODES
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
@@ -61,6 +62,7 @@ def run() -> list[BenchmarkRow]:
     for n_modes in MODES:
         modes = m2c[:, :n_modes]
         oopao = OopaoPeer(alike, modes)
+        rows += _matrices(alike, oopao, n_modes)
         rows += _times(alike, oopao, n_modes)
         rows += _accuracy(alike, bench, oopao, n_modes)
         rows += _from_afar(alike, oopao, n_modes)
@@ -99,6 +101,51 @@ def mirror(real: bool) -> Mirror:
     """The mirror as designed, or as it comes."""
     gains = GAIN_SCATTER * np.random.default_rng(7).standard_normal(97) if real else np.zeros(97)
     return Mirror(1 + gains, COUPLING if real else 0.4)
+
+
+def _matrices(config: SystemConfig, oopao: OopaoPeer, n_modes: int) -> list[BenchmarkRow]:
+    """The synthetic matrix, alone and with what a step of the descent needs."""
+    model, m2c = make_model(config, None), oopao.m2c
+    ours, theirs = model.modal_matrix(PLANTED, m2c), oopao.matrix(PLANTED, mirror(False))
+    scale = float(np.vdot(ours, theirs) / np.vdot(ours, ours))
+    note = f"relative difference {np.linalg.norm(scale * ours - theirs) / np.linalg.norm(theirs):.1e}"
+    rate, what = product_rate(), f"sprint, {n_modes} modes"
+    times = alternate(
+        lambda: model.modal_matrix(PLANTED, m2c), lambda: oopao.matrix(PLANTED, mirror(False)), rounds=3
+    )
+    alone, whole = (1e3 * count / rate for count in _operations(config, model.n_act, n_modes))
+    with_derivatives = alternate(lambda: model.modal_jacobian(PLANTED, m2c), None, rounds=3)[0]
+    matrices = 1 + 2 * len(PARAMETERS)
+    rows = (
+        ("synthetic matrix", times[0], times[1], alone, note),
+        (
+            "with derivatives",
+            with_derivatives,
+            _times_of(times[1], matrices),
+            whole,
+            f"{matrices} of OOPAO's",
+        ),
+    )
+    who = f"{oopao.name.split(':')[0]}: mirror and InteractionMatrix"
+    return [
+        BenchmarkRow(f"{what}: {label}", 1e3 * a, _times_of(b, 1e3), who, "ms", "lower", text, floor)
+        for label, a, b, floor, text in rows
+    ]
+
+
+def _operations(config: SystemConfig, n_act: int, n_modes: int) -> tuple[int, int]:
+    """Floating-point operations of a modal matrix, and of one with derivatives, as they are made."""
+    windows, across = nominal_grid(config).n_valid, config.sensor.n_sub + 2
+    seen = (3 * NODES) ** 2
+    surfaces = 2 * (across * NODES) ** 2 * n_act * n_modes + 4 * windows * seen * n_modes
+    # Three factors along x against two slopes, five pairs of factors, ten products into modes.
+    zonal = 4 * windows * n_act * (seen + 3 * NODES) + 4 * windows * n_act * n_modes
+    whole = 4 * windows * n_act * (3 * seen + 5 * 3 * NODES) + 10 * 4 * windows * n_act * n_modes
+    return min(surfaces, zonal), whole
+
+
+def _times_of(seconds: float | None, factor: float) -> float | None:
+    return None if seconds is None else factor * seconds
 
 
 def _times(config: SystemConfig, oopao: OopaoPeer, n_modes: int) -> list[BenchmarkRow]:
