@@ -20,8 +20,10 @@ def _expose(intensity, photons, dark, read2, gain, offset, noise, start, sign, w
         count = max(np.float32(0), count)
         level = np.int32(count + np.float32(0.5))
         level = min(level, np.int32(top))
-        # A pixel of low gain is full before the converter reaches its top.
-        if full or level == top:
+        # The pattern is one of sensitivities: whatever its own, a full pixel stands at the top.
+        if full:
+            level = np.int32(top)
+        if level == top:
             saturated += 1
         out[k] = level
     return saturated
