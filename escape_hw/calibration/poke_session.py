@@ -15,7 +15,8 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, Motion, next_frame, reachable
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
 from escape_hw.calibration.mean_focus import MeanFocus
-from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, setup_from_frames
+from escape_hw.calibration.sensor_kinds import kind_of
+from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, refined, setup_from_frames
 from escape_hw.errors import Aborted
 
 #: Seconds of turbulence over which the mean tilt and focus in the references average out well enough.
@@ -59,6 +60,8 @@ class PokeSession:
     waiting: list[tuple[Frame, NDArray[np.float64]]] = field(default_factory=list)
     taken: int = 0
     shortened: int = 0
+    looked: NDArray[np.floating] | None = None
+    looks: int = 0
     kept: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] = field(default_factory=list)
 
     def poke(self, frames: int, amplitude: NDArray[np.float64]) -> Procedure[bool]:
@@ -132,7 +135,11 @@ class PokeSession:
         if self.grid is None or self.motion is None:
             raise RuntimeError("the sensor was never set up")
         grid = self.motion.of(self.grid)
-        return grid if self.mean_frame is None else self.motion.references(grid, self.focus)
+        if self.mean_frame is None:
+            return grid
+        if self.looked is not None:
+            grid = refined(self.bench, grid, (self.looked / self.looks).astype(np.float32))
+        return self.motion.references(grid, self.focus)
 
     def notes(self) -> tuple[str, ...]:
         """What to know of the references before closing a loop on them."""
@@ -153,6 +160,9 @@ class PokeSession:
         self.motion.add(slopes)
         if self.focus is not None:
             self.focus.add(slopes)
+        if kind_of(self.bench).long_look:
+            self.looked = frame.data + (0.0 if self.looked is None else self.looked)
+            self.looks += 1
         if self.estimator is not None:
             self.estimator.partial_fit(frame.index, slopes, poke)
         if self.keep:

@@ -24,6 +24,8 @@ _SOFT = 0.45
 #: Half width in pixels of the ring in which a rim is fitted, and harmonics of its brightness.
 _RING, _HARMONICS = 4.0, 6
 _ITERATIONS = 12
+#: Light that is pressed down to one half before rims are fitted, as a share of the usual one.
+_PRESSED = 1.0
 #: Pixels that come so near to another image (in pixels from its rim) are left out.
 _NEIGHBOUR = 2.0
 
@@ -76,7 +78,7 @@ def find_pupils(
         raise ValueError(f"references is {references!r}; choose 'mean' or 'design'")
     image = np.asarray(mean_frame, dtype=np.float64)
     rough = _search(image, n_sub, np.asarray(nominal_px, float))
-    centres, radius = _fit_rims(image, rough, n_sub / 2)
+    centres, radius = _fit_rims(_evened(image), rough, n_sub / 2)
     diameter = 2 * radius
     _check_fit(centres, rough, diameter, n_sub, image.shape)
     corners = boxes(centres, n_sub)
@@ -101,6 +103,32 @@ def find_pupils(
     if references == "design":
         mean = without_low_orders(mean, valid, pupils.flux)
     return replace(pupils, references=mean.astype(np.float32))
+
+
+def refine_pupils(mean_frame: NDArray[np.float32], pupils: PyramidPupils) -> PyramidPupils:
+    """The pupils with centres and diameter from a longer look.
+
+    Under turbulence the rims fitted on a second of frames may be some tenths of a pixel off. Boxes
+    and mask stay as they are, so slopes keep their meaning; a model wants the centres.
+
+    Parameters
+    ----------
+    mean_frame
+        Mean of frames in counts ``(rows, columns)``, background subtracted.
+    pupils
+        As found before.
+    """
+    image = _evened(np.asarray(mean_frame, dtype=np.float64))
+    centres, radius = _fit_rims(image, pupils.centres_px, pupils.valid.shape[0] / 2)
+    return replace(pupils, centres_px=centres, diameter_px=2 * radius)
+
+
+def _evened(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The image with its bright parts pressed down: a rim is to be as steep in bright light as in dim."""
+    lit = image > 0.1 * np.percentile(image, 99)
+    level = _PRESSED * float(np.median(image[lit])) if lit.any() else 1.0
+    light = np.maximum(image, 0.0)
+    return np.asarray(light / (light + level))
 
 
 def _search(image: NDArray[np.float64], n_sub: int, nominal_px: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -197,11 +225,18 @@ def _rim_step(
     steepness = np.exp(-(depth**2) / 2) / (np.sqrt(2 * np.pi) * _SOFT)
     slant = (depth * edge)[:, None] * waves[:, :5]
     known = np.concatenate([waves, waves * edge[:, None], slant], axis=1)
-    shares = np.linalg.lstsq(known, light, rcond=None)[0]
+    shares = _fit(known, light)
     n = waves.shape[1]
     bright = (waves @ shares[n : 2 * n]) * steepness
     moving = np.stack([bright * dx / r, bright * dy / r, bright], axis=1)
-    return np.asarray(np.linalg.lstsq(np.concatenate([known, moving], axis=1), light, rcond=None)[0][-3:])
+    return _fit(np.concatenate([known, moving], axis=1), light)[-3:]
+
+
+def _fit(terms: NDArray[np.float64], light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares of the terms in the light, by the normal equations: few terms, many pixels."""
+    scale = np.sqrt(np.maximum(np.square(terms).sum(axis=0), 1e-30))
+    unit = terms / scale
+    return np.asarray(np.linalg.lstsq(unit.T @ unit, unit.T @ light, rcond=1e-12)[0] / scale)
 
 
 def _harmonics(angle: NDArray[np.float64], order: int) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from escape_hw.api.benchmark import BenchmarkRow, alternate, product_rate
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.calibration.derivatives import modal_jacobian, modal_matrix
 from escape_hw.calibration.modes import karhunen_loeve
 from escape_hw.calibration.sprint import sprint
 from escape_hw.config.load import load_system
@@ -94,7 +95,7 @@ class Ours:
 
     def matrix(self, registration: Registration) -> NDArray[np.float64]:
         """What our model says is measured under a registration."""
-        return make_model(self.config, None).modal_matrix(registration, self.m2c)
+        return modal_matrix(make_model(self.config, None), registration, self.m2c)
 
 
 def mirror(real: bool) -> Mirror:
@@ -106,15 +107,15 @@ def mirror(real: bool) -> Mirror:
 def _matrices(config: SystemConfig, oopao: OopaoPeer, n_modes: int) -> list[BenchmarkRow]:
     """The synthetic matrix, alone and with what a step of the descent needs."""
     model, m2c = make_model(config, None), oopao.m2c
-    ours, theirs = model.modal_matrix(PLANTED, m2c), oopao.matrix(PLANTED, mirror(False))
+    ours, theirs = modal_matrix(model, PLANTED, m2c), oopao.matrix(PLANTED, mirror(False))
     scale = float(np.vdot(ours, theirs) / np.vdot(ours, ours))
     note = f"relative difference {np.linalg.norm(scale * ours - theirs) / np.linalg.norm(theirs):.1e}"
     rate, what = product_rate(), f"sprint, {n_modes} modes"
     times = alternate(
-        lambda: model.modal_matrix(PLANTED, m2c), lambda: oopao.matrix(PLANTED, mirror(False)), rounds=3
+        lambda: modal_matrix(model, PLANTED, m2c), lambda: oopao.matrix(PLANTED, mirror(False)), rounds=3
     )
     alone, whole = (1e3 * count / rate for count in _operations(config, model.n_act, n_modes))
-    with_derivatives = alternate(lambda: model.modal_jacobian(PLANTED, m2c), None, rounds=3)[0]
+    with_derivatives = alternate(lambda: modal_jacobian(model, PLANTED, m2c), None, rounds=3)[0]
     matrices = 1 + 2 * len(PARAMETERS)
     rows = (
         ("synthetic matrix", times[0], times[1], alone, note),
