@@ -11,7 +11,7 @@ from escape_hw.calibration.weighted import WeightedMatrix
 
 #: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
 #: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
-_FLOOR = np.array([0.04, 0.04, 3e-4, 0.035, 0.018])
+_FLOOR = np.array([0.03, 0.03, 0.0, 0.035, 0.018])
 
 
 class Linearised(Protocol):
@@ -31,17 +31,28 @@ class Linearised(Protocol):
         ...
 
 
+def nearness(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """How near valid sub-apertures are to each other ``(n_valid, n_valid)``.
+
+    1 in one place, falling linearly along rows and along columns to 0 at half the larger side of ``valid``.
+    """
+    rows, columns = np.nonzero(valid)
+    down, right = (np.abs(at[:, None] - at[None, :]) / (max(valid.shape) / 2) for at in (rows, columns))
+    return np.asarray(np.maximum(1 - down, 0.0) * np.maximum(1 - right, 0.0))
+
+
 def sandwich(
     weighted: WeightedMatrix, system: Linearised, noise: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
     """Sandwich covariance of the common parameters, in units of their own.
 
-    The middle holds the noise's correlation between patches, where it is known, and else the
-    scatter of the scores from mode to mode, which shows what moved all slopes together while one
-    mode was measured. To it comes the scatter from patch to patch of 2 x 2 sub-apertures as it is
-    found, which includes what the model still misses: neighbouring lenslets fall on the pixels in
-    opposite ways, so that much of it cancels within a patch. What is common to the whole pupil no
-    scatter can show; :data:`_FLOOR` stands for it.
+    The middle is the scatter of the scores over the pupil as it is found, which includes what the
+    model still misses. Neighbouring sub-apertures err together, and what the model misses has its
+    own pattern over the pupil, so products of scores count with a weight that falls linearly with
+    the distance to zero at half the pupil (Bartlett's window, as in Newey & West 1987 over time).
+    Beyond that the noise's correlation fills in where it is known, and else the scatter of the
+    scores from mode to mode, which shows what moved all slopes together while one mode was
+    measured. What is common to the whole pupil no scatter can show; :data:`_FLOOR` stands for it.
 
     Parameters
     ----------
@@ -53,19 +64,17 @@ def sandwich(
         Covariance of the slopes' noise ``(n_slopes, n_slopes)`` up to a factor, where it is known.
     """
     bread = np.linalg.inv(system.information())
-    scores, patches = system.efficient(), weighted.patches
+    scores, near = system.efficient(), nearness(weighted.valid)
     each = scores * system.residual
-    by_slope = each.sum(axis=2)
-    by_patch = np.zeros((by_slope.shape[0], int(patches.max()) + 1))
-    np.add.at(by_patch.T, patches, by_slope.T)
-    meat = by_patch @ by_patch.T
+    # Slopes along x and along y of one sub-aperture stand in one place.
+    by_place = each.sum(axis=2).reshape(len(each), 2, -1).sum(axis=1)
+    meat = by_place @ near @ by_place.T
     if noise is None:
         by_mode = each.sum(axis=1)
         meat += by_mode @ by_mode.T
     else:
-        # Within a patch the scatter holds the noise already.
-        apart = patches[:, None] != patches[None, :]
-        whole = np.where(apart, noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise))), 0.0)
+        # What is near is in the scatter already.
+        whole = (1 - np.tile(near, (2, 2))) * noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
         spread = np.matmul(whole, scores).reshape(len(scores), -1)
         # Only what adds to the errors counts: negative correlations are too uncertain to trade on.
         shares, directions = np.linalg.eigh(scores.reshape(len(scores), -1) @ spread.T)

@@ -26,8 +26,8 @@ class WeightedMatrix:
         Mode-to-command matrix of the columns ``(n_act, n_modes)``.
     measured
         Whether the matrix came with standard errors; if not, they are taken as equal.
-    patches
-        For each slope, the number of the patch of 2 x 2 sub-apertures it lies in.
+    valid
+        Valid sub-apertures ``(n_rows, n_columns)``.
     """
 
     data: NDArray[np.float64]
@@ -35,7 +35,7 @@ class WeightedMatrix:
     by_mode: NDArray[np.float64]
     m2c: NDArray[np.float64]
     measured: bool
-    patches: NDArray[np.intp]
+    valid: NDArray[np.bool_]
 
     @classmethod
     def of(cls, matrix: InteractionMatrix, columns: NDArray[np.intp]) -> WeightedMatrix:
@@ -50,11 +50,8 @@ class WeightedMatrix:
         else:
             by_slope = np.ones(data.shape[0])
             by_mode = np.full(data.shape[1], max(float(data.std()), 1e-30))
-        rows, cols = np.nonzero(matrix.valid)
-        patches = np.tile(np.unique(rows // 2 * 1000 + cols // 2, return_inverse=True)[1], 2)
-        return cls(
-            data / by_slope[:, None] / by_mode, by_slope, by_mode, matrix.m2c[:, columns], measured, patches
-        )
+        m2c = matrix.m2c[:, columns]
+        return cls(data / by_slope[:, None] / by_mode, by_slope, by_mode, m2c, measured, matrix.valid)
 
     @property
     def modes(self) -> NDArray[np.float64]:

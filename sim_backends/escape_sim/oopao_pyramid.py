@@ -23,6 +23,8 @@ class OOPAOPyramid:
     amplitude, diameter_px, wavelength_m, centres_px, shape, modulation, rooftop, samples, grid_px
         As for ``PyramidOptics``. OOPAO's grid holds two pupils side by side, so ``grid_px`` is at
         least twice the pupil map's side.
+    diameter_m
+        Side of the pupil map in metres, for a mirror of OOPAO's; angles alone do not need it.
 
     Raises
     ------
@@ -44,6 +46,7 @@ class OOPAOPyramid:
         rooftop: float = 0.0,
         samples: int = 1,
         grid_px: int | None = None,
+        diameter_m: float = 1.0,
     ) -> None:
         n = amplitude.shape[0]
         if amplitude.shape != (n, n) or n % (2 * samples):
@@ -63,15 +66,14 @@ class OOPAOPyramid:
         self._window = Window(np.asarray(centres_px, dtype=float), shape, grid, 1)
         shifts = self._window.shifts(side)
         separation = (grid - 2 * side) // 4 * 2
-        # Only angles count, so the size of the pupil is free: one metre.
-        self._light = make_light(self.amplitude, 1.0, wavelength_m)
+        self.light = make_light(self.amplitude, diameter_m, wavelength_m)
         roof = Prism(shifts, diameter_px, rooftop).roof_height * np.sqrt(2) / samples
         edge = (grid - 2 * side - separation) // 2
-        self._sensor = make_pyramid(self._light, side, separation, edge, roof)
+        self.sensor = make_pyramid(self.light, side, separation, edge, roof)
         nominal = (side + separation) / 2 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
         extra = (shifts - (grid - side) / 2 - nominal)[np.argsort(_FACES)]
         with quiet():
-            self._sensor.apply_shift_wfs(list(extra[:, 0]), list(-extra[:, 1]))
+            self.sensor.apply_shift_wfs(list(extra[:, 0]), list(-extra[:, 1]))
         self.modulation = modulation
 
     @property
@@ -84,14 +86,14 @@ class OOPAOPyramid:
         self._modulation = modulation
         path = modulation.points * self._unit
         with quiet():
-            self._sensor.user_modulation_path = path.tolist()
+            self.sensor.user_modulation_path = path.tolist()
             # It divides by the number of points in the field and once more in the weighted sum.
-            self._sensor.weight_vector = modulation.weights * len(path) ** 2
-            self._sensor.modulation = float(np.hypot(*path.T).max())
+            self.sensor.weight_vector = modulation.weights * len(path) ** 2
+            self.sensor.modulation = float(np.hypot(*path.T).max())
 
     def frame(
-        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
+        self, opd_m: NDArray[np.floating], image: NDArray[np.floating] | None = None
+    ) -> NDArray[np.floating]:
         """Intensity on the camera, averaged over the modulation.
 
         Parameters
@@ -103,15 +105,15 @@ class OOPAOPyramid:
 
         Returns
         -------
-        ndarray of float32, ``(rows, columns)``
+        ndarray, ``(rows, columns)``, float32 by default
             Sums (but for light beside the region) to the sum of ``amplitude ** 2``.
         """
         if opd_m.shape != self.amplitude.shape:
             raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
-        out = np.zeros(self.shape, np.float32) if image is None else image
-        light = self._light
+        out: NDArray[np.floating] = np.zeros(self.shape, np.float32) if image is None else image
+        light = self.light
         with quiet():
             # '**' starts a new propagation; '*' alone would add to the last one.
-            light.source**light.telescope * oopao().OPD_map(np.asarray(opd_m, dtype=float)) * self._sensor
-            self._window.add(np.asarray(self._sensor.cam.frame) / light.unit, out)
+            light.source**light.telescope * oopao().OPD_map(np.asarray(opd_m, dtype=float)) * self.sensor
+            self._window.add(np.asarray(self.sensor.cam.frame) / light.unit, out)
         return out

@@ -29,7 +29,7 @@ class PyramidOptics:
     path along x moves the image to +x on the pyramid, and that light goes to the right-hand images.
     The images are not mirrored. Conventions as OOPAO's ``Pyramid``, except that a tilt of one
     lambda/D is one wave across the pupil's diameter; OOPAO's is one between the centres of the
-    outermost samples.
+    outermost samples. Not for two threads at a time, though it uses two itself.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ class Window:
         middles = (self._centres - self.first + 0.5) * self._samples - 0.5
         return np.asarray(middles - (n - 1) / 2)
 
-    def add(self, power: NDArray[np.floating], image: NDArray[np.float32]) -> None:
+    def add(self, power: NDArray[np.floating], image: NDArray[np.floating]) -> None:
         """Add the part of ``power`` that lies on the region to ``image``, samples summed to pixels."""
         part, s = power[self._part], self._samples
         if s > 1:

@@ -102,7 +102,7 @@ class PyramidModel:
         self._coupling = config.devices.dm.coupling
         self._modulation = modulation or Modulation.circle(pupils.modulation)
         if turbulence is None:
-            turbulence = strength(self._optics(), pupils, _OUTER_SCALE)
+            turbulence = strength(self.optics(), pupils, _OUTER_SCALE)
         self.turbulence = turbulence if turbulence >= _CALM else 0.0
         sigma = self._pitch / np.sqrt(2 * np.log(1 / self._coupling))
         self._nodes, self._carry = surface_nodes(pupil.coordinates_m, sigma)
@@ -193,7 +193,7 @@ class PyramidModel:
             carry=self._carry, samples=samples, local=pupils.normalisation == "local",
         ).by_phase  # fmt: skip
 
-    def _optics(self) -> PyramidOptics:
+    def optics(self) -> PyramidOptics:
         """The sensor of the design, with the images where they were found."""
         return PyramidOptics(
             self._pupil.amplitude, float(self._pupil.n_sub), self._config.system.wavelength_m,
