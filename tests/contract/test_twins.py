@@ -28,7 +28,9 @@ def slaved_camera() -> Any:
     config = configuration("razor-pywfs")
     with sim_modulator.make_modulator("modulator", config, shared) as stage:
         turning = stage.modulate(Modulation(1.4e-4, 303.0))
-    devices.shared_bench(config, shared).beam_circle.modulation = turning
+    bench = devices.shared_bench(config, shared)
+    bench.beam_circle.modulation = turning
+    bench.plates.inserted = False
     return devices.make_wfs_camera("wfs", config, shared)
 
 
@@ -39,7 +41,6 @@ TWINS: dict[str, Factory] = {
     "sim-science": partial(fresh, devices.make_science_camera, "science"),
     "sim-screen": partial(fresh, devices.make_screen, "screen"),
     "sim-e727": partial(fresh, sim_modulator.make_modulator, "modulator", "razor-pywfs"),
-    "sim-ximea-pyramid": partial(fresh, devices.make_wfs_camera, "wfs", "razor-pywfs"),
     "sim-ximea-slaved": slaved_camera,
 }
 
