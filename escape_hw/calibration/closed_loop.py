@@ -19,6 +19,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, next_frame, some_frames
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, IncompatibleProduct
+from escape_hw.pipeline.design_psf import design_psf
 from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.integrator import LeakyIntegrator, gain_limit
 from escape_hw.pipeline.reconstructor import reconstructor
@@ -53,6 +54,9 @@ class _Record:
 def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32]]:
     """Mean PSF with a flat mirror and no turbulence in the beam (paper: the empirical model).
 
+    Under a sky that cannot be switched off (``devices.science.model_psf = "design"``) it is the
+    diffraction image of the design's pupil, and no frame is taken.
+
     Raises
     ------
     CalibrationError
@@ -62,6 +66,11 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
     science = bench.science
     if science is None:
         raise CalibrationError("this system has no science camera to take a PSF with")
+    config = bench.config.devices.science
+    if config is not None and config.model_psf == "design":
+        _, pupil, pixel_m = bench.model().influence_functions()
+        across = bench.config.system.pupil_m / pixel_m
+        return design_psf(pupil, across, config.psf_px, (config.region[3], config.region[2]))
     bench.dm.flatten()
     science.stop()
     wait = bench.config.devices.science.timeout_s if bench.config.devices.science else 1.0

@@ -151,6 +151,11 @@ class ScienceConfig(CameraConfig):
     """The science camera, which sees the point-spread function."""
 
     psf_px: float = Field(ge=0.5, le=100, description="lambda/D in camera pixels")
+    model_psf: Literal["measured", "design"] = Field(
+        "measured",
+        description="what Strehl ratios refer to: an image 'measured' without turbulence, or the 'design' "
+        "pupil's where the turbulence cannot be taken out",
+    )
 
 
 class ModulatorConfig(DeviceConfig):

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from escape_hw.api.device import Device
+from escape_hw.api.modulator import ModulatorInfo
 from escape_hw.api.screen import ScreenInfo
 from escape_hw.errors import SettingRejected
 from escape_hw.testing import modulator_checks, screen_checks
@@ -55,6 +56,7 @@ def repairs_screen(self: Any, **change: Any) -> Any:
 
 
 BROKEN: list[Broken] = [
+    ("no limit", QuantisedModulator, "modulator_info", {"info": ModulatorInfo("x", "1", 1e-9, True)}),
     ("check moves", QuantisedModulator, "modulator_check_changes_nothing", {"_check": checks_by_moving}),
     ("any modulation", QuantisedModulator, "modulator_refuses_meaningless", {"check": takes_all}),
     ("modulate lies", QuantisedModulator, "modulator_tells_the_truth", {"modulate": modulates_as_asked}),
