@@ -169,6 +169,9 @@ def sprint(
     set: options.Set = None,
     seed: options.Seed = None,
     mode: options.Mode = None,
+    light: Annotated[
+        bool, typer.Option("--light", help="Gain and registration only; quick, for a mirror like its model.")
+    ] = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -176,10 +179,10 @@ def sprint(
     with session("sprint", json=json, quiet=quiet) as one:
         config = one.configured(options.Choice.of(system, set, seed, mode))
         with one.run_folder(config, "sprint", out) as folder:
-            _sprint(one, folder, config, im)
+            _sprint(one, folder, config, im, light)
 
 
-def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
+def _sprint(one: Session, folder: RunFolder, config: Any, im: Path, light: bool) -> None:
     from dataclasses import replace
 
     from escape_hw.calibration.sprint import sprint
@@ -207,6 +210,7 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
         model,
         modes=min(settings.sprint_modes, measured.n_modes),
         learning_rate=settings.learning_rate,
+        misfit=not light,
     )
     result = replace(product.result, matrix=measured, measured=None, registration=estimate)
     origin = replace(config_record(config), parents={im.name: product.sha256})
