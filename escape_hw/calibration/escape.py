@@ -120,17 +120,15 @@ def escape(
         )
     except Aborted:
         return replace(measured, partial=True)
-    # The matrix's own gain errs for all modes alike, which no fit to it can tell.
-    gain = estimate.gain
-    estimate = replace(
-        estimate, gain=replace(gain, sigma=float(np.hypot(gain.sigma, gain.value * run.solution.gain_sigma)))
-    )
     made = synthesise(bench, measured.grid, estimate, measured.matrix.m2c)
     metrics = {**measured.matrix.metrics, **made.matrix.metrics}
+    # What errs for all of the measured matrix alike no fit to it can tell.
+    gain = estimate.gain
+    whole = float(np.hypot(gain.sigma, gain.value * run.solution.gain_sigma))
     return replace(
         measured,
         matrix=replace(made.matrix, metrics=metrics),
-        registration=estimate,
+        registration=replace(estimate, gain=replace(gain, sigma=whole)),
         measured=measured.matrix,
         notes=(*measured.notes, *estimate.warnings),
     )
