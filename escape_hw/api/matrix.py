@@ -18,8 +18,8 @@ class InteractionMatrix:
     data
         ``(n_slopes, n_modes)``, slopes per unit mode (paper Eq. s = D c).
     sigma
-        Standard error of every element, same shape, beside what a common gain adds: a matrix measured
-        by DO-CRIME gives the relative standard error of that as ``metrics["gain_sigma"]``.
+        Standard error of every element, same shape, beside what a common gain adds: a matrix that rests
+        on DO-CRIME gives the relative standard error of that as ``metrics["gain_sigma"]``.
     m2c
         Mode-to-command matrix ``(n_act, n_modes)``; columns have unit rms surface over the pupil.
     valid

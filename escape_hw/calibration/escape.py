@@ -82,13 +82,12 @@ def escape(
         )
     except Aborted:
         return replace(measured, partial=True)
-    estimate = _with_gain_error(estimate, solution.gain_sigma)
     made = synthesise(bench, measured.grid, estimate, measured.matrix.m2c)
     metrics = {**measured.matrix.metrics, **made.matrix.metrics}
     return replace(
         measured,
         matrix=replace(made.matrix, metrics=metrics),
-        registration=estimate,
+        registration=_with_gain_error(estimate, solution.gain_sigma),
         measured=measured.matrix,
         notes=(*measured.notes, *estimate.warnings),
     )
