@@ -29,6 +29,7 @@ from escape_hw.config.load import load_system
 ACROSS = (10, 20, 40, 60, 80)
 LAYOUTS = (11, 21, 37, 55, 71, 80)
 RADII = (1, 2, 3, 5, 8)
+PYRAMID_ACROSS = (16, 32, 64, 80)
 #: Lenslets across while the actuators grow, and camera pixels per lenslet.
 LENSLETS, PIXELS = 40, 8
 WHO = ("ours", "OOPAO")
@@ -65,7 +66,10 @@ def points() -> list[Point]:
         return out
     still = ("twin.substeps=1", "twin.loss_probability=0")
     out += [Point("modulation", r, "razor-pywfs", (*still, f"sensor.modulation={r}")) for r in RADII]
-    return [*out, Point("pyramid pixels across", 80, "razor-pywfs", (*still, *_pyramid(80)))]
+    return [
+        *out,
+        *(Point("pyramid pixels across", n, "razor-pywfs", (*still, *_pyramid(n))) for n in PYRAMID_ACROSS),
+    ]
 
 
 def _shack_hartmann(n: int, across: int) -> tuple[str, ...]:
@@ -117,7 +121,12 @@ def measure(system: str, overrides: tuple[str, ...], who: str, seconds: float) -
             call()
             times.append(time.perf_counter() - start)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"frame_s": float(np.median(times)), "set_up_s": set_up, "peak_mb": peak, "frames": len(times)}
+    return {
+        "frame_s": float(np.median(times)),
+        "set_up_s": set_up,
+        "peak_mb": peak,
+        "load": os.getloadavg()[0],
+    }
 
 
 def run_point(point: Point, who: str, limit: float, seconds: float) -> dict[str, object]:
@@ -234,7 +243,11 @@ def table(rows: list[dict[str, object]]) -> str:
             x, y = curves(rows, series, who, "frame_s")
             if x.size > 2:
                 fits.append(f"{series}, {who}: {slope(x, y):.2f}")
-    return "\n".join([*lines, "", "Exponents over the upper half of each range: " + "; ".join(fits) + "."])
+    loads = [float(r["load"]) for r in rows if "load" in r]
+    load = f" Load average {min(loads):.1f} to {max(loads):.1f}." if loads else ""
+    return "\n".join(
+        [*lines, "", "Exponents over the upper half of each range: " + "; ".join(fits) + "." + load]
+    )
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
@@ -116,7 +117,9 @@ class OopaoPeer:
         solver = self._solver
         if solver is None:
             raise RuntimeError("set_up() comes first")
-        with quiet():
+        # Where it diverges it divides by zero; what comes of that is counted, not printed.
+        with quiet(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
             solver.estimate(self._parts, data, n_iteration=iterations, precision=6, display=False, plot=False)
         x, y, rotation, radial, tangential = solver.mis_registration_buffer[-1]
         per_cent = 100 / self._sub_aperture
