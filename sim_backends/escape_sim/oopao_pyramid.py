@@ -69,11 +69,11 @@ class OOPAOPyramid:
         self.light = make_light(self.amplitude, diameter_m, wavelength_m)
         roof = Prism(shifts, diameter_px, rooftop).roof_height * np.sqrt(2) / samples
         edge = (grid - 2 * side - separation) // 2
-        self._sensor = make_pyramid(self.light, side, separation, edge, roof)
+        self.sensor = make_pyramid(self.light, side, separation, edge, roof)
         nominal = (side + separation) / 2 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
         extra = (shifts - (grid - side) / 2 - nominal)[np.argsort(_FACES)]
         with quiet():
-            self._sensor.apply_shift_wfs(list(extra[:, 0]), list(-extra[:, 1]))
+            self.sensor.apply_shift_wfs(list(extra[:, 0]), list(-extra[:, 1]))
         self.modulation = modulation
 
     @property
@@ -86,10 +86,10 @@ class OOPAOPyramid:
         self._modulation = modulation
         path = modulation.points * self._unit
         with quiet():
-            self._sensor.user_modulation_path = path.tolist()
+            self.sensor.user_modulation_path = path.tolist()
             # It divides by the number of points in the field and once more in the weighted sum.
-            self._sensor.weight_vector = modulation.weights * len(path) ** 2
-            self._sensor.modulation = float(np.hypot(*path.T).max())
+            self.sensor.weight_vector = modulation.weights * len(path) ** 2
+            self.sensor.modulation = float(np.hypot(*path.T).max())
 
     def frame(
         self, opd_m: NDArray[np.floating], image: NDArray[np.floating] | None = None
@@ -114,6 +114,6 @@ class OOPAOPyramid:
         light = self.light
         with quiet():
             # '**' starts a new propagation; '*' alone would add to the last one.
-            light.source**light.telescope * oopao().OPD_map(np.asarray(opd_m, dtype=float)) * self._sensor
-            self._window.add(np.asarray(self._sensor.cam.frame) / light.unit, out)
+            light.source**light.telescope * oopao().OPD_map(np.asarray(opd_m, dtype=float)) * self.sensor
+            self._window.add(np.asarray(self.sensor.cam.frame) / light.unit, out)
         return out

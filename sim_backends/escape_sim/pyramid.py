@@ -29,7 +29,7 @@ class PyramidOptics:
     path along x moves the image to +x on the pyramid, and that light goes to the right-hand images.
     The images are not mirrored. Conventions as OOPAO's ``Pyramid``, except that a tilt of one
     lambda/D is one wave across the pupil's diameter; OOPAO's is one between the centres of the
-    outermost samples.
+    outermost samples. Not for two threads at a time, though it uses two itself.
 
     Parameters
     ----------

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from small_pyramid import configuration
 
 from escape_sim.fourier_filter import good_length
+from escape_sim.geometry import pupil_geometry
 from escape_sim.modulation import Modulation
 from escape_sim.oopao_bridge import make_light, make_pyramid, oopao, quiet
 from escape_sim.oopao_pyramid import OOPAOPyramid
 from escape_sim.prism import Prism
 from escape_sim.pyramid import PyramidOptics
+from escape_sim.sensor_optics import ModulatedOptics, make_sensor_optics
 
 WAVELENGTH = 635e-9
 #: Single precision of the fast optics, relative to the brightest pixel.
@@ -117,6 +120,18 @@ def test_the_twin_sees_the_same_frames_with_oopao_inside(n_px, centres, shape, m
             ours, theirs = fast.frame(opd), slow.frame(opd)
             assert ours.shape == theirs.shape == shape
             assert np.abs(ours - theirs).max() < TOLERANCE * theirs.max()
+
+
+def test_one_key_puts_oopao_into_the_bench():
+    optics = []
+    for key in ("fast", "oopao"):
+        config = configuration(f"system.optics={key}", "twin.pyramid.rooftop=0.5")
+        optics.append(make_sensor_optics(config, pupil_geometry(config)))
+        assert isinstance(optics[-1], ModulatedOptics)
+        optics[-1].modulation = ELLIPSE
+    fast, slow = (o.frame(turbulence(16, 300e-9)) for o in optics)
+    assert type(optics[0]) is not type(optics[1])
+    assert np.abs(fast - slow).max() < TOLERANCE * slow.max()
 
 
 def test_frames_do_not_accumulate_in_oopao():
