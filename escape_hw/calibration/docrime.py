@@ -21,12 +21,14 @@ from escape_hw.calibration.acquire import (
     some_frames,
 )
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator, DocrimeSolution
+from escape_hw.calibration.sensor_kinds import kind_of
 from escape_hw.calibration.sensor_setup import (
     SETUP_FRAMES,
     extractor,
     modal_basis,
     poke_amplitudes,
     prepare_sensor,
+    refined,
     setup_from_frames,
 )
 from escape_hw.errors import Aborted, TooFewFrames
@@ -61,6 +63,7 @@ class _Session:
     grid: SensorGeometry | None
     setup_frames: int
     correlations: bool
+    long_look: bool
     mean_frame: NDArray[np.float32] | None = None
     slopes_of: SlopeFunction | None = None
     estimator: DocrimeEstimator | None = None
@@ -68,6 +71,8 @@ class _Session:
     light: LightWatch | None = None
     waiting: list[tuple[Frame, NDArray[np.float64]]] = field(default_factory=list)
     taken: int = 0
+    looked: NDArray[np.floating] | None = None
+    looks: int = 0
     kept: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] | None = None
 
     def take(self, frame: Frame, poke: NDArray[np.float64]) -> None:
@@ -108,7 +113,11 @@ class _Session:
         if self.grid is None or self.motion is None:
             raise RuntimeError("the sensor was never set up")
         grid = self.motion.of(self.grid)
-        return grid if self.mean_frame is None else self.motion.references(grid)
+        if self.mean_frame is None:
+            return grid
+        if self.looked is not None:
+            grid = refined(self.bench, grid, (self.looked / self.looks).astype(np.float32))
+        return self.motion.references(grid)
 
     def _feed(self, frame: Frame, poke: NDArray[np.float64]) -> None:
         if self.slopes_of is None or self.motion is None or self.light is None or self.estimator is None:
@@ -116,6 +125,9 @@ class _Session:
         slopes = self.slopes_of(frame.data)
         self.light(self.slopes_of.flux)
         self.motion.add(slopes)
+        if self.long_look:
+            self.looked = frame.data + (0.0 if self.looked is None else self.looked)
+            self.looks += 1
         self.estimator.partial_fit(frame.index, slopes, poke)
         if self.kept is not None:
             self.kept.append((frame.index, slopes, poke))
@@ -155,7 +167,7 @@ def docrime_run(
     to_modes = np.linalg.pinv(m2c)
     session = _Session(
         bench, c.whiten_order if whiten else 0, c.lags, m2c.shape[1], grid, min(SETUP_FRAMES, n_frames),
-        correlations,
+        correlations, kind_of(bench).long_look,
     )  # fmt: skip
     session.kept = [] if record else None
     shortened, partial = 0, False

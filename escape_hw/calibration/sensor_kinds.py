@@ -17,7 +17,7 @@ from escape_hw.bench import Bench
 from escape_hw.config.sensor_models import PyramidSection, ShackHartmannSection
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.pipeline.grid import find_grid
-from escape_hw.pipeline.pyramid_pupils import find_pupils
+from escape_hw.pipeline.pyramid_pupils import find_pupils, refine_pupils
 from escape_hw.pipeline.pyramid_slopes import PyramidSlopes
 from escape_hw.pipeline.slopes import SlopeExtractor
 
@@ -34,10 +34,13 @@ class SensorKind(Protocol):
         What is looked for on its frames, for progress reports.
     source_references
         ``"mean"`` or ``"design"``: the references to take on a calibration source.
+    long_look
+        True when the mean frame of a whole run tells more of the geometry than its first frames do.
     """
 
     sought: str
     source_references: str
+    long_look: bool
 
     def prepare(self, bench: Bench) -> None:
         """Make the sensor ready for frames that mean something."""
@@ -49,6 +52,10 @@ class SensorKind(Protocol):
 
     def find(self, bench: Bench, mean_frame: NDArray[np.float32], references: str) -> SensorGeometry:
         """The geometry on a calibrated mean frame; ``references`` is ``"design"`` or ``"mean"``."""
+        ...
+
+    def refined(self, grid: SensorGeometry, mean_frame: NDArray[np.float32]) -> SensorGeometry:
+        """The geometry, better known by the calibrated mean frame of a run; its slopes stay the same."""
         ...
 
     def extractor(
@@ -64,6 +71,7 @@ class _ShackHartmann:
     sought = "lenslet grid"
     # Lenslets stand regularly; what their spots lack of it is the aberration that a loop should take out.
     source_references = "design"
+    long_look = False
 
     def __init__(self, section: ShackHartmannSection) -> None:
         self._section = section
@@ -85,6 +93,10 @@ class _ShackHartmann:
             references="lattice" if references == "design" else references,
         )
 
+    def refined(self, grid: SensorGeometry, mean_frame: NDArray[np.float32]) -> SensorGeometry:
+        """As it is: the mean slopes of the run already tell all that its mean frame does."""
+        return grid
+
     def extractor(
         self, bench: Bench, grid: SensorGeometry, shape: tuple[int, int], dark: NDArray[np.float32]
     ) -> SlopeExtractor:
@@ -105,6 +117,7 @@ class _Pyramid:
     sought = "pupil images"
     # A pyramid has no lattice to go by; on a source, what the sensor shows is the flat wavefront.
     source_references = "mean"
+    long_look = True
 
     def __init__(self, section: PyramidSection) -> None:
         self._section = section
@@ -136,6 +149,10 @@ class _Pyramid:
             modulation=modulation_in_force(bench),
             references=references,
         )
+
+    def refined(self, grid: SensorGeometry, mean_frame: NDArray[np.float32]) -> PyramidPupils:
+        """Rims on the mean of the whole run: turbulence averages out."""
+        return refine_pupils(mean_frame, of_kind(grid, PyramidPupils))
 
     def extractor(
         self, bench: Bench, grid: SensorGeometry, shape: tuple[int, int], dark: NDArray[np.float32]

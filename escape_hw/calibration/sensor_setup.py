@@ -56,11 +56,19 @@ def setup_from_frames(
     """
     kind = kind_of(bench)
     background = kind.background(mean_frame) if bench.dark is None else 0.0
-    clean = mean_frame - (background if bench.dark is None else bench.dark)
-    if bench.flat is not None:
-        clean = clean / bench.flat
-    grid = kind.find(bench, clean.astype(np.float32), references)
+    grid = kind.find(bench, _calibrated(bench, mean_frame, background), references)
     return SensorSetup(grid.with_background(background), mean_frame)
+
+
+def refined(bench: Bench, grid: SensorGeometry, mean_frame: NDArray[np.float32]) -> SensorGeometry:
+    """A geometry, better known by the mean of all raw frames of a run."""
+    return kind_of(bench).refined(grid, _calibrated(bench, mean_frame, grid.background))
+
+
+def _calibrated(bench: Bench, frame: NDArray[np.float32], background: float) -> NDArray[np.float32]:
+    """A raw frame without dark and flat."""
+    clean = frame - (background if bench.dark is None else bench.dark)
+    return np.asarray(clean if bench.flat is None else clean / bench.flat, np.float32)
 
 
 def extractor(bench: Bench, grid: SensorGeometry) -> SlopeFunction:

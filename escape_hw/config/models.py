@@ -12,7 +12,7 @@ from escape_hw.config.section import Breach, Section, enforce
 from escape_hw.config.sensor_models import AnySensor, PyramidSection, SensorSection
 from escape_hw.config.telescope_models import TelescopeSection
 from escape_hw.config.toml_text import dump_toml
-from escape_hw.config.twin_models import TwinConfig, TwinPyramid
+from escape_hw.config.twin_models import TwinConfig
 from escape_hw.errors import ConfigError
 
 S = TypeVar("S", bound=SensorSection)
@@ -154,9 +154,9 @@ class SystemConfig(Section):
         """What the kind of sensor asks of the other sections."""
         twin = self.twin
         if not isinstance(self.sensor, PyramidSection):
-            if twin.pyramid != TwinPyramid():
-                text = f"is not read with sensor.kind = '{self.sensor.kind}'; remove it"
-                yield Breach("twin.pyramid", twin.pyramid.model_dump(exclude_defaults=True), text)
+            text = f"is not read with sensor.kind = '{self.sensor.kind}'; remove it"
+            for key, value in twin.pyramid.model_dump(exclude_defaults=True).items():
+                yield Breach(f"twin.pyramid.{key}", value, text)
             return
         modulator, radius = self.devices.modulator, self.sensor.modulation
         if radius and modulator is None:

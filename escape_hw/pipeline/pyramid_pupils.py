@@ -23,7 +23,9 @@ _FAINT = 0.1
 _SOFT = 0.45
 #: Half width in pixels of the ring in which a rim is fitted, and harmonics of its brightness.
 _RING, _HARMONICS = 4.0, 6
-_ITERATIONS = 12
+_ITERATIONS, _NARROW = 12, 8
+#: Light that is pressed down to one half before rims are fitted, as a share of the usual one.
+_PRESSED = 1.0
 #: Pixels that come so near to another image (in pixels from its rim) are left out.
 _NEIGHBOUR = 2.0
 
@@ -76,8 +78,7 @@ def find_pupils(
         raise ValueError(f"references is {references!r}; choose 'mean' or 'design'")
     image = np.asarray(mean_frame, dtype=np.float64)
     rough = _search(image, n_sub, np.asarray(nominal_px, float))
-    centres, radius = _fit_rims(image, rough, n_sub / 2)
-    diameter = 2 * radius
+    centres, diameter = _places(image, rough, n_sub)
     _check_fit(centres, rough, diameter, n_sub, image.shape)
     corners = boxes(centres, n_sub)
     light = np.sum([image[y : y + n_sub, x : x + n_sub] for x, y in corners], axis=0)
@@ -103,6 +104,42 @@ def find_pupils(
     return replace(pupils, references=mean.astype(np.float32))
 
 
+def refine_pupils(mean_frame: NDArray[np.float32], pupils: PyramidPupils) -> PyramidPupils:
+    """The pupils with centres and diameter from a longer look.
+
+    Under turbulence the rims fitted on a second of frames may be some tenths of a pixel off. Boxes
+    and mask stay as they are, so slopes keep their meaning; a model wants the centres.
+
+    Parameters
+    ----------
+    mean_frame
+        Mean of frames in counts ``(rows, columns)``, background subtracted.
+    pupils
+        As found before.
+    """
+    image = np.asarray(mean_frame, dtype=np.float64)
+    centres, diameter = _places(image, pupils.centres_px, pupils.valid.shape[0])
+    return replace(pupils, centres_px=centres, diameter_px=diameter)
+
+
+def _places(
+    image: NDArray[np.float64], rough: NDArray[np.float64], n_sub: int
+) -> tuple[NDArray[np.float64], float]:
+    """Centres ``(4, 2)`` and common diameter of the images, from their rims."""
+    centres, radius = _fit_rims(_evened(image), rough, n_sub / 2, n_sub / 2)
+    # Pressed light ends a little late; where it really ends on average, the light itself tells.
+    _, radius = _fit_rims(image, centres, radius, n_sub / 2, _ITERATIONS // 3)
+    return centres, 2 * radius
+
+
+def _evened(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The image with its bright parts pressed down: a rim is to be as steep in bright light as in dim."""
+    lit = image > 0.1 * np.percentile(image, 99)
+    level = _PRESSED * float(np.median(image[lit])) if lit.any() else 1.0
+    light = np.maximum(image, 0.0)
+    return np.asarray(light / (light + level))
+
+
 def _search(image: NDArray[np.float64], n_sub: int, nominal_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rough centres ``(4, 2)``: where a disk is bright and the ring around it is dark."""
     pad = n_sub
@@ -112,7 +149,7 @@ def _search(image: NDArray[np.float64], n_sub: int, nominal_px: NDArray[np.float
     disk, ring = (distance <= radius - 1).astype(float), (distance > radius + 1) & (distance < radius + 4)
     kernel = disk / disk.sum() - ring / ring.sum()
     # The square root evens out what is bright and what is dim within an image.
-    light = np.pad(np.sqrt(np.maximum(image, 0.0)), pad)
+    light = np.pad(np.sqrt(np.maximum(image, 0.0)), pad, mode="edge")
     score = signal.fftconvolve(light, kernel, mode="same")
     centres, contrast = [], []
     reach = max(2, round(_REACH * n_sub))
@@ -134,7 +171,7 @@ def _check_light(
     apart = np.min([np.hypot(columns - x, rows - y) for x, y in nominal_px], axis=0) > 0.75 * n_sub
     rest = np.sqrt(np.maximum(image[apart] if apart.any() else image, 0.0))
     # A disk of noise alone differs from its ring by a small share of the noise of a pixel.
-    noise = 6 * float(rest.std()) / np.sqrt(2 * n_sub)
+    noise = 6 * float(rest.std()) / np.sqrt(2 * n_sub) + 1e-3 * float(rest.mean())
     if not contrast.max() > noise:
         raise CalibrationError(
             "no pupil images on the wavefront sensor, nothing but noise or an even glow; "
@@ -154,13 +191,17 @@ def _check_light(
 
 
 def _fit_rims(
-    image: NDArray[np.float64], rough: NDArray[np.float64], nominal: float
+    image: NDArray[np.float64],
+    rough: NDArray[np.float64],
+    radius: float,
+    nominal: float,
+    iterations: int = _ITERATIONS,
 ) -> tuple[NDArray[np.float64], float]:
     """Centres ``(4, 2)`` and the common radius of the images, from their rims alone."""
-    centres, radius = rough.copy(), nominal
-    for iteration in range(_ITERATIONS):
+    centres = rough.copy()
+    for left in reversed(range(iterations)):
         # A wide ring captures, a narrow one is precise.
-        width = min(_RING * (2 if iteration < _ITERATIONS // 3 else 1), nominal / 2)
+        width = min(_RING * (1 if left < _NARROW else 2), nominal / 2)
         moves = np.array(
             [_rim_step(image, centres, k, radius, width, nominal + _NEIGHBOUR) for k in range(4)]
         )
@@ -197,11 +238,18 @@ def _rim_step(
     steepness = np.exp(-(depth**2) / 2) / (np.sqrt(2 * np.pi) * _SOFT)
     slant = (depth * edge)[:, None] * waves[:, :5]
     known = np.concatenate([waves, waves * edge[:, None], slant], axis=1)
-    shares = np.linalg.lstsq(known, light, rcond=None)[0]
+    shares = _fit(known, light)
     n = waves.shape[1]
     bright = (waves @ shares[n : 2 * n]) * steepness
     moving = np.stack([bright * dx / r, bright * dy / r, bright], axis=1)
-    return np.asarray(np.linalg.lstsq(np.concatenate([known, moving], axis=1), light, rcond=None)[0][-3:])
+    return _fit(np.concatenate([known, moving], axis=1), light)[-3:]
+
+
+def _fit(terms: NDArray[np.float64], light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares of the terms in the light, by the normal equations: few terms, many pixels."""
+    scale = np.sqrt(np.maximum(np.square(terms).sum(axis=0), 1e-30))
+    unit = terms / scale
+    return np.asarray(np.linalg.lstsq(unit.T @ unit, unit.T @ light, rcond=1e-12)[0] / scale)
 
 
 def _harmonics(angle: NDArray[np.float64], order: int) -> NDArray[np.float64]:
@@ -236,8 +284,8 @@ def _check_fit(
 ) -> None:
     """Raise unless the images are whole, round, and of the design's size."""
     low, high = centres - diameter / 2, centres + diameter / 2
-    # Half a pixel lies between a pixel's centre and its edge, and diffraction widens the rest.
-    cut = (low < -2.0).any(axis=1) | (high > np.array(shape[::-1]) + 1.0).any(axis=1)
+    # Half a pixel lies between a pixel's centre and its edge; diffraction takes another half.
+    cut = (low < -1.0).any(axis=1) | (high > np.array(shape[::-1])).any(axis=1)
     if cut.any():
         names = " and ".join(IMAGES[k] for k in np.flatnonzero(cut))
         raise CalibrationError(

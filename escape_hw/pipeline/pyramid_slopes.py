@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -9,7 +11,7 @@ from numpy.typing import NDArray
 from escape_hw.api.pyramid import PyramidPupils
 
 
-def slopes_of_image(image: NDArray[np.floating], pupils: PyramidPupils) -> NDArray[np.float64]:
+def slopes_of_image(image: NDArray[Any], pupils: PyramidPupils) -> NDArray[np.float64]:
     """Slopes ``(n_slopes,)`` of a calibrated image, in plain numpy; see :class:`PyramidPupils`.
 
     Parameters

@@ -25,9 +25,11 @@ def _digitise(value, k, gain, offset, well, top, out):  # type: ignore[no-untype
     value = min(value, well)
     count = max(np.float32(0), value * gain[k] + offset[k])
     level = min(np.int32(count + np.float32(0.5)), np.int32(top))
+    # The pattern is one of sensitivities: whatever its own, a full pixel stands at the top.
+    if full:
+        level = np.int32(top)
     out[k] = level
-    # A pixel of low gain is full before the converter reaches its top.
-    return 1 if full or level == top else 0
+    return 1 if level == top else 0
 
 
 @njit(cache=True, fastmath=True, nogil=True)
