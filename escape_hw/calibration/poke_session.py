@@ -19,7 +19,7 @@ from escape_hw.calibration.sensor_kinds import kind_of
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, refined, setup_from_frames
 from escape_hw.errors import Aborted
 
-#: Seconds of turbulence over which the mean tilt and focus in the references average out well enough.
+#: Seconds of turbulence over which what it leaves in the geometry averages out well enough.
 _REFERENCE_S = 10.0
 
 Record = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
@@ -144,13 +144,10 @@ class PokeSession:
     def notes(self) -> tuple[str, ...]:
         """What to know of the references before closing a loop on them."""
         seconds = self.taken / self.bench.wfs.settings.frame_rate_hz
-        if self.focus is None or seconds >= _REFERENCE_S or self.focus.still() is not None:
+        stands_still = self.focus is not None and self.focus.still() is not None
+        if self.grid is None or self.mean_frame is None or seconds >= _REFERENCE_S or stands_still:
             return ()
-        return (
-            f"the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio "
-            "and which the wind does not explain; the matrix is not touched by it: close the loop on "
-            "references taken over a longer time",
-        )
+        return (self.grid.short_look.format(seconds=seconds),)
 
     def _feed(self, frame: Frame, poke: NDArray[np.float64]) -> None:
         if self.slopes_of is None or self.motion is None or self.light is None:
