@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -54,14 +55,14 @@ class Running:
             self._ended = True
             self._arrived.notify_all()
 
-    def wait_for(self, beginning: str, timeout_s: float = 90.0) -> None:
-        """Wait until a line begins like this."""
+    def wait_for(self, beginning: str, done: int = 0, timeout_s: float = 90.0) -> None:
+        """Wait until a line begins like this and, if it counts (``stage: 7 of 30``), has come to ``done``."""
         with self._arrived:
-            self._arrived.wait_for(lambda: self._ended or self._has(beginning), timeout_s)
-            assert self._has(beginning), "\n".join(self.lines)
+            self._arrived.wait_for(lambda: self._ended or self._has(beginning, done), timeout_s)
+            assert self._has(beginning, done), "\n".join(self.lines)
 
-    def _has(self, beginning: str) -> bool:
-        return any(line.startswith(beginning) for line in self.lines)
+    def _has(self, beginning: str, done: int) -> bool:
+        return any(line.startswith(beginning) and _count(line) >= done for line in self.lines)
 
     def stop(self, *signals: int, pause_s: float = 0.05) -> Ended:
         """Send signals, wait for the end."""
@@ -98,3 +99,8 @@ class Running:
         """Processor time that the process has used so far."""
         fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _count(line: str) -> int:
+    found = re.match(r".*?: (\d+) of \d+", line)
+    return int(found.group(1)) if found else 0
