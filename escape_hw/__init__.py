@@ -23,11 +23,13 @@ if TYPE_CHECKING:
     from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
     from escape_hw.api.matrix import InteractionMatrix
     from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
+    from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
     from escape_hw.api.procedure import Procedure, Progress, Reporter, run
+    from escape_hw.api.pyramid import PyramidPupils
     from escape_hw.api.registration import Registration
     from escape_hw.api.results import CalibrationResult, LoopResult, Measured, RegistrationEstimate
     from escape_hw.api.screen import PhaseScreen, ScreenState
-    from escape_hw.api.sensor import SubApertureGrid
+    from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
     from escape_hw.calibration.closed_loop import best_gain, closed_loop, measure_model_psf
     from escape_hw.calibration.docrime import docrime
     from escape_hw.calibration.escape import escape
@@ -58,19 +60,24 @@ _HOME = {
     "LoopResult": "escape_hw.api.results",
     "Measured": "escape_hw.api.results",
     "MirrorLimits": "escape_hw.safety.limits",
+    "Modulation": "escape_hw.api.modulator",
+    "ModulatorInfo": "escape_hw.api.modulator",
     "PhaseScreen": "escape_hw.api.screen",
     "Procedure": "escape_hw.api.procedure",
     "Progress": "escape_hw.api.procedure",
+    "PyramidPupils": "escape_hw.api.pyramid",
     "Region": "escape_hw.api.frames",
     "Registration": "escape_hw.api.registration",
     "RegistrationEstimate": "escape_hw.api.results",
     "Reporter": "escape_hw.api.procedure",
     "ScreenState": "escape_hw.api.screen",
     "SendReport": "escape_hw.api.mirror",
+    "SensorGeometry": "escape_hw.api.sensor",
     "ShellHealth": "escape_hw.api.adaptive_secondary",
     "ShellState": "escape_hw.api.adaptive_secondary",
     "SubApertureGrid": "escape_hw.api.sensor",
     "System": "escape_hw.runtime.system",
+    "TipTiltModulator": "escape_hw.api.modulator",
     "best_gain": "escape_hw.calibration.closed_loop",
     "bundled_systems": "escape_hw.config.bundled",
     "closed_loop": "escape_hw.calibration.closed_loop",
@@ -104,19 +111,24 @@ __all__ = [
     "LoopResult",
     "Measured",
     "MirrorLimits",
+    "Modulation",
+    "ModulatorInfo",
     "PhaseScreen",
     "Procedure",
     "Progress",
+    "PyramidPupils",
     "Region",
     "Registration",
     "RegistrationEstimate",
     "Reporter",
     "ScreenState",
     "SendReport",
+    "SensorGeometry",
     "ShellHealth",
     "ShellState",
     "SubApertureGrid",
     "System",
+    "TipTiltModulator",
     "__version__",
     "best_gain",
     "bundled_systems",

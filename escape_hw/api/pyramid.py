@@ -60,6 +60,10 @@ class PyramidPupils(SensorGeometry):
     kind: ClassVar[str] = "pyramid"
     slope_unit: ClassVar[str] = "1"
     elements: ClassVar[str] = "pupil pixels"
+    short_look: ClassVar[str] = (
+        "the centres of the pupil images were found in {seconds:.1f} s of turbulence, which may leave them "
+        "some hundredths of a pixel off; the shifts of the registration, which refer to them, are so too"
+    )
 
     centres_px: NDArray[np.float64]
     diameter_px: float

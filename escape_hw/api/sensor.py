@@ -30,6 +30,8 @@ class SensorGeometry(abc.ABC):
         Unit of the slopes, as products state it.
     elements
         What its sub-apertures are called, in the plural.
+    short_look
+        What a short run under turbulence leaves in the geometry, for a note.
     valid
         Valid sub-apertures, boolean ``(n_rows, n_columns)``.
     flux
@@ -45,6 +47,7 @@ class SensorGeometry(abc.ABC):
     kind: ClassVar[str]
     slope_unit: ClassVar[str]
     elements: ClassVar[str]
+    short_look: ClassVar[str]
 
     valid: NDArray[np.bool_]
     flux: NDArray[np.float32]
@@ -149,6 +152,10 @@ class SubApertureGrid(SensorGeometry):
     kind: ClassVar[str] = "shack-hartmann"
     slope_unit: ClassVar[str] = "pixel"
     elements: ClassVar[str] = "sub-apertures"
+    short_look: ClassVar[str] = (
+        "the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio; "
+        "the matrix is not touched by it: close the loop on references taken over a longer time"
+    )
 
     pitch_px: float
     origin_px: tuple[float, float]

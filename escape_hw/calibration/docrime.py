@@ -33,7 +33,7 @@ from escape_hw.calibration.sensor_setup import (
 )
 from escape_hw.errors import Aborted, TooFewFrames
 
-#: Seconds of turbulence over which the mean tilt and focus in the references average out well enough.
+#: Seconds of turbulence over which what it leaves in the geometry averages out well enough.
 _REFERENCE_S = 10.0
 
 Record = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
@@ -210,10 +210,7 @@ def docrime_run(
         notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
     seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
     if session.mean_frame is not None and seconds < _REFERENCE_S:
-        notes.append(
-            f"the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio; "
-            "the matrix is not touched by it: close the loop on references taken over a longer time"
-        )
+        notes.append(session.grid.short_look.format(seconds=seconds))
     result = CalibrationResult(
         matrix,
         session.finished_grid(),

@@ -70,7 +70,7 @@ class System(Bench):
             return run_procedure(procedure, observers=(*observers, view), abort=abort)
 
     def find_sensor(self, *, frames: int = 200, progress: bool = False) -> SensorSetup:
-        """Watch the sensor and find its lenslet grid; the mirror stays as it is.
+        """Watch the sensor and find its geometry; the mirror stays as it is.
 
         Parameters
         ----------
@@ -82,14 +82,14 @@ class System(Bench):
         Raises
         ------
         CalibrationError
-            No spots where the design says there should be.
+            No spots or pupil images where the design says there should be.
         """
         from escape_hw.calibration.sensor_setup import find_sensor
 
         return self.run(find_sensor(self, frames=frames), progress=progress)
 
     def slopes_of(self, grid: SensorGeometry) -> SlopeFunction:
-        """A function that takes ``frame.data`` and returns slopes ``(n_slopes,)`` in pixels.
+        """A function that takes ``frame.data`` and returns slopes ``(n_slopes,)``.
 
         Parameters
         ----------

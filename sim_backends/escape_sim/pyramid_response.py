@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from escape_hw.api.threads import hold_to_one_thread
 from escape_sim.modulation import Modulation
 from escape_sim.prism import Prism, frequencies
 from escape_sim.pyramid_beams import Beams, Points, Turbulent, coherence
@@ -129,7 +130,8 @@ def slope_response(
         beams = [Turbulent(light, spread, mean) for _ in range(_WORKERS)]
     job = _Job(spread, light, _spans(light), at, samples, carry, sums)
     parts = np.array_split(np.arange(len(places)), _WORKERS)
-    with ThreadPoolExecutor(_WORKERS) as pool:
+    # The workers multiply matrices too, each for itself.
+    with hold_to_one_thread(), ThreadPoolExecutor(_WORKERS) as pool:
         for done in [pool.submit(job.run, beams[k], part, k) for k, part in enumerate(parts)]:
             done.result()
     return sums.normalised(local)
