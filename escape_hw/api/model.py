@@ -73,6 +73,19 @@ class SyntheticModel(Protocol):
 
 
 @runtime_checkable
+class DoubtfulModel(Protocol):
+    """A model whose place on the sensor is itself known with an error only."""
+
+    @property
+    def registration_doubt(self) -> NDArray[np.float64]:
+        """Standard errors of where the registration counts from ``(5,)``, in its units.
+
+        No matrix shows them; SPRINT adds them to its errors.
+        """
+        ...
+
+
+@runtime_checkable
 class DifferentiableModel(SyntheticModel, Protocol):
     """A synthetic model that also gives few modes at a time, and its derivatives in closed form.
 

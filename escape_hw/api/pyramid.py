@@ -55,6 +55,9 @@ class PyramidPupils(SensorGeometry):
         ``"global"`` or ``"local"``.
     modulation
         Radius of the modulation in lambda/D during the measurement.
+    centre_sigma_px
+        Standard error of the mean of the four centres along an axis; 0 if unknown. A mirror's shift
+        counts from there.
     """
 
     kind: ClassVar[str] = "pyramid"
@@ -76,6 +79,7 @@ class PyramidPupils(SensorGeometry):
     background: float = 0.0
     normalisation: str = "global"
     modulation: float = 0.0
+    centre_sigma_px: float = 0.0
 
     def with_background(self, counts: float) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_background`."""

@@ -25,6 +25,9 @@ from escape_hw.calibration.sensor_setup import (
 from escape_hw.config.models import CalibrationSection
 from escape_hw.errors import Aborted, TooFewFrames
 
+#: Slopes up to which the correlation of their noise is followed.
+MOST_CORRELATED = 3000
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DocrimeRun:
@@ -51,7 +54,8 @@ def docrime_run(
 ) -> Procedure[DocrimeRun]:
     """As :func:`docrime`, with the solution beside the matrix, and with the telemetry if asked for.
 
-    The solution knows how the noise of the slopes is correlated unless ``correlations`` is false.
+    The solution knows how the noise of the slopes is correlated unless ``correlations`` is false, or
+    there are more than :data:`MOST_CORRELATED` slopes.
     """
     c = bench.config.calibration
     n_frames = c.frames if frames is None else some_frames(frames)
@@ -62,7 +66,9 @@ def docrime_run(
     order, lags = c.whiten_order if whiten else 0, c.lags
 
     def estimator(n_slopes: int) -> DocrimeEstimator:
-        return DocrimeEstimator(n_slopes, m2c.shape[1], order=order, lags=lags, correlations=correlations)
+        # Their number squared: with as many slopes as a pyramid has, gigabytes.
+        known = correlations and n_slopes <= MOST_CORRELATED
+        return DocrimeEstimator(n_slopes, m2c.shape[1], order=order, lags=lags, correlations=known)
 
     session = PokeSession(bench, m2c, grid, min(SETUP_FRAMES, n_frames), estimator, keep=record)
     partial = yield from session.poke(n_frames, amplitude)

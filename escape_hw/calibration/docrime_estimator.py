@@ -47,7 +47,7 @@ class DocrimeSolution:
         ``(n_slopes, n_modes)``: slopes per unit mode, and standard errors of single elements beside a
         gain that they share.
     covariance
-        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; diagonal where
+        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; ``None`` where
         correlations were not asked for.
     gram
         Sum over frames of filtered pokes times filtered pokes ``(n_modes, n_modes)``.
@@ -63,7 +63,7 @@ class DocrimeSolution:
     matrix: NDArray[np.float64]
     sigma: NDArray[np.float64]
     response: TemporalResponse
-    covariance: NDArray[np.float64]
+    covariance: NDArray[np.float64] | None
     gram: NDArray[np.float64]
     variance: NDArray[np.float64]
     whitener: NDArray[np.float64]
@@ -215,9 +215,9 @@ class DocrimeEstimator:
         if self.order:
             rows, power = sums.sample(matrix)
             require_response(sums.gram, rows, power / freedom, self.lags)
-        covariance = sums.residual_power(matrix) / freedom
-        covariance = covariance if covariance.ndim == 2 else np.diag(covariance)
-        variance = np.maximum(np.diag(covariance), 0.0) * self._spread
+        residual = sums.residual_power(matrix) / freedom
+        covariance = residual if residual.ndim == 2 else None
+        variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * self._spread
         sigma = np.outer(np.sqrt(variance), np.sqrt(sums.inverse_diagonal()))
         scale = self._tracker.scale()
         return DocrimeSolution(

@@ -22,6 +22,9 @@ from escape_hw.errors import Aborted
 #: Seconds of turbulence over which what it leaves in the geometry averages out well enough.
 _REFERENCE_S = 10.0
 
+#: Parts of a run whose mean frames are compared.
+_LOOKS = 6
+
 Record = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -59,9 +62,10 @@ class PokeSession:
     light: LightWatch | None = None
     waiting: list[tuple[Frame, NDArray[np.float64]]] = field(default_factory=list)
     taken: int = 0
+    fed: int = 0
     shortened: int = 0
-    looked: NDArray[np.floating] | None = None
-    looks: int = 0
+    planned: int = 0
+    looked: dict[int, tuple[NDArray[np.floating], int]] = field(default_factory=dict)
     kept: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] = field(default_factory=list)
 
     def poke(self, frames: int, amplitude: NDArray[np.float64]) -> Procedure[bool]:
@@ -80,6 +84,7 @@ class PokeSession:
             Whether it was stopped early.
         """
         bench, to_modes = self.bench, np.linalg.pinv(self.m2c)
+        self.planned = frames
         report = Reporter("DO-CRIME", frames)
         try:
             bench.dm.flatten()
@@ -137,8 +142,9 @@ class PokeSession:
         grid = self.motion.of(self.grid)
         if self.mean_frame is None:
             return grid
-        if self.looked is not None:
-            grid = refined(self.bench, grid, (self.looked / self.looks).astype(np.float32))
+        if self.looked:
+            means = [(total / count).astype(np.float32) for total, count in self.looked.values()]
+            grid = refined(self.bench, grid, means)
         return self.motion.references(grid, self.focus)
 
     def notes(self) -> tuple[str, ...]:
@@ -158,8 +164,10 @@ class PokeSession:
         if self.focus is not None:
             self.focus.add(slopes)
         if kind_of(self.bench).long_look:
-            self.looked = frame.data + (0.0 if self.looked is None else self.looked)
-            self.looks += 1
+            part = min(self.fed * _LOOKS // max(self.planned, 1), _LOOKS - 1)
+            total, count = self.looked.get(part, (np.zeros(frame.data.shape), 0))
+            self.looked[part] = total + frame.data, count + 1
+        self.fed += 1
         if self.estimator is not None:
             self.estimator.partial_fit(frame.index, slopes, poke)
         if self.keep:

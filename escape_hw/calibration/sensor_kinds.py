@@ -5,6 +5,7 @@ This is the only place of the core that tells kinds of sensors apart by their co
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -54,8 +55,8 @@ class SensorKind(Protocol):
         """The geometry on a calibrated mean frame; ``references`` is ``"design"`` or ``"mean"``."""
         ...
 
-    def refined(self, grid: SensorGeometry, mean_frame: NDArray[np.float32]) -> SensorGeometry:
-        """The geometry, better known by the calibrated mean frame of a run; its slopes stay the same."""
+    def refined(self, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]) -> SensorGeometry:
+        """The geometry, better known by calibrated mean frames of a run's parts; its slopes stay the same."""
         ...
 
     def extractor(
@@ -93,7 +94,7 @@ class _ShackHartmann:
             references="lattice" if references == "design" else references,
         )
 
-    def refined(self, grid: SensorGeometry, mean_frame: NDArray[np.float32]) -> SensorGeometry:
+    def refined(self, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]) -> SensorGeometry:
         """As it is: the mean slopes of the run already tell all that its mean frame does."""
         return grid
 
@@ -150,9 +151,9 @@ class _Pyramid:
             references=references,
         )
 
-    def refined(self, grid: SensorGeometry, mean_frame: NDArray[np.float32]) -> PyramidPupils:
+    def refined(self, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]) -> PyramidPupils:
         """Rims on the mean of the whole run: turbulence averages out."""
-        return refine_pupils(mean_frame, of_kind(grid, PyramidPupils))
+        return refine_pupils(means, of_kind(grid, PyramidPupils))
 
     def extractor(
         self, bench: Bench, grid: SensorGeometry, shape: tuple[int, int], dark: NDArray[np.float32]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,9 +61,9 @@ def setup_from_frames(
     return SensorSetup(grid.with_background(background), mean_frame)
 
 
-def refined(bench: Bench, grid: SensorGeometry, mean_frame: NDArray[np.float32]) -> SensorGeometry:
-    """A geometry, better known by the mean of all raw frames of a run."""
-    return kind_of(bench).refined(grid, _calibrated(bench, mean_frame, grid.background))
+def refined(bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]) -> SensorGeometry:
+    """A geometry, better known by the mean raw frames of a run's parts."""
+    return kind_of(bench).refined(grid, [_calibrated(bench, mean, grid.background) for mean in means])
 
 
 def _calibrated(bench: Bench, frame: NDArray[np.float32], background: float) -> NDArray[np.float32]:

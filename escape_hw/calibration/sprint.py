@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.model import SyntheticModel
+from escape_hw.api.model import DoubtfulModel, SyntheticModel
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, SprintIteration
@@ -285,6 +285,8 @@ def _estimate(
 ) -> RegistrationEstimate:
     residual = found.system.residual
     covariance = sandwich(weighted, found.system, noise)
+    if isinstance(model, DoubtfulModel):
+        covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(model.registration_doubt)
     warnings = []
     if not found.settled:
         warnings.append(f"the steps did not shrink within {len(history)} iterations")

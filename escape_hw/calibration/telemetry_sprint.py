@@ -21,6 +21,7 @@ from escape_hw.api.procedure import Procedure
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.docrime import MOST_CORRELATED
 from escape_hw.calibration.response import Filtered, filtered
 from escape_hw.calibration.sprint import sprint_steps
 from escape_hw.calibration.telemetry import Telemetry
@@ -50,7 +51,8 @@ class TelemetryFit:
     whitener
         The filter over time.
     covariance
-        Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``, shrunk towards its diagonal.
+        Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``, shrunk towards its diagonal;
+        ``None`` with more than :data:`~escape_hw.calibration.docrime.MOST_CORRELATED` slopes.
     rows
         Whitened frames that it rests on.
     """
@@ -58,7 +60,7 @@ class TelemetryFit:
     estimate: RegistrationEstimate
     response: TemporalResponse
     whitener: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    covariance: NDArray[np.float64] | None
     rows: int
 
 
@@ -168,14 +170,15 @@ def telemetry_sprint(
         seen = block.pokes_through(response.weights).astype(float)
         slopes, seen = slopes - slopes.mean(axis=0), seen - seen.mean(axis=0)
         left = slopes if matrix is None else slopes - seen @ matrix.T
-        covariance = _shrunk(left)
+        variance = np.square(left).mean(axis=0)
+        covariance = _shrunk(left) if left.shape[1] <= MOST_CORRELATED else None
         gram = seen.T @ seen
         measured = replace(
             frame,
             data=(slopes.T @ seen @ np.linalg.pinv(gram, rcond=_LEAST, hermitian=True)).astype(np.float32),
             sigma=np.zeros(frame.data.shape, np.float32),
         )
-        columns = independent_columns(measured, gram, np.diag(covariance))
+        columns = independent_columns(measured, gram, variance)
         estimate = yield from sprint_steps(
             columns, model, start=start, learning_rate=learning_rate, covariance=covariance,
             reach=start is None,

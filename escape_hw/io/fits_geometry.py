@@ -92,6 +92,7 @@ def _pack_pupils(geometry: SensorGeometry) -> _Packed:
     cards = {
         "DIAMETER": float(pupils.diameter_px),
         "MOTION": float(pupils.motion),
+        "CENTRESD": float(pupils.centre_sigma_px),
         "NORMAL": fits_file.plain(pupils.normalisation),
         "MODULAT": float(pupils.modulation),
     }
@@ -116,6 +117,7 @@ def _unpack_pupils(
         corners_px=np.stack([table["CORNERX"], table["CORNERY"]], axis=1).astype(np.intp),
         references=references,
         motion=float(header["MOTION"]),
+        centre_sigma_px=float(header["CENTRESD"]),
         normalisation=str(header["NORMAL"]),
         modulation=float(header["MODULAT"]),
         **common,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -104,22 +105,28 @@ def find_pupils(
     return replace(pupils, references=mean.astype(np.float32))
 
 
-def refine_pupils(mean_frame: NDArray[np.float32], pupils: PyramidPupils) -> PyramidPupils:
-    """The pupils with centres and diameter from a longer look.
+def refine_pupils(means: Sequence[NDArray[np.float32]], pupils: PyramidPupils) -> PyramidPupils:
+    """The pupils with centres and diameter from a longer look, and with the error of their mean place.
 
     Under turbulence the rims fitted on a second of frames may be some tenths of a pixel off. Boxes
     and mask stay as they are, so slopes keep their meaning; a model wants the centres.
 
     Parameters
     ----------
-    mean_frame
-        Mean of frames in counts ``(rows, columns)``, background subtracted.
+    means
+        Means of equally many frames in counts ``(rows, columns)``, background subtracted, one after
+        the other in time; the scatter from one to the next tells the error.
     pupils
         As found before.
     """
-    image = np.asarray(mean_frame, dtype=np.float64)
-    centres, diameter = _places(image, pupils.centres_px, pupils.valid.shape[0])
-    return replace(pupils, centres_px=centres, diameter_px=diameter)
+    n_sub = pupils.valid.shape[0]
+    image = np.asarray(np.mean(means, axis=0), np.float64)
+    centres, diameter = _places(image, pupils.centres_px, n_sub)
+    sigma = 0.0
+    if len(means) > 1:
+        parts = [_places(np.asarray(part, np.float64), centres, n_sub)[0].mean(axis=0) for part in means]
+        sigma = float(np.sqrt(np.mean(np.var(parts, axis=0, ddof=1)) / len(parts)))
+    return replace(pupils, centres_px=centres, diameter_px=diameter, centre_sigma_px=sigma)
 
 
 def _places(

@@ -109,7 +109,7 @@ def run_plant(
                     continue
                 errors[e, f] = found.registration.to_array() - plant.to_array()
                 sigmas[e, f] = found.sigma
-                if order and count == max(frames):
+                if order and count == max(frames) and solution.covariance is not None:
                     bound = registration_bound(matrix, solution.covariance, model, found.registration)
         for f, count in enumerate(frames):
             # Frames of its own: a run this short must find the sensor's geometry on them as well.

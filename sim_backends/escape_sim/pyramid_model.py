@@ -122,6 +122,12 @@ class PyramidModel:
         """Size of a pixel of the pupil image in metres."""
         return self._pupil.sub_aperture_m
 
+    @property
+    def registration_doubt(self) -> NDArray[np.float64]:
+        """The error of the pupil images' mean place, see :class:`DoubtfulModel`."""
+        shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
+        return np.array([shift, shift, 0.0, 0.0, 0.0])
+
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
         x = self._pupil.coordinates_m
