@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
+from escape_hw.calibration.derivatives import modal_jacobian
 
-_STEPS = (1.0, 1.0, 0.05, 0.1, 0.1)
 #: Share of the diagonal mixed into the noise covariance, so that few frames leave it invertible.
 _SHRINKAGE = 0.05
 
@@ -41,16 +41,9 @@ def registration_bound(
     variance = np.diag(covariance)
     excitation = np.mean(variance[:, None] / np.square(matrix.sigma, dtype=float), axis=0)
     mixed = (1 - _SHRINKAGE) * covariance + _SHRINKAGE * np.diag(variance)
-    alpha = registration.to_array()
-    unit = model.zonal_matrix(registration) @ matrix.m2c
+    unit, derivatives = modal_jacobian(model, registration, matrix.m2c)
     gain = float(np.vdot(unit, matrix.data) / np.vdot(unit, unit))
-    parts = [unit]
-    for k, step in enumerate(_STEPS):
-        plus, minus = (
-            model.zonal_matrix(Registration.from_array(alpha + s * step * np.eye(5)[k])) for s in (1, -1)
-        )
-        parts.append(gain * ((plus - minus) @ matrix.m2c) / (2 * step))
-    jacobian = np.stack(parts) * np.sqrt(excitation)
+    jacobian = np.concatenate([unit[None], gain * derivatives[:5]]) * np.sqrt(excitation)
     whitened = np.linalg.solve(np.linalg.cholesky(mixed), jacobian.transpose(1, 0, 2).reshape(len(mixed), -1))
-    columns = whitened.reshape(len(mixed), len(parts), -1).transpose(1, 0, 2).reshape(len(parts), -1)
+    columns = whitened.reshape(len(mixed), 6, -1).transpose(1, 0, 2).reshape(6, -1)
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(columns @ columns.T)))[1:6])

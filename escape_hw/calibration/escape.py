@@ -9,17 +9,14 @@ from numpy.typing import NDArray
 
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure, Reporter
-from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix
+from escape_hw.calibration.derivatives import modal_jacobian
 from escape_hw.calibration.docrime import docrime_run
 from escape_hw.calibration.sprint import sprint_steps
 from escape_hw.errors import Aborted
-
-#: Half steps for the propagation of the registration's errors, in its units.
-_STEPS = (1.0, 1.0, 0.05, 0.1, 0.1)
 
 
 def pseudo_synthetic(
@@ -41,17 +38,9 @@ def pseudo_synthetic(
     matrix, sigma : ndarray, ``(n_slopes, n_modes)``
         The errors are those of registration and gain, propagated to first order.
     """
-    alpha, width = estimate.registration.to_array(), estimate.width.value
-    gain = estimate.gain.value
-    unit = model.zonal_matrix(estimate.registration, width) @ m2c
-    derivatives = []
-    for k, step in enumerate(_STEPS):
-        plus, minus = (
-            model.zonal_matrix(Registration.from_array(alpha + s * step * np.eye(5)[k]), width)
-            for s in (1, -1)
-        )
-        derivatives.append(gain * ((plus - minus) @ m2c) / (2 * step))
-    jacobian = np.stack(derivatives)
+    width, gain = estimate.width.value, estimate.gain.value
+    unit, derivatives = modal_jacobian(model, estimate.registration, m2c, width)
+    jacobian = gain * derivatives[:5]
     variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
     variance += np.square(unit * estimate.gain.sigma)
     return gain * unit, np.sqrt(np.maximum(variance, 0))

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
+from escape_hw.calibration.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
+from escape_hw.calibration.weighted import WeightedMatrix
 
-#: Half steps of the central differences, in the units of the parameters.
-_STEPS = np.array([2.0, 2.0, 0.05, 0.2, 0.2])
-_WIDTH_STEP = 0.05
 #: Width of the broad pedestal that influence functions may stand on, relative to their own.
 _PEDESTAL = 1.7
 #: Places of the common parameters among the unknowns; the registration has places 1 to 5.
@@ -43,40 +41,19 @@ class State:
         )
 
 
-def _near(rows: NDArray[np.intp], columns: NDArray[np.intp], reach: float) -> NDArray[np.float64]:
-    """How near slopes are ``(n_slopes, n_slopes)``: 1 in one place, falling to 0 at ``reach`` lenslets."""
-    down, right = (np.abs(at[:, None] - at[None, :]) / reach for at in (rows, columns))
-    weight = np.maximum(1 - down, 0.0) * np.maximum(1 - right, 0.0)
-    return np.tile(weight, (2, 2))
-
-
 class Problem:
     """One matrix, one model, and the weights between them."""
 
     def __init__(
-        self, matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], priors: Priors
+        self, weighted: WeightedMatrix, valid: NDArray[np.bool_], model: SyntheticModel, priors: Priors
     ) -> None:
-        data = matrix.data[:, columns].astype(float)
-        sigma = matrix.sigma[:, columns].astype(float)
-        self.model, self.priors = model, priors
-        self.m2c = matrix.m2c[:, columns]
-        self.measured_errors = bool((sigma > 0).all())
-        if self.measured_errors:
-            # Standard errors factor into slopes' noise and modes' excitation: both estimators say so.
-            power = np.log(sigma)
-            self.by_slope = np.exp(power.mean(axis=1) - power.mean())
-            self.by_mode = np.exp(power.mean(axis=0))
-        else:
-            self.by_slope = np.ones(data.shape[0])
-            self.by_mode = np.full(data.shape[1], max(float(data.std()), 1e-30))
-        self.data = data / self.by_slope[:, None] / self.by_mode
-        self.modes = self.m2c / self.by_mode
+        self.weighted = weighted
+        self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
-        rows, cols = np.nonzero(matrix.valid)
+        rows, cols = np.nonzero(valid)
         # x slopes share what their column does to them, y slopes what their row does.
-        self.lines = np.unique(np.concatenate([cols, matrix.valid.shape[1] + rows]), return_inverse=True)[1]
+        self.lines = np.unique(np.concatenate([cols, valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
-        self.near = _near(rows, cols, max(matrix.valid.shape) / 2)
         self.precision = np.concatenate(
             [
                 np.zeros(6),
@@ -85,16 +62,16 @@ class Problem:
                 np.full(self.n_lines, priors.sampling**-2),
                 np.full(model.n_act, priors.actuator_gain**-2),
                 np.full(model.n_act, priors.actuator_width**-2),
-                np.full(data.shape[0], priors.slope_gain**-2),
+                np.full(weighted.data.shape[0], priors.slope_gain**-2),
             ]
         )
 
     def start(self, registration: Registration) -> State:
         """State to start from: a registration, and the gain that fits it."""
-        n_act, n_slopes = self.model.n_act, self.data.shape[0]
+        n_act, n_slopes = self.model.n_act, self.weighted.data.shape[0]
         zeros = np.zeros(n_act)
-        model = self._weighted(self.model.zonal_matrix(registration)) @ self.modes
-        gain = float(np.vdot(model, self.data) / np.vdot(model, model))
+        model = self.weighted.weigh(modal_matrix(self.model, registration, self.modes))
+        gain = float(np.vdot(model, self.weighted.data) / np.vdot(model, model))
         return State(
             gain,
             registration.to_array(),
@@ -107,54 +84,39 @@ class Problem:
             np.zeros(n_slopes),
         )
 
-    def _weighted(self, zonal: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(zonal / self.by_slope[:, None])
-
     def linearise(self, state: State) -> NormalEquations:
         """Model and derivatives about a state."""
-        here, w = Registration.from_array(state.alpha), 1.0 + state.width
-        zonal = {0: self._weighted(self.model.zonal_matrix(here, w))}
-        for side in (-1, 1):
-            zonal[side] = self._weighted(self.model.zonal_matrix(here, w * (1 + side * _WIDTH_STEP)))
-        by_width = (zonal[1] - zonal[-1]) / (2 * _WIDTH_STEP)
-        by_shape = self._weighted(self.model.zonal_matrix(here, w * _PEDESTAL)) - zonal[0]
-        moved = []
-        for k, step in enumerate(_STEPS):
-            d = np.eye(5)[k] * step
-            plus, minus = (
-                self._weighted(self.model.zonal_matrix(Registration.from_array(state.alpha + s * d), w))
-                for s in (1, -1)
-            )
-            moved.append((plus - minus) / (2 * step))
-        rows = (1 + state.slope_gain)[:, None]
-        acting = 1 + state.actuator_gain
-        shaped = zonal[0] + state.shape * by_shape + state.actuator_width * by_width
-
-        def modal(z: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.asarray(rows * (z * acting) @ self.modes)
-
-        variants = [self._weighted(v.zonal_matrix(here, w)) - zonal[0] for v in self.variants]
+        here, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
+        zonal, moved = (weigh(part) for part in zonal_jacobian(self.model, here, w))
+        by_width = moved[5] * w
+        by_shape = weigh(self.model.zonal_matrix(here, w * _PEDESTAL)) - zonal
+        variants = [weigh(v.zonal_matrix(here, w)) - zonal for v in self.variants]
+        rows, acting = (1 + state.slope_gain)[:, None], 1 + state.actuator_gain
+        shaped = zonal + state.shape * by_shape + state.actuator_width * by_width
         for share, difference in zip(state.variant, variants, strict=True):
             shaped = shaped + share * difference
+        acted = acting[:, None] * self.modes
+
+        def modal(z: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(rows * (z @ acted))
+
         unit = modal(shaped)
-        parts = (*moved, by_width, by_shape, *variants)
-        common = np.stack([unit, *(state.gain * modal(z) for z in parts)])
+        common = np.stack([unit, *(state.gain * modal(z) for z in (*moved, by_shape, *variants))])
         # Where a slope samples the wavefront: a shift shared by the lenslets of a column (x) or row (y).
-        sampled = np.zeros((self.lines.max() + 1, *unit.shape))
         half = unit.shape[0] // 2
-        rows_of = np.arange(unit.shape[0])
-        sampled[self.lines, rows_of] = np.where((rows_of < half)[:, None], common[1], common[2])
-        common = np.concatenate([common, sampled])
-        model = state.gain * unit + np.einsum("l,lsm->sm", state.sampling, sampled)
+        sampled = np.concatenate([common[1, :half], common[2, half:]])
+        model = state.gain * unit + state.sampling[self.lines, None] * sampled
         return normal_equations(
             common,
             state.gain * rows * shaped,
             state.gain * rows * by_width * acting,
             self.modes,
-            state.gain * (shaped * acting) @ self.modes,
-            self.data - model,
+            state.gain * (shaped @ acted),
+            self.weighted.data - model,
             self.precision,
             state.offset(),
+            sampled,
+            self.lines,
         )
 
     def move(self, state: State, step: NDArray[np.floating]) -> State:

@@ -44,18 +44,57 @@ class NormalEquations:
     """Gauss-Newton system of one linearisation, in units of the data's standard errors.
 
     The unknowns are, in order: the common parameters (gain, five of the registration, width, shape,
-    shares of the model's variants, sampling positions), actuator gains, actuator widths, slope gains.
+    shares of the model's variants), sampling positions, actuator gains, actuator widths, slope gains.
+    A slope's gain touches no other slope, so its block is diagonal and is eliminated first.
+
+    Parameters
+    ----------
+    inner
+        Normal matrix of all unknowns but the slope gains ``(n_inner, n_inner)``.
+    across
+        Its coupling with the slope gains ``(n_slopes, n_inner)``.
+    diagonal
+        The slope gains' own part ``(n_slopes,)``.
+    right
+        Right-hand side of the whole system.
+    common, sampled, slopes_gain, slopes_width, modes, model, residual, lines
+        As handed to :func:`normal_equations`.
     """
 
-    matrix: NDArray[np.float64]
+    inner: NDArray[np.float64]
+    across: NDArray[np.float64]
+    diagonal: NDArray[np.float64]
     right: NDArray[np.float64]
     common: NDArray[np.float64]
+    sampled: NDArray[np.float64]
     slopes_gain: NDArray[np.float64]
     slopes_width: NDArray[np.float64]
     modes: NDArray[np.float64]
     model: NDArray[np.float64]
     residual: NDArray[np.float64]
-    n_common: int
+    lines: NDArray[np.intp]
+
+    @property
+    def n_common(self) -> int:
+        """Number of common parameters."""
+        return len(self.common)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The whole normal matrix, written out."""
+        return np.block([[self.inner, self.across.T], [self.across, np.diag(self.diagonal)]])
+
+    def solve(self) -> NDArray[np.float64]:
+        """The Gauss-Newton step, in the order of the unknowns."""
+        n = len(self.inner)
+        scaled = self.right[n:] / self.diagonal
+        first = np.linalg.solve(self._without_slopes(), self.right[:n] - self.across.T @ scaled)
+        return np.concatenate([first, scaled - self.across @ first / self.diagonal])
+
+    def information(self) -> NDArray[np.float64]:
+        """Information on the common parameters ``(n_common, n_common)``, random effects integrated out."""
+        k, whole = self.n_common, self._without_slopes()
+        return np.asarray(whole[:k, :k] - whole[:k, k:] @ np.linalg.solve(whole[k:, k:], whole[k:, :k]))
 
     def efficient(self) -> NDArray[np.float64]:
         """Derivatives by the common parameters, less what the random effects can imitate.
@@ -64,15 +103,22 @@ class NormalEquations:
         -------
         ndarray, ``(n_common, n_slopes, n_modes)``
         """
-        k = self.n_common
-        n_act = self.modes.shape[0]
-        imitation = np.linalg.solve(self.matrix[k:, k:], self.matrix[k:, :k])
+        k, n_act = self.n_common, len(self.modes)
+        whole = self._without_slopes()
+        inner = np.linalg.solve(whole[k:, k:], whole[k:, :k])
+        by_slope = (self.across[:, :k] - self.across[:, k:] @ inner) / self.diagonal[:, None]
+        n_lines = len(inner) - 2 * n_act
         out = np.empty_like(self.common)
         for p in range(k):
-            by_gain, by_width, by_slope = np.split(imitation[:, p], [n_act, 2 * n_act])
-            out[p] = self.common[p] - (self.slopes_gain * by_gain + self.slopes_width * by_width) @ self.modes
-            out[p] -= by_slope[:, None] * self.model
+            by_line, by_gain, by_width = np.split(inner[:, p], [n_lines, n_lines + n_act])
+            acting = (self.slopes_gain * by_gain + self.slopes_width * by_width) @ self.modes
+            out[p] = self.common[p] - acting - by_slope[:, p, None] * self.model
+            if n_lines:
+                out[p] -= by_line[self.lines, None] * self.sampled
         return out
+
+    def _without_slopes(self) -> NDArray[np.float64]:
+        return np.asarray(self.inner - self.across.T @ (self.across / self.diagonal[:, None]))
 
 
 def normal_equations(
@@ -84,6 +130,8 @@ def normal_equations(
     residual: NDArray[np.float64],
     precision: NDArray[np.float64],
     offset: NDArray[np.float64],
+    sampled: NDArray[np.float64] | None = None,
+    lines: NDArray[np.intp] | None = None,
 ) -> NormalEquations:
     """Assemble the system; no array of the size of all derivatives is ever formed.
 
@@ -102,33 +150,52 @@ def normal_equations(
         Prior precision of every unknown.
     offset
         Present value of every unknown minus its prior mean.
+    sampled, lines
+        Weighted derivatives of each slope by where it samples ``(n_slopes, n_modes)``, and the number
+        of the line of sub-apertures ``(n_slopes,)`` that it shares the unknown with; none by default.
     """
-    k = common.shape[0]
-    flat = common.reshape(k, -1)
-    zonal = (slopes_gain, slopes_width)
+    if sampled is None or lines is None:
+        sampled, lines = np.zeros_like(model), np.zeros(len(model), np.intp)
+        member = np.zeros((len(model), 0))
+    else:
+        member = (lines[:, None] == np.arange(lines.max() + 1)).astype(float)
+    k, n_modes = common.shape[0], model.shape[1]
+    flat, zonal = common.reshape(k, -1), (slopes_gain, slopes_width)
     overlap = modes @ modes.T
     acting = np.block([[(a.T @ b) * overlap for b in zonal] for a in zonal])
-    onto_modes = np.einsum("psm,am->psa", common, modes, optimize=True)
-    common_acting = np.concatenate([np.einsum("psa,sa->pa", onto_modes, z) for z in zonal], axis=1)
-    model_modes = model @ modes.T
-    slope_acting = np.concatenate([model_modes * z for z in zonal], axis=1)
-    slope_common = np.einsum("sm,psm->sp", model, common)
-    matrix = np.block(
+    onto_modes = (common.reshape(-1, n_modes) @ modes.T).reshape(k, len(model), -1)
+    common_acting = np.concatenate([(onto_modes * z).sum(axis=1) for z in zonal], axis=1)
+    common_line = np.einsum("psm,sm->ps", common, sampled) @ member
+    sampled_modes = sampled @ modes.T
+    line_acting = member.T @ np.concatenate([sampled_modes * z for z in zonal], axis=1)
+    line = np.diag(np.square(sampled).sum(axis=1) @ member)
+    inner = np.block(
         [
-            [flat @ flat.T, common_acting, slope_common.T],
-            [common_acting.T, acting, slope_acting.T],
-            [slope_common, slope_acting, np.diag(np.square(model).sum(axis=1))],
+            [flat @ flat.T, common_line, common_acting],
+            [common_line.T, line, line_acting],
+            [common_acting.T, line_acting.T, acting],
         ]
     )
-    residual_modes = residual @ modes.T
+    model_modes, residual_modes = model @ modes.T, residual @ modes.T
+    across = np.concatenate(
+        [
+            np.einsum("sm,psm->sp", model, common),
+            member * (model * sampled).sum(axis=1)[:, None],
+            *(model_modes * z for z in zonal),
+        ],
+        axis=1,
+    )
     right = np.concatenate(
         [
             flat @ residual.ravel(),
+            (residual * sampled).sum(axis=1) @ member,
             *(np.einsum("sa,sa->a", z, residual_modes) for z in zonal),
             np.einsum("sm,sm->s", model, residual),
         ]
     )
-    matrix[np.diag_indices_from(matrix)] += precision
+    n = len(inner)
+    inner[np.diag_indices(n)] += precision[:n]
     return NormalEquations(
-        matrix, right - precision * offset, common, slopes_gain, slopes_width, modes, model, residual, k
-    )
+        inner, across, np.square(model).sum(axis=1) + precision[n:], right - precision * offset,
+        common, sampled, slopes_gain, slopes_width, modes, model, residual, lines,
+    )  # fmt: skip

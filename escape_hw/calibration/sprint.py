@@ -8,6 +8,9 @@ fits what the synthetic model does not know as random effects (see :mod:`~.misfi
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,19 +19,19 @@ from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, SprintIteration
-from escape_hw.calibration.linearisation import GAIN, WIDTH, Problem, State
-from escape_hw.calibration.misfit import NormalEquations, Priors
+from escape_hw.api.threads import hold_to_one_thread
+from escape_hw.calibration.capture import EXPLAINED, capture
+from escape_hw.calibration.covariance import Linearised, sandwich
+from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.light import SMALL, LightFit, LightProblem
+from escape_hw.calibration.linearisation import GAIN, WIDTH, Problem
+from escape_hw.calibration.misfit import Priors
+from escape_hw.calibration.parity import parity_hint
+from escape_hw.calibration.weighted import WeightedMatrix
 from escape_hw.errors import CalibrationError, IncompatibleProduct
 
 #: Largest move in one iteration: the model is only locally linear.
 _LARGEST = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
-#: A step below this many standard errors, or below the last column of the table, ends the descent.
-_SMALL = np.array([5e-3, 5e-3, 2e-4, 2e-3, 2e-3])
-#: Share of what noise leaves to explain that the model must explain to be believed.
-_EXPLAINED = 0.8
-#: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
-#: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
-_FLOOR = np.array([0.03, 0.03, 0.0, 0.035, 0.018])
 
 
 def choose_modes(matrix: InteractionMatrix, n_modes: int) -> NDArray[np.intp]:
@@ -51,6 +54,8 @@ def sprint(
     max_iterations: int = 25,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
+    misfit: bool = True,
+    reach: bool = True,
 ) -> RegistrationEstimate:
     """Registration, gain and their standard errors from an interaction matrix.
 
@@ -74,6 +79,13 @@ def sprint(
         learn of it from the scatter between modes, less precisely.
     priors
         Scatter of what the model does not know.
+    misfit
+        Whether to fit that too. Without it gain and registration are the only unknowns: several times
+        faster and as good on a mirror that is like its model; on a real one less accurate, and its
+        error bars know nothing of unequal actuators.
+    reach
+        Whether to come from afar first, low modes before high ones (:mod:`~.capture`). Without it the
+        descent is from ``start`` alone, on all modes at once.
 
     Returns
     -------
@@ -92,7 +104,7 @@ def sprint(
     """
     steps = sprint_steps(
         matrix, model, modes=modes, learning_rate=learning_rate, start=start,
-        max_iterations=max_iterations, covariance=covariance, priors=priors,
+        max_iterations=max_iterations, covariance=covariance, priors=priors, misfit=misfit, reach=reach,
     )  # fmt: skip
     while True:
         try:
@@ -112,44 +124,98 @@ def sprint_steps(
     max_iterations: int = 25,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
+    misfit: bool = True,
+    reach: bool = True,
 ) -> Procedure[RegistrationEstimate]:
     """As :func:`sprint`, iteration by iteration, so that it can be watched and stopped."""
+    # The products are many and small.
+    with hold_to_one_thread():
+        return (yield from _steps(
+            matrix, model, modes, learning_rate, start, max_iterations, covariance, priors, misfit, reach
+        ))  # fmt: skip
+
+
+def _steps(
+    matrix: InteractionMatrix,
+    model: SyntheticModel,
+    modes: NDArray[np.intp] | int | None,
+    learning_rate: float,
+    start: Registration | None,
+    max_iterations: int,
+    covariance: NDArray[np.float64] | None,
+    priors: Priors | None,
+    misfit: bool,
+    reach: bool,
+) -> Procedure[RegistrationEstimate]:
     if not 0 < learning_rate <= 1:
         raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
     columns = _columns(matrix, modes)
-    _check_fit(matrix, model)
-    if not np.isfinite(matrix.data[:, columns]).all():
-        raise CalibrationError("the interaction matrix is not finite; measure it again")
-    if not matrix.data[:, columns].any():
-        raise CalibrationError("the interaction matrix is zero; does the sensor see the mirror?")
-    problem = Problem(matrix, model, columns, priors or Priors())
-    if not np.isfinite(problem.data).all():
-        raise CalibrationError("the interaction matrix's standard errors are not finite; measure it again")
-    if problem.measured_errors and float(matrix.snr()[columns].max()) < 0.1:
-        raise CalibrationError(
-            "the interaction matrix holds nothing but noise; use more frames or larger pokes"
-        )
-    state = problem.start(start or Registration())
-    history: list[SprintIteration] = []
-    settled = False
+    _check(matrix, model, columns)
     report = Reporter("SPRINT", max_iterations, "iteration")
+    history: list[SprintIteration] = []
+    weighted = WeightedMatrix.of(matrix, columns)
+    begin = (start or Registration()).to_array()
+    if reach or not misfit:
+        if reach:
+            steps = capture(matrix, model, columns, begin, max_iterations, learning_rate)
+        else:
+            steps = LightProblem(weighted, model, learning_rate).descend(begin, max_iterations)
+        light = yield from _watched(steps, report, history)
+        begin = light.alpha
+    if misfit:
+        found = yield from _with_misfit(
+            Problem(weighted, matrix.valid, model, priors or Priors()),
+            Registration.from_array(begin), max_iterations, learning_rate, report, history,
+        )  # fmt: skip
+    else:
+        found = _Solution(light, light.alpha, light.gain, 1.0, light.settled)
+    return _estimate(matrix, model, columns, weighted, found, tuple(history), covariance)
+
+
+def _watched(
+    steps: Generator[LightFit, None, LightFit], report: Reporter, history: list[SprintIteration]
+) -> Procedure[LightFit]:
+    """Hand on the progress of a descent and keep its steps."""
+    while True:
+        try:
+            fit = next(steps)
+        except StopIteration as done:
+            light: LightFit = done.value
+            return light
+        norm = float(np.linalg.norm(fit.step / _LARGEST))
+        history.append(_record(fit.alpha, fit.gain, fit.residual, norm))
+        if progress := report.step():
+            yield progress
+
+
+def _with_misfit(
+    problem: Problem,
+    start: Registration,
+    max_iterations: int,
+    learning_rate: float,
+    report: Reporter,
+    history: list[SprintIteration],
+) -> Procedure[_Solution]:
+    """Gauss-Newton on registration and random effects together."""
+    state, settled = problem.start(start), False
+    system = problem.linearise(state)
     for _ in range(max_iterations):
         if progress := report.step():
             yield progress
-        system = problem.linearise(state)
-        step = np.linalg.solve(system.matrix, system.right)
+        step = system.solve()
         if not np.isfinite(step).all():
             break
-        spread = np.sqrt(np.abs(np.diag(np.linalg.inv(_reduced(system)))))[1:6]
-        relative = np.abs(step[1:6]) / np.maximum(_SMALL, 0.02 * spread)
-        history.append(_record(state, system, float(np.linalg.norm(step[1:6] / _LARGEST))))
+        spread = np.sqrt(np.abs(np.diag(np.linalg.inv(system.information()))))[1:6]
+        relative = np.abs(step[1:6]) / np.maximum(SMALL, 0.02 * spread)
+        norm = float(np.linalg.norm(step[1:6] / _LARGEST))
+        history.append(_record(state.alpha, state.gain, system.residual, norm))
         if relative.max() < 1.0:
             settled = True
             break
         damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / _LARGEST)))
         state = problem.move(state, step * damping * learning_rate)
-    system = problem.linearise(state)
-    return _estimate(problem, matrix, state, system, history, settled, covariance)
+        system = problem.linearise(state)
+    return _Solution(system, state.alpha, state.gain, 1 + state.width, settled)
 
 
 def _columns(matrix: InteractionMatrix, modes: NDArray[np.intp] | int | None) -> NDArray[np.intp]:
@@ -165,103 +231,86 @@ def _columns(matrix: InteractionMatrix, modes: NDArray[np.intp] | int | None) ->
     return columns
 
 
-def _check_fit(matrix: InteractionMatrix, model: SyntheticModel) -> None:
+def _check(matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp]) -> None:
+    """Refuse what cannot be fitted, with the reason."""
     if matrix.m2c.shape[0] != model.n_act:
         raise IncompatibleProduct(
             f"the matrix is for {matrix.m2c.shape[0]} actuators, the model has {model.n_act}"
         )
-    rows = model.zonal_matrix(Registration()).shape[0]
+    rows = modal_matrix(model, Registration(), matrix.m2c[:, :1]).shape[0]
     if rows != matrix.n_slopes:
         raise IncompatibleProduct(
             f"the matrix has {matrix.n_slopes} slopes, the model {rows}; build the model on the matrix's grid"
         )
+    data, sigma = matrix.data[:, columns], matrix.sigma[:, columns]
+    if not np.isfinite(data).all():
+        raise CalibrationError("the interaction matrix is not finite; measure it again")
+    if not data.any():
+        raise CalibrationError("the interaction matrix is zero; does the sensor see the mirror?")
+    if not np.isfinite(sigma).all():
+        raise CalibrationError("the interaction matrix's standard errors are not finite; measure it again")
+    if (sigma > 0).all() and float(matrix.snr()[columns].max()) < 0.1:
+        raise CalibrationError(
+            "the interaction matrix holds nothing but noise; use more frames or larger pokes"
+        )
 
 
-def _reduced(system: NormalEquations) -> NDArray[np.float64]:
-    """Information on the common parameters, the random effects integrated out."""
-    k = system.n_common
-    a, b, c = system.matrix[:k, :k], system.matrix[:k, k:], system.matrix[k:, k:]
-    return np.asarray(a - b @ np.linalg.solve(c, b.T))
+def _record(
+    alpha: NDArray[np.float64], gain: float, residual: NDArray[np.float64], norm: float
+) -> SprintIteration:
+    chi2 = float(np.mean(np.square(residual)))
+    return SprintIteration(Registration.from_array(alpha), gain, norm, chi2)
 
 
-def _record(state: State, system: NormalEquations, norm: float) -> SprintIteration:
-    chi2 = float(np.mean(np.square(system.residual)))
-    return SprintIteration(Registration.from_array(state.alpha), state.gain, norm, chi2)
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    """Where a descent ended, with and without random effects alike."""
 
-
-def _covariance(
-    problem: Problem, system: NormalEquations, noise: NDArray[np.float64] | None
-) -> NDArray[np.float64]:
-    """Sandwich covariance of the common parameters, in units of their own.
-
-    The middle is the scatter of the scores over the pupil as it is found, which includes what the
-    model still misses. Neighbouring sub-apertures err together, and what the model misses has its
-    own pattern over the pupil, so products of scores count with a weight that falls linearly with
-    the distance to zero at half the pupil (Bartlett's window, as in Newey & West 1987 over time).
-    Beyond that the noise's correlation fills in where it is known, and else the scatter of the
-    scores from mode to mode, which shows what moved all slopes together while one mode was
-    measured. What is common to the whole pupil no scatter can show; :data:`_FLOOR` stands for it.
-    """
-    bread = np.linalg.inv(_reduced(system))
-    scores = system.efficient()
-    each = scores * system.residual
-    by_slope = each.sum(axis=2)
-    meat = by_slope @ problem.near @ by_slope.T
-    if noise is None:
-        by_mode = each.sum(axis=1)
-        meat += by_mode @ by_mode.T
-    else:
-        # What is near is in the scatter already.
-        whole = (1 - problem.near) * noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
-        # Only what adds to the errors counts: negative correlations are too uncertain to trade on.
-        shares, directions = np.linalg.eigh(np.einsum("psm,st,qtm->pq", scores, whole, scores, optimize=True))
-        meat += (directions * np.maximum(shares, 0.0)) @ directions.T
-    found = bread @ meat @ bread
-    # Never better than the noise alone allows.
-    scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))
-    covariance = found * np.outer(scale, scale)
-    covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(_FLOOR)
-    return np.asarray(covariance)
+    system: Linearised
+    alpha: NDArray[np.float64]
+    gain: float
+    width: float
+    settled: bool
 
 
 def _estimate(
-    problem: Problem,
     matrix: InteractionMatrix,
-    state: State,
-    system: NormalEquations,
-    history: list[SprintIteration],
-    settled: bool,
+    model: SyntheticModel,
+    columns: NDArray[np.intp],
+    weighted: WeightedMatrix,
+    found: _Solution,
+    history: tuple[SprintIteration, ...],
     noise: NDArray[np.float64] | None,
 ) -> RegistrationEstimate:
-    chi2 = float(np.mean(np.square(system.residual)))
-    covariance = _covariance(problem, system, noise)
-    if not problem.measured_errors:
-        covariance = covariance * chi2
+    residual = found.system.residual
+    covariance = sandwich(weighted, found.system, noise)
     warnings = []
-    if not settled:
+    if not found.settled:
         warnings.append(f"the steps did not shrink within {len(history)} iterations")
-    model = problem.data - system.residual
-    explained = 1 - float(np.square(system.residual).sum() / np.square(problem.data).sum())
-    expected = (
-        1 - problem.data.size / float(np.square(problem.data).sum()) if problem.measured_errors else 1.0
-    )
-    if explained < _EXPLAINED * max(expected, 0.0) or np.vdot(model, problem.data) <= 0:
+    explained, explicable = weighted.explained(residual), weighted.explicable
+    if explained < EXPLAINED * explicable or np.vdot(weighted.data - residual, weighted.data) <= 0:
+        hint = parity_hint(matrix, model, columns)
         warnings.append(
-            f"the model explains {max(explained, 0.0):.0%} of the matrix "
-            f"where noise leaves {max(expected, 0.0):.0%} "
-            "to explain; wrong layout, flip or basis, or a registration beyond capture"
+            f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves {explicable:.0%} "
+            f"to explain; {hint or 'wrong layout, flip or basis, or a registration beyond capture'}"
+        )
+    elif found.gain < 0:
+        warnings.append(
+            "the gain is negative: the mirror pulls where the model pushes; check its polarity, "
+            "or whether the camera is turned by 180 degrees"
         )
     sigma = np.sqrt(np.diag(covariance))
     worst = int(np.argmax(sigma[1:6] / _LARGEST))
     if sigma[1 + worst] > _LARGEST[worst]:
         warnings.append(f"the data do not constrain {PARAMETERS[worst]}; use more frames or more modes")
+    width = float(sigma[WIDTH]) if sigma.size > WIDTH else 0.0
     return RegistrationEstimate(
-        Registration.from_array(state.alpha),
+        Registration.from_array(found.alpha),
         covariance[1:6, 1:6],
-        Measured(state.gain, float(sigma[GAIN])),
-        Measured(1 + state.width, float(sigma[WIDTH])),
-        settled and len(warnings) == 0,
-        tuple(history),
-        chi2,
+        Measured(found.gain, float(sigma[GAIN])),
+        Measured(found.width, width),
+        found.settled and len(warnings) == 0,
+        history,
+        float(np.mean(np.square(residual))),
         tuple(warnings),
     )

@@ -6,12 +6,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SubApertureGrid
 from escape_sim.geometry import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.influence import InfluenceFunctions
+from escape_sim.mode_surfaces import N_DERIVATIVES, GaussianFactors, gaussian_factors, mode_surfaces
+from escape_sim.slope_operator import SlopeOperator
 from escape_sim.slope_weights import slope_weights
 
 if TYPE_CHECKING:
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
 #: Relative doubt about the spots' motion: blur within the lenslets counts as motion too.
 _MOTION_DOUBT = 0.25
+#: Up to this many modes, their surfaces are quicker made than the slopes of all actuators.
+_FEW = 12
 
 
 def make_model(config: SystemConfig, grid: SubApertureGrid | None) -> ShackHartmannModel:
@@ -68,10 +72,10 @@ class ShackHartmannModel:
         self._pitch = pitch_on_pupil(config)
         self._coupling = config.devices.dm.coupling
         self._metres = 2 * config.devices.dm.stroke_m
-        self._rows, self._columns = np.nonzero(grid.valid)
         self._config, self._grid = config, grid
         self._variants: list[ShackHartmannModel] | None = None
-        self._weights = slope_weights(config, grid, self._pupil)
+        weights = slope_weights(config, grid, self._pupil)
+        self._slopes = SlopeOperator(weights, grid.valid, self._pupil.sub_aperture_m)
 
     @property
     def n_act(self) -> int:
@@ -98,17 +102,52 @@ class ShackHartmannModel:
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
-        x = self._pupil.coordinates_m
-        along_x, along_y = self._influence(width).factors(registration, self.sub_aperture_m, x, x)
-        p, n = self._pupil.n_pix, self._pupil.n_sub
-        gx, gy = along_x[:, :, 0].reshape(n, p, -1), along_y[:, :, 0].reshape(n, p, -1)
-        out = np.zeros((2, self._rows.size, self.n_act))
-        for (down, right), block in self._weights.items():
-            here = gx[np.clip(self._columns + right, 0, n - 1)]
-            there = gy[np.clip(self._rows + down, 0, n - 1)]
-            for axis in range(2):
-                out[axis] += np.einsum("kqa,kqa->ka", there, block[axis] @ here)
-        return np.asarray(out.reshape(-1, self.n_act) * self._metres)
+        factors = self._factors(registration, width, np.float64)
+        return np.asarray(self._slopes.zonal(factors)[0] * self._metres)
+
+    def zonal_jacobian(
+        self, registration: Registration, width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Zonal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
+        factors = self._factors(registration, width, np.float32)
+        parts = self._slopes.zonal(factors, derivatives=True) * np.float32(self._metres)
+        out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
+        for p, ((along_x, along_y), (wide_x, wide_y)) in enumerate(
+            zip(factors.place, factors.spread, strict=True)
+        ):
+            out[p] = parts[1] * along_x + parts[2] * along_y
+            if wide_x:
+                out[p] += parts[3] * wide_x
+            if wide_y:
+                out[p] += parts[4] * wide_y
+        return parts[0].astype(float), out
+
+    def modal_matrix(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> NDArray[np.float64]:
+        """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
+        factors = self._factors(registration, width, np.float32)
+        if m2c.shape[1] <= _FEW:
+            return np.asarray(self._slopes.slopes(mode_surfaces(factors, m2c)) * self._metres, dtype=float)
+        return np.asarray(self._slopes.zonal(factors)[0] @ (m2c * self._metres))
+
+    def modal_jacobian(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Modal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
+        factors = self._factors(registration, width, np.float32)
+        parts = self._slopes.zonal(factors, derivatives=True)
+        modes = (m2c * self._metres).astype(np.float32)
+        out = np.zeros((N_DERIVATIVES, parts.shape[1], m2c.shape[1]))
+        for p in range(N_DERIVATIVES):
+            for part, share in zip(parts[1:3], factors.place[p], strict=True):
+                if share.any():
+                    out[p] += part @ (share[:, None] * modes)
+        for part, shares in zip(parts[3:], factors.spread.T, strict=True):
+            wider = part @ modes
+            for p in np.flatnonzero(shares).tolist():
+                out[p] += wider * shares[p]
+        return np.asarray(parts[0] @ modes, dtype=float), out
 
     def variants(self) -> list[ShackHartmannModel]:
         """The same sensor with spots that move by a quarter more than the slopes say."""
@@ -116,6 +155,10 @@ class ShackHartmannModel:
             grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_DOUBT))
             self._variants = [ShackHartmannModel(self._config, grid)] if grid.motion_px else []
         return list(self._variants)
+
+    def _factors(self, registration: Registration, width: float, dtype: DTypeLike) -> GaussianFactors:
+        at = self._slopes.nodes_m
+        return gaussian_factors(self._influence(width), registration, self.sub_aperture_m, at, at, dtype)
 
     def _influence(self, width: float) -> InfluenceFunctions:
         return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)

@@ -70,6 +70,9 @@ class _Views:
         size = int((boxes[:, 1::2] - boxes[:, ::2]).max())
         self._rows_at = boxes[:, 0, None] + np.arange(size)
         self._columns_at = boxes[:, 2, None] + np.arange(size)
+        # All windows of a row begin at the same pixel row, all of a column at the same pixel column.
+        row_at, column_at = np.zeros((2, n, size), np.intp)
+        row_at[rows], column_at[columns] = self._rows_at, self._columns_at
         in_y, in_x = self._rows_at < boxes[:, 1, None], self._columns_at < boxes[:, 3, None]
         self._inside = in_y[:, :, None] & in_x[:, None, :]
         blocks = pupil.amplitude.reshape(n, p, n, p).transpose(0, 2, 1, 3).astype(float)
@@ -93,10 +96,10 @@ class _Views:
             i, j = np.clip(i, 0, n - 1), np.clip(j, 0, n - 1)
             self._blocks[step] = (blocks[i, j] * exists[:, None, None]).astype(self._real)
             self._along[step] = tuple(
-                self._transform(first + number * pitch, at, p, field)
-                for first, pitch, number, at in (
-                    (y_first, y_pitch, i, self._rows_at),
-                    (x_first, x_pitch, j, self._columns_at),
+                self._transform(first + (np.arange(n) + by) * pitch, at, p, field)[number]
+                for first, pitch, by, at, number in (
+                    (y_first, y_pitch, step[0], row_at, rows),
+                    (x_first, x_pitch, step[1], column_at, columns),
                 )
             )
 

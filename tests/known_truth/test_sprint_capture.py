@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,10 @@ from escape_sim.model import ShackHartmannModel, make_model, nominal_grid
 
 #: Noise of the matrix elements, relative to their rms.
 NOISE = 0.03
+#: Actuator pitch in % of a sub-aperture.
+PITCH = 100 * 24 / 9
+#: The paper's laboratory case.
+PAPER = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +65,96 @@ def test_finds_home_from_afar(model, matrix_at, planted):
 
 def test_a_shift_by_more_than_a_pitch_is_not_passed_off_as_found(model, matrix_at):
     planted = Registration(shift_x=400.0)
-    estimate = sprint(matrix_at(planted), model, max_iterations=10)
+    estimate = sprint(matrix_at(planted), model, max_iterations=10, reach=False)
     assert not estimate.converged
     assert any("explains" in warning for warning in estimate.warnings)
-    assert sprint(matrix_at(planted), model, start=Registration(shift_x=300.0)).converged
+    assert sprint(matrix_at(planted), model, start=Registration(shift_x=300.0), reach=False).converged
+
+
+def random_far(number):
+    """A shift by two actuator pitches in some direction, turned and scaled as far as one would."""
+    rng = np.random.default_rng(100 + number)
+    way = rng.uniform(0, 2 * np.pi)
+    return Registration.from_array(
+        [*(2 * PITCH * np.array([np.cos(way), np.sin(way)])), *(rng.uniform(-1, 1, 3) * [10, 8, 8])]
+    )
+
+
+@pytest.mark.parametrize("misfit", [False, True], ids=["light", "with misfit"])
+def test_two_pitches_away_turned_and_scaled(model, matrix_at, misfit):
+    for number in range(4):
+        planted = random_far(number)
+        estimate = sprint(matrix_at(planted), model, misfit=misfit)
+        assert estimate.converged, planted
+        error = estimate.registration.to_array() - planted.to_array()
+        assert (np.abs(error) < 5 * estimate.sigma).all(), planted
+
+
+@pytest.mark.parametrize("n_modes", [5, 40])
+def test_plants_at_random_are_found_or_refused(model, matrix_at, n_modes):
+    """Anywhere within three pitches and far beyond: what is called converged is right."""
+    found = 0
+    for number in range(8):
+        rng = np.random.default_rng(number)
+        reach = PITCH * rng.choice([0.3, 1.0, 3.0, 6.0])
+        planted = Registration.from_array(
+            [*rng.uniform(-reach, reach, 2), *(rng.uniform(-1, 1, 3) * [12, 8, 8])]
+        )
+        estimate = sprint(matrix_at(planted), model, modes=np.arange(n_modes), misfit=False)
+        error = np.abs(estimate.registration.to_array() - planted.to_array())
+        assert not estimate.converged or (error < 5 * estimate.sigma).all(), planted
+        found += estimate.converged
+    assert found >= 6
+
+
+def test_high_modes_alone_are_found_by_many_starts(model, matrix_at):
+    planted = Registration(shift_x=400.0, shift_y=-250.0, rotation=4.0)
+    columns = np.arange(20, 25)
+    estimate = sprint(matrix_at(planted), model, modes=columns, misfit=False)
+    assert estimate.converged
+    assert (np.abs(estimate.registration.to_array() - planted.to_array()) < 5 * estimate.sigma).all()
+    assert not sprint(matrix_at(planted), model, modes=columns, misfit=False, reach=False).converged
+
+
+def test_light_and_full_agree_on_a_mirror_like_the_model(model, matrix_at):
+    matrix = matrix_at(PAPER)
+    light, full = (sprint(matrix, model, misfit=m) for m in (False, True))
+    assert light.converged
+    assert full.converged
+    assert light.width.value == 1.0
+    assert (np.abs(light.registration.to_array() - full.registration.to_array()) < 3 * full.sigma).all()
+    assert (np.abs(light.registration.to_array() - PAPER.to_array()) < 4 * light.sigma).all()
+    assert abs(light.gain.value - 1) < 4 * light.gain.sigma
+
+
+def test_a_slow_learner_arrives_too(model, matrix_at):
+    estimate = sprint(matrix_at(PAPER), model, misfit=False, learning_rate=0.5)
+    assert estimate.converged
+    assert (np.abs(estimate.registration.to_array() - PAPER.to_array()) < 4 * estimate.sigma).all()
+
+
+def test_a_mirror_of_the_other_polarity_is_pointed_out(model, matrix_at):
+    matrix = matrix_at(PAPER)
+    for misfit in (False, True):
+        estimate = sprint(replace(matrix, data=-matrix.data), model, modes=10, misfit=misfit)
+        assert not estimate.converged
+        assert any("polarity" in warning for warning in estimate.warnings)
+
+
+def test_a_flip_is_named(model, matrix_at):
+    matrix = matrix_at(PAPER)
+    n = matrix.n_slopes // 2
+    flipped = np.zeros_like(matrix.data)
+    for k in range(matrix.n_modes):
+        x, y = matrix.maps(k)
+        flipped[:n, k], flipped[n:, k] = -np.fliplr(x)[matrix.valid], np.fliplr(y)[matrix.valid]
+    estimate = sprint(replace(matrix, data=flipped), model, modes=10, misfit=False)
+    assert not estimate.converged
+    assert any("mirrored left to right" in warning for warning in estimate.warnings), estimate.warnings
+    turned = np.zeros_like(matrix.data)
+    for k in range(matrix.n_modes):
+        x, y = matrix.maps(k)
+        turned[:n, k], turned[n:, k] = y.T[matrix.valid], x.T[matrix.valid]
+    estimate = sprint(replace(matrix, data=turned), model, modes=10, misfit=False)
+    assert not estimate.converged
+    assert any("transposed;" in warning for warning in estimate.warnings), estimate.warnings

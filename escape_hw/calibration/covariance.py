@@ -1,0 +1,89 @@
+"""Standard errors of the registration that hold where the model misses something."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.calibration.weighted import WeightedMatrix
+
+#: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
+#: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
+_FLOOR = np.array([0.03, 0.03, 0.0, 0.035, 0.018])
+
+
+class Linearised(Protocol):
+    """A least-squares problem about its solution."""
+
+    @property
+    def residual(self) -> NDArray[np.float64]:
+        """What is left ``(n_slopes, n_modes)``, in standard errors."""
+        ...
+
+    def information(self) -> NDArray[np.float64]:
+        """Information on gain, registration and whatever comes after them ``(n, n)``."""
+        ...
+
+    def efficient(self) -> NDArray[np.float64]:
+        """Derivatives by the same parameters ``(n, n_slopes, n_modes)``, less what is not theirs."""
+        ...
+
+
+def nearness(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """How near valid sub-apertures are to each other ``(n_valid, n_valid)``.
+
+    1 in one place, falling linearly along rows and along columns to 0 at half the larger side of ``valid``.
+    """
+    rows, columns = np.nonzero(valid)
+    down, right = (np.abs(at[:, None] - at[None, :]) / (max(valid.shape) / 2) for at in (rows, columns))
+    return np.asarray(np.maximum(1 - down, 0.0) * np.maximum(1 - right, 0.0))
+
+
+def sandwich(
+    weighted: WeightedMatrix, system: Linearised, noise: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Sandwich covariance of the common parameters, in units of their own.
+
+    The middle is the scatter of the scores over the pupil as it is found, which includes what the
+    model still misses. Neighbouring sub-apertures err together, and what the model misses has its
+    own pattern over the pupil, so products of scores count with a weight that falls linearly with
+    the distance to zero at half the pupil (Bartlett's window, as in Newey & West 1987 over time).
+    Beyond that the noise's correlation fills in where it is known, and else the scatter of the
+    scores from mode to mode, which shows what moved all slopes together while one mode was
+    measured. What is common to the whole pupil no scatter can show; :data:`_FLOOR` stands for it.
+
+    Parameters
+    ----------
+    weighted
+        The measured matrix.
+    system
+        The problem about its solution.
+    noise
+        Covariance of the slopes' noise ``(n_slopes, n_slopes)`` up to a factor, where it is known.
+    """
+    bread = np.linalg.inv(system.information())
+    scores, near = system.efficient(), nearness(weighted.valid)
+    each = scores * system.residual
+    # Slopes along x and along y of one sub-aperture stand in one place.
+    by_place = each.sum(axis=2).reshape(len(each), 2, -1).sum(axis=1)
+    meat = by_place @ near @ by_place.T
+    if noise is None:
+        by_mode = each.sum(axis=1)
+        meat += by_mode @ by_mode.T
+    else:
+        # What is near is in the scatter already.
+        whole = (1 - np.tile(near, (2, 2))) * noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
+        spread = np.matmul(whole, scores).reshape(len(scores), -1)
+        # Only what adds to the errors counts: negative correlations are too uncertain to trade on.
+        shares, directions = np.linalg.eigh(scores.reshape(len(scores), -1) @ spread.T)
+        meat += (directions * np.maximum(shares, 0.0)) @ directions.T
+    found = bread @ meat @ bread
+    # Never better than the noise alone allows.
+    scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))
+    covariance = found * np.outer(scale, scale)
+    covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(_FLOOR)
+    if not weighted.measured:
+        covariance = covariance * np.mean(np.square(system.residual))
+    return np.asarray(covariance)

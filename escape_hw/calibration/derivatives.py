@@ -1,0 +1,84 @@
+"""Matrices of modes and derivatives of any synthetic model: its own where it has them, else differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.model import DifferentiableModel, SyntheticModel
+from escape_hw.api.registration import Registration
+
+#: Half steps of the central differences: the registration in its units, then the relative width.
+_STEPS = np.array([2.0, 2.0, 0.05, 0.2, 0.2, 0.02])
+
+
+def modal_matrix(
+    model: SyntheticModel, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+) -> NDArray[np.float64]:
+    """Slopes per unit of each mode ``(n_slopes, n_modes)``.
+
+    Parameters
+    ----------
+    model
+        Any synthetic model.
+    registration
+        Registration of the mirror.
+    m2c
+        Mode-to-command matrix ``(n_act, n_modes)``.
+    width
+        Scale of the influence functions' width relative to nominal.
+    """
+    if isinstance(model, DifferentiableModel):
+        return model.modal_matrix(registration, m2c, width)
+    return np.asarray(model.zonal_matrix(registration, width) @ m2c)
+
+
+def modal_jacobian(
+    model: SyntheticModel, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes per unit of each mode, and their derivatives.
+
+    Parameters
+    ----------
+    model, registration, m2c, width
+        As for :func:`modal_matrix`.
+
+    Returns
+    -------
+    matrix : ndarray, ``(n_slopes, n_modes)``
+    derivatives : ndarray, ``(6, n_slopes, n_modes)``
+        By the five parameters of the registration, in their units, and by the width.
+    """
+    if isinstance(model, DifferentiableModel):
+        return model.modal_jacobian(registration, m2c, width)
+    return _differences(lambda r, w: np.asarray(model.zonal_matrix(r, w) @ m2c), registration, width)
+
+
+def zonal_jacobian(
+    model: SyntheticModel, registration: Registration, width: float = 1.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes per unit command ``(n_slopes, n_act)`` and their derivatives ``(6, n_slopes, n_act)``.
+
+    Parameters
+    ----------
+    model, registration, width
+        As for :func:`modal_matrix`.
+    """
+    if isinstance(model, DifferentiableModel):
+        return model.zonal_jacobian(registration, width)
+    return _differences(model.zonal_matrix, registration, width)
+
+
+def _differences(
+    make: Callable[[Registration, float], NDArray[np.float64]], registration: Registration, width: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    here = np.append(registration.to_array(), width)
+    steps = _STEPS * np.append(np.ones(5), width)
+
+    def at(place: NDArray[np.float64]) -> NDArray[np.float64]:
+        return make(Registration.from_array(place[:5]), float(place[5]))
+
+    moved = [(at(here + step) - at(here - step)) / (2 * step.sum()) for step in np.diag(steps)]
+    return make(registration, width), np.stack(moved)

@@ -1,0 +1,74 @@
+"""A measured matrix in units of its standard errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.matrix import InteractionMatrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WeightedMatrix:
+    """Columns of an interaction matrix, each element divided by its standard error.
+
+    Standard errors factor into slopes' noise and modes' excitation: both estimators say so.
+
+    Parameters
+    ----------
+    data
+        ``(n_slopes, n_modes)``, in standard errors.
+    by_slope, by_mode
+        The factors ``(n_slopes,)`` and ``(n_modes,)`` that it was divided by.
+    m2c
+        Mode-to-command matrix of the columns ``(n_act, n_modes)``.
+    measured
+        Whether the matrix came with standard errors; if not, they are taken as equal.
+    valid
+        Valid sub-apertures ``(n_rows, n_columns)``.
+    """
+
+    data: NDArray[np.float64]
+    by_slope: NDArray[np.float64]
+    by_mode: NDArray[np.float64]
+    m2c: NDArray[np.float64]
+    measured: bool
+    valid: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, matrix: InteractionMatrix, columns: NDArray[np.intp]) -> WeightedMatrix:
+        """Weigh some columns of a matrix."""
+        data = matrix.data[:, columns].astype(float)
+        sigma = matrix.sigma[:, columns].astype(float)
+        measured = bool((sigma > 0).all())
+        if measured:
+            power = np.log(sigma)
+            by_slope = np.exp(power.mean(axis=1) - power.mean())
+            by_mode = np.exp(power.mean(axis=0))
+        else:
+            by_slope = np.ones(data.shape[0])
+            by_mode = np.full(data.shape[1], max(float(data.std()), 1e-30))
+        m2c = matrix.m2c[:, columns]
+        return cls(data / by_slope[:, None] / by_mode, by_slope, by_mode, m2c, measured, matrix.valid)
+
+    @property
+    def modes(self) -> NDArray[np.float64]:
+        """The modes in units in which a column's typical standard error is 1, ``(n_act, n_modes)``."""
+        return self.m2c / self.by_mode
+
+    def weigh(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Slopes ``(..., n_slopes, n)`` in units of their noise."""
+        return np.asarray(slopes / self.by_slope[:, None])
+
+    @property
+    def explicable(self) -> float:
+        """Share of the squared elements that is not noise."""
+        if not self.measured:
+            return 1.0
+        return max(1 - self.data.size / float(np.square(self.data).sum()), 0.0)
+
+    def explained(self, residual: NDArray[np.float64]) -> float:
+        """Share of the squared elements that a model leaves no residual of."""
+        return 1 - float(np.square(residual).sum() / np.square(self.data).sum())
