@@ -18,15 +18,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from escape_hw import errors, testing
+    from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
     from escape_hw.api.camera import Camera
     from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
     from escape_hw.api.matrix import InteractionMatrix
     from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
+    from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
     from escape_hw.api.procedure import Procedure, Progress, Reporter, run
+    from escape_hw.api.pyramid import PyramidPupils
     from escape_hw.api.registration import Registration
     from escape_hw.api.results import CalibrationResult, LoopResult, Measured, RegistrationEstimate
     from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
-    from escape_hw.api.sensor import SubApertureGrid
+    from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
     from escape_hw.calibration.closed_loop import best_gain, closed_loop, measure_model_psf
     from escape_hw.calibration.docrime import docrime
     from escape_hw.calibration.escape import escape
@@ -45,6 +48,7 @@ __version__ = "0.1.0"
 #: Public name -> module that defines it (a module of that very name is published as a whole). Add a
 #: line here, to ``__all__`` and to the block for type checkers above to publish a name.
 _HOME = {
+    "AdaptiveSecondary": "escape_hw.api.adaptive_secondary",
     "Camera": "escape_hw.api.camera",
     "CameraInfo": "escape_hw.api.frames",
     "CameraSettings": "escape_hw.api.frames",
@@ -56,9 +60,12 @@ _HOME = {
     "LoopResult": "escape_hw.api.results",
     "Measured": "escape_hw.api.results",
     "MirrorLimits": "escape_hw.safety.limits",
+    "Modulation": "escape_hw.api.modulator",
+    "ModulatorInfo": "escape_hw.api.modulator",
     "PhaseScreen": "escape_hw.api.screen",
     "Procedure": "escape_hw.api.procedure",
     "Progress": "escape_hw.api.procedure",
+    "PyramidPupils": "escape_hw.api.pyramid",
     "Region": "escape_hw.api.frames",
     "Registration": "escape_hw.api.registration",
     "RegistrationEstimate": "escape_hw.api.results",
@@ -66,8 +73,12 @@ _HOME = {
     "ScreenInfo": "escape_hw.api.screen",
     "ScreenState": "escape_hw.api.screen",
     "SendReport": "escape_hw.api.mirror",
+    "SensorGeometry": "escape_hw.api.sensor",
+    "ShellHealth": "escape_hw.api.adaptive_secondary",
+    "ShellState": "escape_hw.api.adaptive_secondary",
     "SubApertureGrid": "escape_hw.api.sensor",
     "System": "escape_hw.runtime.system",
+    "TipTiltModulator": "escape_hw.api.modulator",
     "best_gain": "escape_hw.calibration.closed_loop",
     "bundled_systems": "escape_hw.config.bundled",
     "closed_loop": "escape_hw.calibration.closed_loop",
@@ -89,6 +100,7 @@ _HOME = {
 }
 
 __all__ = [
+    "AdaptiveSecondary",
     "CalibrationResult",
     "Camera",
     "CameraInfo",
@@ -100,9 +112,12 @@ __all__ = [
     "LoopResult",
     "Measured",
     "MirrorLimits",
+    "Modulation",
+    "ModulatorInfo",
     "PhaseScreen",
     "Procedure",
     "Progress",
+    "PyramidPupils",
     "Region",
     "Registration",
     "RegistrationEstimate",
@@ -110,8 +125,12 @@ __all__ = [
     "ScreenInfo",
     "ScreenState",
     "SendReport",
+    "SensorGeometry",
+    "ShellHealth",
+    "ShellState",
     "SubApertureGrid",
     "System",
+    "TipTiltModulator",
     "__version__",
     "best_gain",
     "bundled_systems",

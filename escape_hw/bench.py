@@ -14,8 +14,9 @@ from escape_hw.api.camera import Camera
 from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror
 from escape_hw.api.model import SyntheticModel
+from escape_hw.api.modulator import TipTiltModulator
 from escape_hw.api.screen import PhaseScreen
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.threads import hold_to_one_thread
 from escape_hw.config.device_models import DeviceConfig
 from escape_hw.config.models import SystemConfig
@@ -34,7 +35,7 @@ class Bench:
     """The devices of a system and its configuration; usable as a context manager.
 
     Nothing is connected before :meth:`open`. Devices open in the order mirror, sensor camera,
-    science camera, screen, and close in reverse, so that the mirror is flattened last.
+    modulator, science camera, screen, and close in reverse, so that the mirror is flattened last.
 
     Parameters
     ----------
@@ -42,8 +43,8 @@ class Bench:
         The whole configuration.
     dm, wfs
         Deformable mirror and camera of the wavefront sensor.
-    science, screen
-        Science camera and phase screens, or ``None`` on a system without.
+    science, screen, modulator
+        Science camera, phase screens and a pyramid's modulator, or ``None`` on a system without.
 
     Attributes
     ----------
@@ -63,9 +64,11 @@ class Bench:
         wfs: Camera,
         science: Camera | None = None,
         screen: PhaseScreen | None = None,
+        modulator: TipTiltModulator | None = None,
     ) -> None:
         self.config = config
         self.dm, self.wfs, self.science, self.screen = dm, wfs, science, screen
+        self.modulator = modulator
         self.dark: NDArray[np.float32] | None = None
         self.flat: NDArray[np.float32] | None = None
         self._threads: threadpool_limits | None = None
@@ -87,11 +90,12 @@ class Bench:
         wfs = _build("wfs", devices.wfs, config, shared, Camera)  # type: ignore[type-abstract]
         science = _build("science", devices.science, config, shared, Camera)  # type: ignore[type-abstract]
         screen = _build("screen", devices.screen, config, shared, PhaseScreen)  # type: ignore[type-abstract]
+        modulator = _build("modulator", devices.modulator, config, shared, TipTiltModulator)  # type: ignore[type-abstract]
         if dm is None or wfs is None:
             name, mode = ("dm", devices.dm.mode) if dm is None else ("wfs", devices.wfs.mode)
             key = "sim_driver" if (mode or config.system.mode) == "sim" else "driver"
             raise ConfigError(f"devices.{name}.{key}: ''  names no driver, and no system works without one")
-        return cls(config, dm, wfs, science, screen)
+        return cls(config, dm, wfs, science, screen, modulator)
 
     def __repr__(self) -> str:
         kind = "simulated" if self.simulated else "hardware"
@@ -101,7 +105,8 @@ class Bench:
     @property
     def devices(self) -> tuple[Device, ...]:
         """The devices present, in the order of opening."""
-        return tuple(d for d in (self.dm, self.wfs, self.science, self.screen) if d is not None)
+        every = (self.dm, self.wfs, self.modulator, self.science, self.screen)
+        return tuple(device for device in every if device is not None)
 
     @property
     def is_open(self) -> bool:
@@ -119,10 +124,11 @@ class Bench:
                 (sections.wfs, self.wfs),
                 (sections.science, self.science),
                 (sections.screen, self.screen),
+                (sections.modulator, self.modulator),
             )
             if section is not None and device is not None
         }
-        speaking = (self.dm, self.wfs, self.science, self.screen)
+        speaking = (self.dm, self.wfs, self.science, self.screen, self.modulator)
         told = [d.info.simulated for d in speaking if d is not None and d.is_open]
         return "sim" in chosen or any(told)
 
@@ -167,13 +173,13 @@ class Bench:
         else:
             self._close_all(error)
 
-    def model(self, grid: SubApertureGrid | None = None) -> SyntheticModel:
+    def model(self, grid: SensorGeometry | None = None) -> SyntheticModel:
         """The synthetic model that ``calibration.model`` names.
 
         Parameters
         ----------
         grid
-            The sub-aperture grid found on the camera; ``None``: the nominal one.
+            The sensor's geometry found on the camera; ``None``: the nominal one.
 
         Raises
         ------

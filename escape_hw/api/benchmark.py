@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from escape_hw.api.threads import hold_to_one_thread
 
@@ -33,6 +34,9 @@ class BenchmarkRow:
         Which way is better.
     note
         Agreement of the results, or why there is no peer.
+    floor
+        What this machine could do at best, in ``unit``: the arithmetic that cannot be avoided at the
+        speed of its fastest matrix products, or the memory traffic; ``None`` where not counted.
     """
 
     stage: str
@@ -42,6 +46,14 @@ class BenchmarkRow:
     unit: str
     better: Better
     note: str = ""
+    floor: float | None = None
+
+    @property
+    def reached(self) -> float | None:
+        """Share of the floor that ours reaches, at most 1."""
+        if self.floor is None or self.floor == 0 or self.ours == 0:
+            return None
+        return self.ours / self.floor if self.better == "higher" else self.floor / self.ours
 
     @property
     def ratio(self) -> float | None:
@@ -51,8 +63,8 @@ class BenchmarkRow:
         return self.ours / self.peer if self.better == "higher" else self.peer / self.ours
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, the ratio included."""
-        return {**asdict(self), "ratio": self.ratio}
+        """Plain values for JSON, the ratio and the share of the floor included."""
+        return {**asdict(self), "ratio": self.ratio, "reached": self.reached}
 
 
 #: What an entry point of the group ``escape.benchmarks`` is: a function that measures.
@@ -89,6 +101,21 @@ def alternate(
             times[k].append(_elapsed(call, repeats[k]) / repeats[k])
     medians = [float(np.median(t)) for t in times]
     return medians[0], medians[1] if peer is not None else None
+
+
+def product_rate(dtype: DTypeLike = np.float32, size: int = 512) -> float:
+    """Floating-point operations per second of a large matrix product, for floors.
+
+    Parameters
+    ----------
+    dtype
+        Precision.
+    size
+        Rows and columns of the square factors.
+    """
+    a = np.ones((size, size), dtype)
+    times = [_elapsed(lambda: a @ a, 1) for _ in range(9)]
+    return 2 * size**3 / min(times)
 
 
 def _elapsed(call: Callable[[], object], repeats: int) -> float:

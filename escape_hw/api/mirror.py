@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from escape_hw.api.device import Device
 from escape_hw.errors import CommandRejected, DeviceError, SettingRejected
 from escape_hw.safety.guard import CommandGuard, GuardReport
-from escape_hw.safety.limits import MirrorLimits, neighbour_pairs
+from escape_hw.safety.limits import MirrorLimits, nearest_pairs, neighbour_pairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,6 +162,8 @@ class DeformableMirror(Device):
     def flatten(self) -> None:
         """Ramp to the flat shape in steps of at most :data:`RAMP_STEP`; legal whenever open.
 
+        A mirror that lies at rest has no shape, and is left alone.
+
         Raises
         ------
         NotOpen, DeviceError
@@ -169,6 +171,8 @@ class DeformableMirror(Device):
         """
         with self._lock:
             guard = self._checked()
+            if not self._movable():
+                return
             target = self.flat
             step = min(self.RAMP_STEP, self.limits.max_slew or self.RAMP_STEP)
             distance = float(np.abs(target - guard.last).max(initial=0.0))
@@ -196,8 +200,8 @@ class DeformableMirror(Device):
             raise DeviceError(
                 self.name, f"its layout has {int(info.layout.sum())} places for {info.n_act} actuators"
             )
-        pairs = None if info.layout is None else neighbour_pairs(info.layout)
         try:
+            pairs = _neighbours(info)
             guard = CommandGuard(self.name, info.n_act, self.limits, pairs)
         except ValueError as error:
             raise SettingRejected(self.name, f"its limits do not fit it: {error}") from error
@@ -216,6 +220,15 @@ class DeformableMirror(Device):
         """
         return None
 
+    def _movable(self) -> bool:
+        """False while the mirror lies at rest and follows no commands."""
+        return True
+
     @abc.abstractmethod
     def _send(self, command: NDArray[np.float64]) -> None:
         """Transfer a guarded, C-contiguous, read-only float64 command ``(n_act,)``."""
+
+
+def _neighbours(info: DMInfo) -> NDArray[np.intp]:
+    """Pairs of adjacent actuators ``(n_pairs, 2)``, on the grid or, where there is none, by distance."""
+    return nearest_pairs(info.positions_m) if info.layout is None else neighbour_pairs(info.layout)

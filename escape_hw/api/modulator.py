@@ -20,12 +20,27 @@ class Modulation:
     centre_rad: tuple[float, float] = (0.0, 0.0)
 
 
+@dataclass(frozen=True, slots=True)
+class ModulatorInfo:
+    """Identity of a modulator: model, serial number, largest tilt from the centre in radians."""
+
+    model: str
+    serial: str
+    max_tilt_rad: float
+    simulated: bool
+
+
 class TipTiltModulator(Device):
     """A tip-tilt stage that turns the beam in a circle; parks at its centre when stopped.
 
-    Drivers fill in ``_open``, ``_close``, ``_check``, ``_modulate``, ``_park`` and
-    ``modulation``. Closing parks first.
+    Drivers fill in ``_open``, ``_close``, ``_check``, ``_modulate``, ``_park``,
+    ``info`` and ``modulation``. Closing parks first.
     """
+
+    @property
+    @abc.abstractmethod
+    def info(self) -> ModulatorInfo:
+        """Identity and fixed properties; available once open."""
 
     @property
     @abc.abstractmethod
@@ -48,6 +63,11 @@ class TipTiltModulator(Device):
             )
         if not all(map(math.isfinite, want.centre_rad)):
             raise SettingRejected(self.name, f"{want}: the centre must be finite")
+        furthest = want.radius_rad + math.hypot(*want.centre_rad)
+        if furthest > self.info.max_tilt_rad:
+            raise SettingRejected(
+                self.name, f"{want}: tilts by {furthest:.4g} rad; it does 0 to {self.info.max_tilt_rad:g} rad"
+            )
         return self._check(want)
 
     @final

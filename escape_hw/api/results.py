@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class CalibrationResult:
     """
 
     matrix: InteractionMatrix
-    grid: SubApertureGrid
+    grid: SensorGeometry
     frames: int
     lost_frames: int
     sky_seconds: float

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.frames import Frame
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.mirror import DeformableMirror, SendReport
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.mean_focus import MeanFocus
 from escape_hw.errors import CalibrationError, ConfigError
 
-#: Spots move and blur by more than their centres of gravity show: what the window and the threshold
-#: cut off, and the turbulence within each lenslet. Found on a twin with known optics (docs/decisions).
-MOTION_FACTOR = 1.2
 #: So many frames in a row with half of the sub-apertures dark mean that the light has gone ...
 DARK_FRAMES = 25
 #: ... and dark is a sub-aperture with less than this share of its usual light.
@@ -47,11 +42,11 @@ class LightWatch:
     device
         Name of the camera, for the message.
     grid
-        Tells how much light is usual.
+        Tells how much light is usual, and what the sub-apertures are called.
     """
 
-    def __init__(self, device: str, grid: SubApertureGrid) -> None:
-        self._device = device
+    def __init__(self, device: str, grid: SensorGeometry) -> None:
+        self._device, self._elements = device, grid.elements
         self._least = DARK_SHARE * grid.counts * grid.flux[grid.valid]
         self._dark = 0
 
@@ -66,13 +61,13 @@ class LightWatch:
         self._dark = self._dark + 1 if 2 * np.count_nonzero(flux > self._least) < flux.size else 0
         if self._dark >= DARK_FRAMES:
             raise CalibrationError(
-                f"{self._device}: no light on most sub-apertures for {self._dark} frames in a row; "
+                f"{self._device}: no light on most {self._elements} for {self._dark} frames in a row; "
                 "check the source, the beam stop and the exposure"
             )
 
 
 class Motion:
-    """Running rms motion of the spots."""
+    """Running mean and rms of the slopes."""
 
     def __init__(self, n_slopes: int) -> None:
         self.n_slopes = n_slopes
@@ -86,34 +81,22 @@ class Motion:
         self._sum += slopes
         self._squares += np.square(slopes, dtype=np.float64)
 
-    def of(self, grid: SubApertureGrid) -> SubApertureGrid:
-        """The grid with the motion filled in."""
+    def of(self, grid: SensorGeometry) -> SensorGeometry:
+        """The geometry with the motion filled in."""
         if self._n < 2:
             return grid
         variance = np.maximum(self._squares / self._n - np.square(self._sum / self._n), 0).mean()
-        return replace(grid, motion_px=MOTION_FACTOR * float(np.sqrt(variance)))
+        return grid.with_motion(float(np.sqrt(variance)))
 
-    def references(self, grid: SubApertureGrid, focus: MeanFocus | None = None) -> SubApertureGrid:
-        """The grid with its references moved onto the lattice of the mean spots of all frames.
+    def references(self, grid: SensorGeometry, focus: MeanFocus | None = None) -> SensorGeometry:
+        """The geometry with the references that all frames of a run give, instead of its first ones.
 
-        The grid was found on the first frames, whose mean tilt and focus are the turbulence's own;
-        over the whole run they average out further. The windows stay where they are, so every
-        slope of the run keeps its meaning. ``focus``, which saw the same frames, takes out what the
-        wind explains of the mean focus.
+        ``focus``, which saw the same frames, takes out what the wind explains of the mean focus.
         """
         if self._n < 2:
             return grid
-        total = self._sum / self._n
-        mean = (total if focus is None else focus.corrected(total)).reshape(2, -1).T
-        rows, columns = np.nonzero(grid.valid)
-        at = np.stack([columns, rows], axis=1) - (np.array(grid.valid.shape[::-1]) - 1) / 2
-        weight = grid.flux[grid.valid].astype(float)
-        shift = weight @ mean / weight.sum()
-        middle = weight @ at / weight.sum()
-        lever = at - middle
-        stretch = float((weight[:, None] * lever * (mean - shift)).sum() / (weight[:, None] * lever**2).sum())
-        lattice = shift + stretch * lever
-        return replace(grid, references_px=(grid.references_px + lattice).astype(np.float32))
+        mean = self._sum / self._n
+        return grid.with_mean_slopes(mean if focus is None else focus.corrected(mean))
 
 
 def reachable(dm: DeformableMirror, shape: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -162,7 +145,7 @@ def next_frame(bench: Bench) -> Frame:
 
 def measured_matrix(
     bench: Bench,
-    grid: SubApertureGrid,
+    grid: SensorGeometry,
     m2c: NDArray[np.float64],
     data: NDArray[np.float64],
     sigma: NDArray[np.float64],
@@ -179,4 +162,5 @@ def measured_matrix(
         method,
         bench.simulated,
         dict(metrics),
+        grid.slope_unit,
     )

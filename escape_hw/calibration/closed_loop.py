@@ -14,15 +14,15 @@ from escape_hw.api.frames import Frame
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import LoopResult, StrehlEstimate
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, next_frame, some_frames
-from escape_hw.calibration.sensor_setup import extractor
+from escape_hw.calibration.sensor_setup import extractor, prepare_sensor
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, IncompatibleProduct
+from escape_hw.pipeline.design_psf import design_psf
 from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.integrator import LeakyIntegrator, gain_limit
 from escape_hw.pipeline.reconstructor import reconstructor
-from escape_hw.pipeline.slopes import SlopeExtractor
 from escape_hw.pipeline.standard_error import LEAST
 from escape_hw.pipeline.strehl import has_light, strehl, without_background
 
@@ -54,6 +54,9 @@ class _Record:
 def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32]]:
     """Mean PSF with a flat mirror and no turbulence in the beam (paper: the empirical model).
 
+    Under a sky that cannot be switched off (``devices.science.model_psf = "design"``) it is the
+    diffraction image of the design's pupil, and no frame is taken.
+
     Raises
     ------
     CalibrationError
@@ -63,6 +66,11 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
     science = bench.science
     if science is None:
         raise CalibrationError("this system has no science camera to take a PSF with")
+    config = bench.config.devices.science
+    if config is not None and config.model_psf == "design":
+        _, pupil, pixel_m = bench.model().influence_functions()
+        across = bench.config.system.pupil_m / pixel_m
+        return design_psf(pupil, across, config.psf_px, (config.region[3], config.region[2]))
     bench.dm.flatten()
     science.stop()
     wait = bench.config.devices.science.timeout_s if bench.config.devices.science else 1.0
@@ -87,7 +95,7 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
 def closed_loop(
     bench: Bench,
     matrix: InteractionMatrix,
-    grid: SubApertureGrid,
+    grid: SensorGeometry,
     *,
     gain: float | None = None,
     leak: float | None = None,
@@ -137,6 +145,7 @@ def closed_loop(
     _require_fit(bench, matrix, grid)
     stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
     control = LeakyIntegrator(reconstructor(matrix.data, scale=stroke, dropped_modes=dropped), gain, leak)
+    prepare_sensor(bench)
     slopes_of = extractor(bench, grid)
     record, partial = _Record(), False
     science = bench.science if model_psf is not None else None
@@ -171,7 +180,7 @@ def closed_loop(
     )  # fmt: skip
 
 
-def _require_fit(bench: Bench, matrix: InteractionMatrix, grid: SubApertureGrid) -> None:
+def _require_fit(bench: Bench, matrix: InteractionMatrix, grid: SensorGeometry) -> None:
     """Raise :class:`IncompatibleProduct` unless mirror, matrix and grid belong together."""
     if matrix.m2c.shape[0] != bench.dm.info.n_act or matrix.n_slopes != grid.n_slopes:
         raise IncompatibleProduct(
@@ -179,7 +188,7 @@ def _require_fit(bench: Bench, matrix: InteractionMatrix, grid: SubApertureGrid)
             f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
         )
     if not np.array_equal(matrix.valid, grid.valid):
-        raise IncompatibleProduct("the matrix and the grid mark different sub-apertures as valid")
+        raise IncompatibleProduct(f"the matrix and the geometry mark different {grid.elements} as valid")
 
 
 def _judged(
@@ -202,7 +211,7 @@ def _judged(
 def _run(
     bench: Bench,
     matrix: InteractionMatrix,
-    slopes_of: SlopeExtractor,
+    slopes_of: SlopeFunction,
     control: LeakyIntegrator,
     frames: int,
     watch: bool,
@@ -280,7 +289,7 @@ def _percentiles(latency_ns: list[int]) -> dict[str, float]:
 def best_gain(
     bench: Bench,
     matrix: InteractionMatrix,
-    grid: SubApertureGrid,
+    grid: SensorGeometry,
     *,
     gains: tuple[float, ...] | None = None,
     frames: int = 1500,

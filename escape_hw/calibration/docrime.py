@@ -2,42 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from escape_hw.api.frames import Frame
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import (
-    LightWatch,
-    Motion,
     measured_matrix,
-    next_frame,
-    reachable,
     some_frames,
 )
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator, DocrimeSolution
-from escape_hw.calibration.mean_focus import MeanFocus
+from escape_hw.calibration.poke_session import PokeSession, Record
 from escape_hw.calibration.sensor_setup import (
     SETUP_FRAMES,
-    extractor,
     modal_basis,
     poke_amplitudes,
-    setup_from_frames,
 )
 from escape_hw.config.models import CalibrationSection
 from escape_hw.errors import Aborted, TooFewFrames
-from escape_hw.pipeline.slopes import SlopeExtractor
-
-#: Seconds of turbulence over which the mean tilt and focus in the references average out well enough.
-_REFERENCE_S = 10.0
-
-Record = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,95 +39,13 @@ class DocrimeRun:
     record: Record | None = None
 
 
-@dataclass(slots=True, eq=False)
-class _Session:
-    """State of a run: frames wait until the grid is known, then go straight to the estimator."""
-
-    bench: Bench
-    estimator_order: int
-    lags: int
-    n_modes: int
-    grid: SubApertureGrid | None
-    setup_frames: int
-    correlations: bool
-    mean_frame: NDArray[np.float32] | None = None
-    slopes_of: SlopeExtractor | None = None
-    estimator: DocrimeEstimator | None = None
-    motion: Motion | None = None
-    focus: MeanFocus | None = None
-    light: LightWatch | None = None
-    waiting: list[tuple[Frame, NDArray[np.float64]]] = field(default_factory=list)
-    taken: int = 0
-    kept: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] | None = None
-
-    def take(self, frame: Frame, poke: NDArray[np.float64]) -> None:
-        self.taken += 1
-        if self.estimator is None:
-            self.waiting.append((frame, poke))
-            if self.grid is not None or len(self.waiting) >= self.setup_frames:
-                self.ready()
-        else:
-            self._feed(frame, poke)
-
-    def ready(self) -> None:
-        """Set up the sensor, on the frames that wait if no grid was given, and work them off."""
-        if self.estimator is not None or not self.waiting:
-            return
-        if self.grid is None:
-            total = np.zeros(self.waiting[0][0].data.shape)
-            for frame, _ in self.waiting:
-                total += frame.data
-            mean = (total / len(self.waiting)).astype(np.float32)
-            setup = setup_from_frames(self.bench, mean)
-            self.grid, self.mean_frame = setup.grid, setup.mean_frame
-        self.slopes_of = extractor(self.bench, self.grid)
-        self.motion, self.light = Motion(self.grid.n_slopes), LightWatch(self.bench.wfs.name, self.grid)
-        if self.mean_frame is not None:
-            self.focus = MeanFocus(self.grid, self.bench.wfs.settings.frame_rate_hz)
-        self.estimator = DocrimeEstimator(
-            self.grid.n_slopes,
-            self.n_modes,
-            order=self.estimator_order,
-            lags=self.lags,
-            correlations=self.correlations,
-        )
-        for frame, poke in self.waiting:
-            self._feed(frame, poke)
-        self.waiting = []
-
-    def finished_grid(self) -> SubApertureGrid:
-        """The grid with all that the run taught about it; given references stay as they were."""
-        if self.grid is None or self.motion is None:
-            raise RuntimeError("the sensor was never set up")
-        grid = self.motion.of(self.grid)
-        return grid if self.mean_frame is None else self.motion.references(grid, self.focus)
-
-    def _feed(self, frame: Frame, poke: NDArray[np.float64]) -> None:
-        if self.slopes_of is None or self.motion is None or self.light is None or self.estimator is None:
-            raise RuntimeError("frames were fed before the sensor was set up")
-        slopes = self.slopes_of(frame.data)
-        self.light(self.slopes_of.flux)
-        self.motion.add(slopes)
-        if self.focus is not None:
-            self.focus.add(slopes)
-        self.estimator.partial_fit(frame.index, slopes, poke)
-        if self.kept is not None:
-            self.kept.append((frame.index, slopes, poke))
-
-    def record(self) -> Record | None:
-        if self.kept is None:
-            return None
-        index, slopes, pokes = zip(*self.kept, strict=True)
-        return np.array(index, np.int64), np.stack(slopes), np.stack(pokes).astype(np.float32)
-
-
 def docrime_run(
     bench: Bench,
     *,
     frames: int | None = None,
     poke: float | None = None,
     whiten: bool = True,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
     record: bool = False,
     correlations: bool = True,
 ) -> Procedure[DocrimeRun]:
@@ -155,30 +59,13 @@ def docrime_run(
     m2c = modal_basis(bench)
     amplitude = poke_amplitudes(bench, m2c, poke)
     require_frames(c, n_frames, m2c.shape[1], whiten)
-    to_modes = np.linalg.pinv(m2c)
-    session = _Session(
-        bench, c.whiten_order if whiten else 0, c.lags, m2c.shape[1], grid, min(SETUP_FRAMES, n_frames),
-        correlations,
-    )  # fmt: skip
-    session.kept = [] if record else None
-    shortened, partial = 0, False
-    report = Reporter("DO-CRIME", n_frames)
-    try:
-        bench.dm.flatten()
-        try:
-            for done in range(n_frames):
-                frame = next_frame(bench)
-                wanted = m2c @ (amplitude * bench.rng.uniform(-1.0, 1.0, m2c.shape[1]))
-                allowed = reachable(bench.dm, wanted)
-                shortened += not np.array_equal(wanted, allowed)
-                # What was really sent, not what was asked for: a shortened poke is still a known poke.
-                session.take(frame, to_modes @ bench.dm.send(allowed).sent)
-                if report.due():
-                    yield report(done + 1, shortened=float(shortened))
-        except Aborted:
-            partial = True
-    finally:
-        bench.dm.flatten()
+    order, lags = c.whiten_order if whiten else 0, c.lags
+
+    def estimator(n_slopes: int) -> DocrimeEstimator:
+        return DocrimeEstimator(n_slopes, m2c.shape[1], order=order, lags=lags, correlations=correlations)
+
+    session = PokeSession(bench, m2c, grid, min(SETUP_FRAMES, n_frames), estimator, keep=record)
+    partial = yield from session.poke(n_frames, amplitude)
     session.ready()
     if session.estimator is None or session.grid is None or session.motion is None:
         raise Aborted("aborted before the first frames")
@@ -192,26 +79,21 @@ def docrime_run(
         bench, session.grid, m2c, solution.matrix, solution.sigma,
         "docrime-whitened" if whiten else "docrime",
         frames=solution.frames, lost_frames=solution.lost_frames, poke=float(poke),
-        shortened=shortened, delay_frames=solution.response.delay,
+        shortened=session.shortened, delay_frames=solution.response.delay,
         whitening_order=solution.whitener.size - 1, gain_sigma=solution.gain_sigma,
     )  # fmt: skip
     return DocrimeRun(_result(session, matrix, solution, partial), solution, session.record())
 
 
 def _result(
-    session: _Session, matrix: InteractionMatrix, solution: DocrimeSolution, partial: bool
+    session: PokeSession, matrix: InteractionMatrix, solution: DocrimeSolution, partial: bool
 ) -> CalibrationResult:
     """The matrix with all that the run taught about the sensor."""
     notes = []
     if float(np.median(matrix.snr())) < 1:
         notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
+    notes += session.notes()
     seconds = (solution.frames + solution.lost_frames) / session.bench.wfs.settings.frame_rate_hz
-    if session.focus is not None and seconds < _REFERENCE_S and session.focus.still() is None:
-        notes.append(
-            f"the references hold the mean focus of {seconds:.1f} s of turbulence, which costs Strehl ratio "
-            "and which the wind does not explain; the matrix is not touched by it: close the loop on "
-            "references taken over a longer time"
-        )
     return CalibrationResult(
         matrix,
         session.finished_grid(),
@@ -231,7 +113,7 @@ def docrime(
     frames: int | None = None,
     poke: float | None = None,
     whiten: bool = True,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
 ) -> Procedure[CalibrationResult]:
     """Measure the interaction matrix by random pokes, under turbulence or not.
 
@@ -262,7 +144,7 @@ def docrime(
     TooFewFrames
         Too few frames for the number of modes; nothing moved.
     CalibrationError
-        No spots, no light, no response, or pokes that do not span the modes.
+        No spots or pupil images, no light, no response, or pokes that do not span the modes.
     Aborted
         Stopped before a matrix could be solved.
     """
@@ -273,15 +155,20 @@ def docrime(
     return run.result
 
 
+def least_frames(settings: CalibrationSection, n_modes: int, whiten: bool = True) -> int:
+    """Fewest frames that a matrix is worth starting with: twice the unknowns per slope."""
+    return 2 * (n_modes + (settings.whiten_order if whiten else 0) + settings.lags)
+
+
 def require_frames(settings: CalibrationSection, frames: int, n_modes: int, whiten: bool = True) -> None:
     """Raise unless the frames are twice the unknowns per slope.
 
     Raises
     ------
     TooFewFrames
-        Says how many are worth starting with.
+        Says how many are needed.
     """
-    needed = 2 * (n_modes + (settings.whiten_order if whiten else 0) + settings.lags)
+    needed = least_frames(settings, n_modes, whiten)
     if frames < needed:
         raise TooFewFrames(
             f"{frames} frames cannot constrain {n_modes} modes; ask for at least {needed} frames, "

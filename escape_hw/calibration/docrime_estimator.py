@@ -49,6 +49,10 @@ class DocrimeSolution:
     covariance
         Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; diagonal where
         correlations were not asked for.
+    gram
+        Sum over frames of filtered pokes times filtered pokes ``(n_modes, n_modes)``.
+    variance
+        Variance of each slope's filtered noise, with what its correlation over time adds ``(n_slopes,)``.
     whitener
         The filter used, ``[1]`` for the plain estimator.
     gain_sigma
@@ -60,6 +64,8 @@ class DocrimeSolution:
     sigma: NDArray[np.float64]
     response: TemporalResponse
     covariance: NDArray[np.float64]
+    gram: NDArray[np.float64]
+    variance: NDArray[np.float64]
     whitener: NDArray[np.float64]
     frames: int
     lost_frames: int
@@ -219,6 +225,8 @@ class DocrimeEstimator:
             sigma * abs(scale),
             self._tracker.response(),
             covariance,
+            sums.gram / scale**2,
+            variance,
             self._whitener,
             self.frames,
             self.lost_frames,

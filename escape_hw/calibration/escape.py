@@ -5,66 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import measured_matrix
-from escape_hw.calibration.derivatives import modal_jacobian
-from escape_hw.calibration.docrime import docrime_run
+from escape_hw.calibration.docrime import docrime_run, least_frames
+from escape_hw.calibration.escape_few import escape_from_few
+from escape_hw.calibration.pseudo_synthetic import synthesise
 from escape_hw.calibration.sprint import sprint_steps
-from escape_hw.errors import Aborted
-
-
-def pseudo_synthetic(
-    model: SyntheticModel, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The model's matrix at an estimated registration, and its standard errors.
-
-    Parameters
-    ----------
-    model
-        The synthetic model.
-    estimate
-        Result of SPRINT.
-    m2c
-        Modal basis ``(n_act, n_modes)``.
-
-    Returns
-    -------
-    matrix, sigma : ndarray, ``(n_slopes, n_modes)``
-        The errors are those of registration and gain, propagated to first order.
-    """
-    width, gain = estimate.width.value, estimate.gain.value
-    unit, derivatives = modal_jacobian(model, estimate.registration, m2c, width)
-    jacobian = gain * derivatives[:5]
-    variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
-    variance += np.square(unit * estimate.gain.sigma)
-    return gain * unit, np.sqrt(np.maximum(variance, 0))
-
-
-def synthesise(
-    bench: Bench, grid: SubApertureGrid, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
-) -> CalibrationResult:
-    """A calibration made of a registration alone, with nothing moved.
-
-    Parameters
-    ----------
-    bench
-        Gives the model.
-    grid
-        The sensor's grid.
-    estimate
-        The registration.
-    m2c
-        Modal basis ``(n_act, n_modes)``.
-    """
-    data, sigma = pseudo_synthetic(bench.model(grid), estimate, m2c)
-    matrix = measured_matrix(bench, grid, m2c, data, sigma, "escape", gain=estimate.gain.value)
-    return CalibrationResult(matrix, grid, 0, 0, 0.0, registration=estimate)
+from escape_hw.calibration.telemetry_sprint import independent_columns
+from escape_hw.config.models import ESTIMATORS
+from escape_hw.errors import Aborted, ConfigError
 
 
 def escape(
@@ -72,8 +24,9 @@ def escape(
     *,
     frames: int | None = None,
     poke: float | None = None,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
     whiten: bool = True,
+    estimator: str | None = None,
 ) -> Procedure[CalibrationResult]:
     """Calibrate without a source: measure under turbulence, find the registration, synthesise.
 
@@ -81,43 +34,66 @@ def escape(
     ----------
     bench, frames, poke, grid, whiten
         As for :func:`~escape_hw.calibration.docrime.docrime`.
+    estimator
+        ``"matrix"``: SPRINT fits the DO-CRIME matrix, mode by mode, as the paper does.
+        ``"telemetry"``: it fits what the whitened frames hold, which takes fewer frames than modes and
+        loses nothing (see :mod:`~escape_hw.calibration.telemetry_sprint`). As configured by default;
+        ``"auto"`` is the second.
 
     Returns
     -------
     CalibrationResult
-        ``matrix`` is pseudo-synthetic, ``measured`` the DO-CRIME matrix behind it, ``registration``
-        what SPRINT found; ``registration.converged`` says whether to trust it. Stopped early,
-        ``matrix`` is the DO-CRIME matrix, ``partial`` is true and ``registration`` is ``None``.
+        ``matrix`` is pseudo-synthetic, ``measured`` the DO-CRIME matrix behind it (``None`` if there
+        were too few frames for one), ``registration`` what SPRINT found; ``registration.converged``
+        says whether to trust it. Stopped early, ``matrix`` is the DO-CRIME matrix, ``partial`` is true
+        and ``registration`` is ``None``.
 
     Raises
     ------
+    ConfigError
+        No such estimator; nothing moved.
     TooFewFrames, CalibrationError, Aborted
         As for DO-CRIME.
     """
+    c = bench.config.calibration
+    estimator = c.estimator if estimator is None else estimator
+    if estimator not in ESTIMATORS:
+        raise ConfigError(f"estimator '{estimator}' is unknown; it is one of {', '.join(ESTIMATORS)}")
+    from_matrix = estimator == "matrix" or not whiten
+    n_frames = c.frames if frames is None else frames
+    if not from_matrix and n_frames < least_frames(c, bench.config.basis.n_modes):
+        return (yield from escape_from_few(bench, frames=n_frames, poke=poke, grid=grid))
     run = yield from docrime_run(bench, frames=frames, poke=poke, grid=grid, whiten=whiten)
-    measured, c = run.result, bench.config.calibration
+    measured, solution = run.result, run.solution
     if measured.partial:
         return measured
+    matrix, modes = measured.matrix, min(c.sprint_modes, measured.matrix.n_modes)
+    if not from_matrix:
+        matrix = independent_columns(matrix, solution.gram, solution.variance)
+        modes = matrix.n_modes
     try:
         yield Reporter("synthetic model", 1, "model")(0)
         estimate = yield from sprint_steps(
-            measured.matrix,
+            matrix,
             bench.model(measured.grid),
-            modes=min(c.sprint_modes, measured.matrix.n_modes),
+            modes=modes,
             learning_rate=c.learning_rate,
-            covariance=run.solution.covariance,
+            covariance=solution.covariance,
         )
     except Aborted:
         return replace(measured, partial=True)
     made = synthesise(bench, measured.grid, estimate, measured.matrix.m2c)
     metrics = {**measured.matrix.metrics, **made.matrix.metrics}
-    # What errs for all of the measured matrix alike no fit to it can tell.
-    gain = estimate.gain
-    whole = float(np.hypot(gain.sigma, gain.value * run.solution.gain_sigma))
     return replace(
         measured,
         matrix=replace(made.matrix, metrics=metrics),
-        registration=replace(estimate, gain=replace(gain, sigma=whole)),
+        registration=_with_gain_error(estimate, solution.gain_sigma),
         measured=measured.matrix,
         notes=(*measured.notes, *estimate.warnings),
     )
+
+
+def _with_gain_error(estimate: RegistrationEstimate, relative: float) -> RegistrationEstimate:
+    """The estimate with the error that all modes share, which no fit to a matrix can tell."""
+    gain = estimate.gain
+    return replace(estimate, gain=replace(gain, sigma=float(np.hypot(gain.sigma, gain.value * relative))))

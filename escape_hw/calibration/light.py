@@ -139,6 +139,7 @@ class LightProblem:
             return None
         if not np.isfinite(step).all():
             return None
+        spread *= self.weighted.noise(fit.residual)
         fit.settled = bool((np.abs(step) < np.maximum(SMALL, 0.02 * spread)).all())
         return np.asarray(step)
 

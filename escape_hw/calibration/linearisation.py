@@ -44,15 +44,13 @@ class State:
 class Problem:
     """One matrix, one model, and the weights between them."""
 
-    def __init__(
-        self, weighted: WeightedMatrix, valid: NDArray[np.bool_], model: SyntheticModel, priors: Priors
-    ) -> None:
+    def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, priors: Priors) -> None:
         self.weighted = weighted
         self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
-        rows, cols = np.nonzero(valid)
+        rows, cols = np.nonzero(weighted.valid)
         # x slopes share what their column does to them, y slopes what their row does.
-        self.lines = np.unique(np.concatenate([cols, valid.shape[1] + rows]), return_inverse=True)[1]
+        self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
         self.precision = np.concatenate(
             [

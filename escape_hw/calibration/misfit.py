@@ -55,6 +55,8 @@ class NormalEquations:
         Its coupling with the slope gains ``(n_slopes, n_inner)``.
     diagonal
         The slope gains' own part ``(n_slopes,)``.
+    whole
+        ``inner`` with the slope gains eliminated.
     right
         Right-hand side of the whole system.
     common, sampled, slopes_gain, slopes_width, modes, model, residual, lines
@@ -64,6 +66,7 @@ class NormalEquations:
     inner: NDArray[np.float64]
     across: NDArray[np.float64]
     diagonal: NDArray[np.float64]
+    whole: NDArray[np.float64]
     right: NDArray[np.float64]
     common: NDArray[np.float64]
     sampled: NDArray[np.float64]
@@ -88,12 +91,12 @@ class NormalEquations:
         """The Gauss-Newton step, in the order of the unknowns."""
         n = len(self.inner)
         scaled = self.right[n:] / self.diagonal
-        first = np.linalg.solve(self._without_slopes(), self.right[:n] - self.across.T @ scaled)
+        first = np.linalg.solve(self.whole, self.right[:n] - self.across.T @ scaled)
         return np.concatenate([first, scaled - self.across @ first / self.diagonal])
 
     def information(self) -> NDArray[np.float64]:
         """Information on the common parameters ``(n_common, n_common)``, random effects integrated out."""
-        k, whole = self.n_common, self._without_slopes()
+        k, whole = self.n_common, self.whole
         return np.asarray(whole[:k, :k] - whole[:k, k:] @ np.linalg.solve(whole[k:, k:], whole[k:, :k]))
 
     def efficient(self) -> NDArray[np.float64]:
@@ -104,7 +107,7 @@ class NormalEquations:
         ndarray, ``(n_common, n_slopes, n_modes)``
         """
         k, n_act = self.n_common, len(self.modes)
-        whole = self._without_slopes()
+        whole = self.whole
         inner = np.linalg.solve(whole[k:, k:], whole[k:, :k])
         by_slope = (self.across[:, :k] - self.across[:, k:] @ inner) / self.diagonal[:, None]
         n_lines = len(inner) - 2 * n_act
@@ -116,9 +119,6 @@ class NormalEquations:
             if n_lines:
                 out[p] -= by_line[self.lines, None] * self.sampled
         return out
-
-    def _without_slopes(self) -> NDArray[np.float64]:
-        return np.asarray(self.inner - self.across.T @ (self.across / self.diagonal[:, None]))
 
 
 def normal_equations(
@@ -195,7 +195,9 @@ def normal_equations(
     )
     n = len(inner)
     inner[np.diag_indices(n)] += precision[:n]
+    diagonal = np.square(model).sum(axis=1) + precision[n:]
+    whole = inner - across.T @ (across / diagonal[:, None])
     return NormalEquations(
-        inner, across, np.square(model).sum(axis=1) + precision[n:], right - precision * offset,
+        inner, across, diagonal, whole, right - precision * offset,
         common, sampled, slopes_gain, slopes_width, modes, model, residual, lines,
     )  # fmt: skip

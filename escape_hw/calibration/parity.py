@@ -43,7 +43,7 @@ def parity_hint(matrix: InteractionMatrix, model: SyntheticModel, columns: NDArr
     if not isinstance(model, DifferentiableModel):
         return None
     weighted = WeightedMatrix.of(matrix, np.sort(columns)[:COARSE])
-    for view, seen in _seen_otherwise(weighted, matrix.valid):
+    for view, seen in _seen_otherwise(weighted):
         problem = LightProblem(seen, model)
         *_, fit = problem.descend(np.zeros(5), _ITERATIONS)
         if seen.explained(fit.residual) >= EXPLAINED * seen.explicable:
@@ -52,10 +52,9 @@ def parity_hint(matrix: InteractionMatrix, model: SyntheticModel, columns: NDArr
     return None
 
 
-def _seen_otherwise(
-    weighted: WeightedMatrix, valid: NDArray[np.bool_]
-) -> Iterator[tuple[str, WeightedMatrix]]:
+def _seen_otherwise(weighted: WeightedMatrix) -> Iterator[tuple[str, WeightedMatrix]]:
     """The matrix as a sensor turned or flipped would have seen it; slopes it would not have are left out."""
+    valid = weighted.valid
     number = np.full(valid.shape, -1)
     number[valid] = np.arange(int(valid.sum()))
     middle = (np.array(valid.shape) - 1) / 2

@@ -7,12 +7,18 @@ from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, Motion, go_to, measured_matrix, next_frame, some_frames
-from escape_hw.calibration.sensor_setup import extractor, find_sensor, modal_basis, poke_amplitudes
+from escape_hw.calibration.sensor_kinds import kind_of
+from escape_hw.calibration.sensor_setup import (
+    extractor,
+    find_sensor,
+    modal_basis,
+    poke_amplitudes,
+    prepare_sensor,
+)
 from escape_hw.errors import Aborted, CalibrationError
-from escape_hw.pipeline.slopes import SlopeExtractor
 
 #: Frames watched after a test step, to see when the sensor has settled.
 _STEP_FRAMES = 30
@@ -20,7 +26,7 @@ _STEP_FRAMES = 30
 _SETTLED = 0.02
 
 
-def settling_frames(bench: Bench, slopes_of: SlopeExtractor, command: NDArray[np.float64]) -> Procedure[int]:
+def settling_frames(bench: Bench, slopes_of: SlopeFunction, command: NDArray[np.float64]) -> Procedure[int]:
     """Frames to skip after a step until the sensor shows all of it, found by a test step.
 
     Raises
@@ -54,7 +60,7 @@ def push_pull(
     *,
     poke: float | None = None,
     frames: int | None = None,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
 ) -> Procedure[CalibrationResult]:
     """Push and pull every mode and average the slopes.
 
@@ -83,7 +89,7 @@ def push_pull(
     ConfigError
         A number of frames or a poke that means nothing; nothing moved.
     CalibrationError
-        No spots, no light, or no response.
+        No spots or pupil images, no light, or no response.
     Aborted
         Stopped before the first mode was measured.
     """
@@ -94,9 +100,10 @@ def push_pull(
     amplitude = poke_amplitudes(bench, m2c, poke)
     try:
         bench.dm.flatten()
+        prepare_sensor(bench)
         mean_frame = None
         if grid is None:
-            setup = yield from find_sensor(bench)
+            setup = yield from find_sensor(bench, references=kind_of(bench).source_references)
             grid, mean_frame = setup.grid, setup.mean_frame
         slopes_of = extractor(bench, grid)
         skip = yield from settling_frames(bench, slopes_of, m2c[:, 0] * amplitude[0] * 3)
@@ -134,7 +141,7 @@ def push_pull(
 
 def _one_mode(
     bench: Bench,
-    slopes_of: SlopeExtractor,
+    slopes_of: SlopeFunction,
     shape: NDArray[np.float64],
     amplitude: float,
     skip: int,
@@ -165,7 +172,7 @@ def _one_mode(
 
 
 def _slopes(
-    bench: Bench, slopes_of: SlopeExtractor, frames: int, report: Reporter, light: LightWatch | None = None
+    bench: Bench, slopes_of: SlopeFunction, frames: int, report: Reporter, light: LightWatch | None = None
 ) -> Procedure[NDArray[np.float32]]:
     """Slopes of the next frames ``(frames, n_slopes)``; ``report`` counts them on."""
     stack = np.empty((frames, slopes_of.grid.n_slopes), np.float32)

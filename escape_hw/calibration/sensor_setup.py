@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Procedure, Reporter
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import some_frames
 from escape_hw.calibration.modes import karhunen_loeve, unit_rms, zonal
-from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
-from escape_hw.pipeline.grid import find_grid
-from escape_hw.pipeline.slopes import SlopeExtractor
+from escape_hw.calibration.sensor_kinds import kind_of
+from escape_hw.errors import CalibrationError, ConfigError
 
 #: Frames whose mean the grid is found on.
 SETUP_FRAMES = 200
@@ -24,31 +23,27 @@ _OUTER_SCALE = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorSetup:
-    """What the sensor's frames say about it: the grid, and the mean frame it was found on."""
+    """What the sensor's frames say about it: its geometry, and the mean frame that was found on."""
 
-    grid: SubApertureGrid
+    grid: SensorGeometry
     mean_frame: NDArray[np.float32]
 
 
-def threshold_counts(bench: Bench) -> float:
-    """Centre-of-gravity threshold in counts above the background."""
-    return bench.config.sensor.threshold * bench.wfs.info.full_scale
+def prepare_sensor(bench: Bench) -> None:
+    """Make the sensor ready for a measurement: a pyramid's modulator turns as configured.
 
-
-def background_level(mean_frame: NDArray[np.float32], spot_px: float) -> float:
-    """Level of the pixels that no spot reaches, in counts: the mode of the darkest half.
-
-    Between the spots and outside the pupil a frame is dark; a quarter of the darkest quantile and
-    its mirror image about the median of the darkest fifth leave out the wings of the spots.
+    Raises
+    ------
+    SettingRejected, DeviceError
+        The modulator cannot do that, or did not start.
     """
-    darkest = np.sort(mean_frame.ravel())[: max(1, mean_frame.size // 5)]
-    return float(np.median(darkest))
+    kind_of(bench).prepare(bench)
 
 
 def setup_from_frames(
-    bench: Bench, mean_frame: NDArray[np.float32], references: str = "lattice"
+    bench: Bench, mean_frame: NDArray[np.float32], references: str = "design"
 ) -> SensorSetup:
-    """Find the grid on a mean frame.
+    """Find the sensor's geometry on a mean frame.
 
     Parameters
     ----------
@@ -57,63 +52,69 @@ def setup_from_frames(
     mean_frame
         Mean of raw frames in counts ``(rows, columns)``.
     references
-        See :func:`~escape_hw.pipeline.grid.find_grid`.
+        See :func:`find_sensor`.
     """
-    sensor = bench.config.sensor
-    background = background_level(mean_frame, sensor.spot_px) if bench.dark is None else 0.0
-    clean = mean_frame - (background if bench.dark is None else bench.dark)
-    if bench.flat is not None:
-        clean = clean / bench.flat
-    grid = find_grid(
-        clean.astype(np.float32),
-        n_sub=sensor.n_sub,
-        nominal_pitch_px=sensor.pitch_px,
-        threshold=threshold_counts(bench),
-        min_flux=sensor.min_flux,
-        references=references,
-    )
-    return SensorSetup(replace(grid, background=background), mean_frame)
+    kind = kind_of(bench)
+    background = kind.background(mean_frame) if bench.dark is None else 0.0
+    grid = kind.find(bench, _calibrated(bench, mean_frame, background), references)
+    return SensorSetup(grid.with_background(background), mean_frame)
 
 
-def extractor(bench: Bench, grid: SubApertureGrid) -> SlopeExtractor:
-    """Slopes of this bench's camera on a grid.
+def refined(bench: Bench, grid: SensorGeometry, mean_frame: NDArray[np.float32]) -> SensorGeometry:
+    """A geometry, better known by the mean of all raw frames of a run."""
+    return kind_of(bench).refined(grid, _calibrated(bench, mean_frame, grid.background))
+
+
+def _calibrated(bench: Bench, frame: NDArray[np.float32], background: float) -> NDArray[np.float32]:
+    """A raw frame without dark and flat."""
+    clean = frame - (background if bench.dark is None else bench.dark)
+    return np.asarray(clean if bench.flat is None else clean / bench.flat, np.float32)
+
+
+def extractor(bench: Bench, grid: SensorGeometry) -> SlopeFunction:
+    """Slopes of this bench's camera on a geometry.
 
     Raises
     ------
     IncompatibleProduct
-        The grid leaves the camera's region.
+        The geometry leaves the camera's region, or is that of another kind of sensor.
     CalibrationError
         The dark frame is of another region.
     """
     region = bench.wfs.settings.region
     shape = (region.height, region.width)
-    centres, half = grid.centres_px(), grid.pitch_px / 2
-    if (centres < half - 1).any() or (centres > np.array(shape[::-1]) - half).any():
-        raise IncompatibleProduct(
-            "the lenslet grid reaches beyond the camera's region of "
-            f"{region.width} x {region.height} pixels; it was found on another region, so measure again"
-        )
     if bench.dark is not None and bench.dark.shape != shape:
         raise CalibrationError(
             f"the dark frame has shape {bench.dark.shape}, the camera delivers {shape}; measure it again"
         )
     dark = bench.dark if bench.dark is not None else np.full(shape, grid.background, np.float32)
-    return SlopeExtractor(grid, shape, dark=dark, flat=bench.flat, threshold=threshold_counts(bench))
+    return kind_of(bench).extractor(bench, grid, shape, dark)
 
 
 def find_sensor(
-    bench: Bench, *, frames: int = SETUP_FRAMES, references: str = "lattice"
+    bench: Bench, *, frames: int = SETUP_FRAMES, references: str = "design"
 ) -> Procedure[SensorSetup]:
-    """Watch the sensor for a while and find its grid.
+    """Watch the sensor for a while and find its geometry.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    frames
+        Frames to average.
+    references
+        ``"design"``: what a flat wavefront shows on a sensor as designed (the choice under
+        turbulence); ``"mean"``: what the frames show (for a source whose wavefront is flat).
 
     Raises
     ------
     CalibrationError
-        No spots where the design says there should be.
+        No spots or pupil images where the design says there should be.
     """
     some_frames(frames)
+    prepare_sensor(bench)
     total = np.zeros((), np.float64)
-    report = Reporter("find the lenslet grid", frames)
+    report = Reporter(f"find the {kind_of(bench).sought}", frames)
     for done in range(frames):
         total = total + bench.wfs.next_frame(bench.config.devices.wfs.timeout_s).data
         if report.due():

@@ -164,7 +164,7 @@ def _steps(
         begin = light.alpha
     if misfit:
         found = yield from _with_misfit(
-            Problem(weighted, matrix.valid, model, priors or Priors()),
+            Problem(weighted, model, priors or Priors()),
             Registration.from_array(begin), max_iterations, learning_rate, report, history,
         )  # fmt: skip
     else:
@@ -206,6 +206,7 @@ def _with_misfit(
         if not np.isfinite(step).all():
             break
         spread = np.sqrt(np.abs(np.diag(np.linalg.inv(system.information()))))[1:6]
+        spread *= problem.weighted.noise(system.residual)
         relative = np.abs(step[1:6]) / np.maximum(SMALL, 0.02 * spread)
         norm = float(np.linalg.norm(step[1:6] / _LARGEST))
         history.append(_record(state.alpha, state.gain, system.residual, norm))

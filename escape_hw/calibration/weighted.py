@@ -69,6 +69,10 @@ class WeightedMatrix:
             return 1.0
         return max(1 - self.data.size / float(np.square(self.data).sum()), 0.0)
 
+    def noise(self, residual: NDArray[np.float64]) -> float:
+        """Noise of an element in the units of the data: 1, or the rms residual where no errors came."""
+        return 1.0 if self.measured else float(np.sqrt(np.mean(np.square(residual))))
+
     def explained(self, residual: NDArray[np.float64]) -> float:
         """Share of the squared elements that a model leaves no residual of."""
         return 1 - float(np.square(residual).sum() / np.square(self.data).sum())

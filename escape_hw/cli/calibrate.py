@@ -21,8 +21,13 @@ if TYPE_CHECKING:
 
 def calibrate(
     system: options.System,
-    method: Annotated[str, typer.Option("--method", help="push-pull, docrime or escape.")] = "escape",
-    frames: Annotated[int | None, typer.Option("--frames", min=1, help="Frames to measure with.")] = None,
+    method: Annotated[
+        str, typer.Option("--method", help="push-pull, modulated, docrime or escape.")
+    ] = "escape",
+    frames: Annotated[
+        int | None,
+        typer.Option("--frames", min=1, help="Frames (push-pull: per push and pull; modulated: per batch)."),
+    ] = None,
     poke: Annotated[
         float | None, typer.Option("--poke", help="Poke, rms surface as a fraction of full stroke.")
     ] = None,
@@ -34,6 +39,10 @@ def calibrate(
     plain: Annotated[
         bool, typer.Option("--plain", help="The paper's estimator, turbulence not whitened (docrime).")
     ] = False,
+    estimator: Annotated[
+        str | None,
+        typer.Option("--estimator", help="What ESCAPE fits: auto, matrix or telemetry (few frames)."),
+    ] = None,
     out: options.Out = None,
     set: options.Set = None,
     seed: options.Seed = None,
@@ -47,7 +56,7 @@ def calibrate(
         if modes is not None:
             choice = _with_modes(one, choice, modes)
         config = one.configured(choice)
-        start = _procedure(method, frames, poke, accuracy, plain)
+        start = _procedure(method, frames, poke, accuracy, plain, estimator)
         with one.run_folder(config, f"calibrate-{method}", out) as folder:
             with one.bench(choice) as bench:
                 from escape_hw.runtime.records import BenchRecord
@@ -76,9 +85,15 @@ def _with_modes(one: Session, choice: options.Choice, modes: int) -> options.Cho
 
 
 def _procedure(
-    method: str, frames: int | None, poke: float | None, accuracy: float | None, plain: bool
+    method: str,
+    frames: int | None,
+    poke: float | None,
+    accuracy: float | None,
+    plain: bool,
+    estimator: str | None,
 ) -> Callable[[Bench], Procedure[CalibrationResult]]:
     """The chosen procedure; refuses what does not go together before anything is opened."""
+    from escape_hw.config.models import ESTIMATORS
     from escape_hw.errors import ConfigError
     from escape_hw.runtime.procedures import METHODS, calibrate_by
 
@@ -90,8 +105,13 @@ def _procedure(
         raise ConfigError("--accuracy: it goes with --method escape and must be positive")
     if plain and method != "docrime":
         raise ConfigError("--plain: it goes with --method docrime")
-
-    return lambda bench: calibrate_by(bench, method, frames=frames, poke=poke, whiten=not plain)
+    if estimator is not None and (method != "escape" or estimator not in ESTIMATORS):
+        raise ConfigError(
+            f"--estimator {estimator}: it goes with --method escape and is one of {', '.join(ESTIMATORS)}"
+        )
+    return lambda bench: calibrate_by(
+        bench, method, frames=frames, poke=poke, whiten=not plain, estimator=estimator
+    )
 
 
 def _finish(
@@ -149,6 +169,9 @@ def sprint(
     set: options.Set = None,
     seed: options.Seed = None,
     mode: options.Mode = None,
+    light: Annotated[
+        bool, typer.Option("--light", help="Gain and registration only; quick, for a mirror like its model.")
+    ] = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -156,10 +179,10 @@ def sprint(
     with session("sprint", json=json, quiet=quiet) as one:
         config = one.configured(options.Choice.of(system, set, seed, mode))
         with one.run_folder(config, "sprint", out) as folder:
-            _sprint(one, folder, config, im)
+            _sprint(one, folder, config, im, light)
 
 
-def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
+def _sprint(one: Session, folder: RunFolder, config: Any, im: Path, light: bool) -> None:
     from dataclasses import replace
 
     from escape_hw.calibration.sprint import sprint
@@ -173,7 +196,12 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
     from escape_hw.runtime.keep import finish
     from escape_hw.runtime.records import config_record
 
-    product = load_matrix(im, expect_system=config.system.name, expect_actuators=config.devices.dm.n_act)
+    product = load_matrix(
+        im,
+        expect_system=config.system.name,
+        expect_sensor=config.sensor.kind,
+        expect_actuators=config.devices.dm.n_act,
+    )
     measured = product.result.measured or product.matrix
     model = model_factory(config.calibration.model)(config, product.grid)
     settings = config.calibration
@@ -182,6 +210,7 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
         model,
         modes=min(settings.sprint_modes, measured.n_modes),
         learning_rate=settings.learning_rate,
+        misfit=not light,
     )
     result = replace(product.result, matrix=measured, measured=None, registration=estimate)
     origin = replace(config_record(config), parents={im.name: product.sha256})

@@ -81,6 +81,7 @@ def fitting_matrix(im: Any, config: SystemConfig, force: bool = False) -> Matrix
     return load_matrix(
         im,
         expect_system=config.system.name,
+        expect_sensor=config.sensor.kind,
         expect_basis=config.basis.kind,
         expect_modes=config.basis.n_modes,
         expect_actuators=config.devices.dm.n_act,

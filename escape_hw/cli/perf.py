@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from escape_hw.cli.perf_page import check_page, conditions, write_page
 from escape_hw.cli.session import session
 from escape_hw.errors import ConfigError
 
@@ -59,8 +60,7 @@ def document(rows: Sequence[BenchmarkRow]) -> dict[str, Any]:
         "system": "razor-shwfs",
         "simulated": True,
         "seed": 1,
-        "python": platform.python_version(),
-        "machine": platform.machine(),
+        **conditions(),
         "rows": [row.to_dict() for row in rows],
     }
 
@@ -70,10 +70,18 @@ def perf(
         list[str] | None, typer.Argument(metavar="[STAGE]...", help="Stages to measure; all by default.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+    page: Annotated[
+        Path | None,
+        typer.Option("--markdown", metavar="FILE", help="Write the table into this page, prose untouched."),
+    ] = None,
 ) -> None:
     """Measure our speed and accuracy beside OOPAO's and pyRTC's, on one thread each."""
     with session("perf", json=as_json) as one:
+        if page is not None:
+            check_page(page)
         rows = measure(stages or ())
+        if page is not None:
+            write_page(page, rows, conditions())
         one.show(_table(rows))
         one.result(document(rows))
 
@@ -81,10 +89,10 @@ def perf(
 def _table(rows: Sequence[BenchmarkRow]) -> Table:
     from rich.table import Table
 
-    table = Table("stage", "ours", "peer", "unit", "times better", "peer is", "note")
+    table = Table("stage", "ours", "peer", "unit", "times better", "of floor", "peer is", "note")
     for column in table.columns[1:3]:
         column.justify = "right"
-    table.columns[4].justify = "right"
+    table.columns[4].justify = table.columns[5].justify = "right"
     for row in rows:
         table.add_row(
             row.stage,
@@ -92,6 +100,7 @@ def _table(rows: Sequence[BenchmarkRow]) -> Table:
             "-" if row.peer is None else f"{row.peer:.4g}",
             row.unit,
             "-" if row.ratio is None else f"{row.ratio:.2f}",
+            "-" if row.reached is None else f"{row.reached:.0%}",
             row.peer_name,
             row.note,
         )

@@ -79,7 +79,7 @@ def sky_time(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Error of the registration against frames, plain and whitened, with the Cramer-Rao bound."""
+    """Error of the registration against frames, by estimator, with the Cramer-Rao bound."""
     with session("reproduce sky-time", json=json, quiet=quiet) as one:
         from escape_hw.io import documents
         from escape_hw.runtime import sky_time as campaign
@@ -98,7 +98,7 @@ def sky_time(
         one.show(f"fewest frames that meet the goal in every parameter: {least}")
         if "note" in curves:
             one.tell(curves["note"])
-        met = "note" not in curves and curves["fewest_frames"]["whitened"] is not None
+        met = "note" not in curves and curves["fewest_frames"]["telemetry"] is not None
         one.result({**head, **curves}, met=met)
 
 

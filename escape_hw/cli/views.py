@@ -44,8 +44,8 @@ def calibration_lines(result: CalibrationResult) -> list[str]:
     matrix = result.matrix
     snr = (result.measured or matrix).snr()
     lines = [
-        f"{matrix.method}: {matrix.n_modes} modes, {result.grid.n_valid} sub-apertures, "
-        f"{result.frames} frames ({result.sky_seconds:.1f} s), {result.lost_frames} lost",
+        f"{matrix.method}: {matrix.n_modes} modes, {result.grid.n_valid} {result.grid.elements}, "
+        f"{result.frames} frames ({result.sky_seconds:.3g} s), {result.lost_frames} lost",
         f"signal-to-noise ratio per mode: least {snr.min():.3g}, median {sorted(snr)[len(snr) // 2]:.3g}",
     ]
     if result.response is not None:

@@ -71,7 +71,8 @@ class MirrorConfig(DeviceConfig):
 
     layout: str = Field(
         pattern=layouts.PATTERN,
-        description="where the actuators stand: 'circle-N' or 'square-N' on an N x N grid",
+        description="where the actuators stand: 'circle-N' or 'square-N' on an N x N grid, "
+        "'rings-336' or 'rings-672' on rings",
     )
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
     pitches_across_pupil: float = Field(
@@ -88,9 +89,13 @@ class MirrorConfig(DeviceConfig):
         """Number of actuators."""
         return layouts.count(self.layout)
 
-    def actuator_map(self) -> NDArray[np.bool_]:
-        """Boolean map ``(N, N)``, true where an actuator stands."""
-        return layouts.actuator_map(self.layout)
+    def actuator_map(self) -> NDArray[np.bool_] | None:
+        """Boolean map ``(N, N)``, true where an actuator stands; ``None`` when there is no grid."""
+        return layouts.actuator_map(self.layout) if layouts.on_grid(self.layout) else None
+
+    def positions(self) -> NDArray[np.float64]:
+        """Actuator positions ``(n_act, 2)`` as (x, y) from the mirror's centre, in pitches."""
+        return layouts.positions(self.layout)
 
     @model_validator(mode="after")
     def _rules(self) -> Self:
@@ -146,6 +151,25 @@ class ScienceConfig(CameraConfig):
     """The science camera, which sees the point-spread function."""
 
     psf_px: float = Field(ge=0.5, le=100, description="lambda/D in camera pixels")
+    model_psf: Literal["measured", "design"] = Field(
+        "measured",
+        description="what Strehl ratios refer to: an image 'measured' without turbulence, or the 'design' "
+        "pupil's where the turbulence cannot be taken out",
+    )
+
+
+class ModulatorConfig(DeviceConfig):
+    """The tip-tilt stage that turns the beam on a pyramid."""
+
+    frequency_hz: float = Field(
+        gt=0, le=5000, description="turns per second that are asked for, hertz; the stage's clock rounds them"
+    )
+    rad_per_lambda_d: float = Field(
+        gt=0, le=0.1, description="mirror tilt that moves the beam by 1 lambda/D on the pyramid, radians"
+    )
+    max_tilt_rad: float = Field(
+        gt=0, le=0.1, description="largest tilt of the mirror from its centre, radians"
+    )
 
 
 class ScreenConfig(DeviceConfig):
@@ -175,3 +199,6 @@ class DevicesConfig(Section):
     wfs: CameraConfig = Field(description="camera of the wavefront sensor")
     science: ScienceConfig | None = Field(None, description="science camera; absent: there is none")
     screen: ScreenConfig | None = Field(None, description="phase screens; absent: there are none")
+    modulator: ModulatorConfig | None = Field(
+        None, description="tip-tilt modulator of a pyramid; absent: there is none"
+    )

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, Literal, Self
+from collections.abc import Iterator
+from typing import Literal, Self, TypeVar, get_args
 
 from pydantic import Field, model_validator
 
 from escape_hw.config.device_models import DeviceConfig, DevicesConfig, Mode
 from escape_hw.config.section import Breach, Section, enforce
+from escape_hw.config.sensor_models import AnySensor, PyramidSection, SensorSection
+from escape_hw.config.telescope_models import TelescopeSection
 from escape_hw.config.toml_text import dump_toml
 from escape_hw.config.twin_models import TwinConfig
+from escape_hw.errors import ConfigError
+
+S = TypeVar("S", bound=SensorSection)
+
+
+Estimator = Literal["auto", "matrix", "telemetry"]
+#: What SPRINT can fit within ESCAPE.
+ESTIMATORS: tuple[str, ...] = get_args(Estimator)
 
 
 class SystemSection(Section):
@@ -28,27 +38,6 @@ class SystemSection(Section):
     pupil_m: float = Field(gt=0, le=100, description="diameter of the pupil, metres")
     optics: Literal["fast", "oopao"] = Field(
         "fast", description="the twin's optics: 'fast', or 'oopao' for the reference"
-    )
-
-
-class SensorSection(Section):
-    """The wavefront sensor."""
-
-    kind: Literal["shack-hartmann"] = Field("shack-hartmann", description="kind of sensor")
-    n_sub: int = Field(ge=2, le=400, description="sub-apertures across the pupil")
-    pitch_px: float = Field(ge=2, le=1000, description="nominal pitch of the lenslets, camera pixels")
-    spot_px: float = Field(ge=0.5, le=200, description="lambda/d of a sub-aperture, camera pixels")
-    threshold: float = Field(
-        0.02,
-        ge=0,
-        le=0.9,
-        description="centre-of-gravity threshold above the background, fraction of full scale",
-    )
-    min_flux: float = Field(
-        0.5, gt=0, le=1, description="least flux of a valid sub-aperture, fraction of the brightest"
-    )
-    beam_radius_m: Annotated[float, Field(allow_inf_nan=True)] = Field(
-        math.inf, gt=0, description="1/e^2 intensity radius of the Gaussian beam, metres; inf: uniform"
     )
 
 
@@ -102,10 +91,17 @@ class CalibrationSection(Section):
     push_pull_frames: int = Field(
         20, ge=1, le=1_000_000, description="push-pull: frames per push and per pull"
     )
+    modulated_frames: int = Field(
+        500, ge=50, le=1_000_000, description="modulation: frames per batch of modes driven at once"
+    )
     whiten_order: int = Field(
         6, ge=0, le=64, description="past frames that predict the turbulence; 0: plain estimator"
     )
     lags: int = Field(5, ge=1, le=64, description="frames over which the temporal response is estimated")
+    estimator: Estimator = Field(
+        "auto",
+        description="what SPRINT fits: the 'matrix' or the whitened 'telemetry'; 'auto': the telemetry",
+    )
     sprint_modes: int = Field(50, ge=1, le=10000, description="SPRINT: largest number of modes used")
     learning_rate: float = Field(1.0, gt=0, le=1, description="SPRINT: share of each step that is taken")
     model: str = Field(
@@ -118,7 +114,10 @@ class SystemConfig(Section):
 
     schema_version: Literal[1] = Field(1, alias="schema", description="version of these keys")
     system: SystemSection = Field(description="what the system is")
-    sensor: SensorSection = Field(description="the wavefront sensor")
+    telescope: TelescopeSection = Field(
+        default_factory=TelescopeSection, description="what stands in the light before the pupil"
+    )
+    sensor: AnySensor = Field(description="the wavefront sensor")
     devices: DevicesConfig = Field(description="the devices")
     basis: BasisSection = Field(description="modal basis")
     loop: LoopSection = Field(default_factory=LoopSection, description="integrator")
@@ -140,6 +139,22 @@ class SystemConfig(Section):
         """
         return dump_toml(self.model_dump(by_alias=True, exclude_none=True))
 
+    def sensor_as(self, kind: type[S]) -> S:
+        """The sensor's section, for code that works with one kind of sensor only.
+
+        Raises
+        ------
+        ConfigError
+            The system has another kind of sensor.
+        """
+        if not isinstance(self.sensor, kind):
+            wanted = kind.model_fields["kind"].annotation
+            raise ConfigError(
+                f"system '{self.system.name}' has sensor.kind = '{self.sensor.kind}'; "
+                f"this needs {', '.join(map(repr, get_args(wanted)))}"
+            )
+        return self.sensor
+
     @model_validator(mode="after")
     def _rules(self) -> Self:
         n_act, n_modes = self.devices.dm.n_act, self.basis.n_modes
@@ -154,5 +169,31 @@ class SystemConfig(Section):
                     f"leaves none of the {n_modes} modes; lower it",
                 )
             )
-        enforce(breaches)
+        enforce([*breaches, *self._sensor_rules()])
         return self
+
+    def _sensor_rules(self) -> Iterator[Breach]:
+        """What the kind of sensor asks of the other sections."""
+        twin = self.twin
+        if not isinstance(self.sensor, PyramidSection):
+            text = f"is not read with sensor.kind = '{self.sensor.kind}'; remove it"
+            for key, value in twin.pyramid.model_dump(exclude_defaults=True).items():
+                yield Breach(f"twin.pyramid.{key}", value, text)
+            return
+        modulator, radius = self.devices.modulator, self.sensor.modulation
+        if radius and modulator is None:
+            text = "needs a modulator, [devices.modulator]; 0 is a pyramid without modulation"
+            yield Breach("sensor.modulation", radius, text)
+        if modulator is not None and radius * modulator.rad_per_lambda_d > modulator.max_tilt_rad:
+            largest = modulator.max_tilt_rad / modulator.rad_per_lambda_d
+            yield Breach("sensor.modulation", radius, f"the modulator reaches {largest:.4g} lambda/D")
+        width, height = self.devices.wfs.region[2:]
+        for number in self.sensor.outside(width, height):
+            centre = list(self.sensor.pupils_px[number])
+            text = f"the region of {width} x {height} pixels cuts this image of {self.sensor.n_sub} pixels"
+            yield Breach("sensor.pupils_px", centre, text)
+        moved = "is for lenslets; pupil images are moved by twin.pyramid.centre_offsets_px"
+        if twin.wfs.pitch_px is not None:
+            yield Breach("twin.wfs.pitch_px", twin.wfs.pitch_px, moved)
+        if any(twin.wfs.grid_offset_px):
+            yield Breach("twin.wfs.grid_offset_px", list(twin.wfs.grid_offset_px), moved)

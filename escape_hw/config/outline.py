@@ -6,11 +6,12 @@ import difflib
 import types
 import typing
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 from annotated_types import Ge, Gt, Le, Lt
-from pydantic import BaseModel
+from pydantic import BaseModel, Tag
 from pydantic.fields import FieldInfo
 
 from escape_hw.config.models import SystemConfig
@@ -26,13 +27,19 @@ def dotted(path: Sequence[str | int]) -> str:
     return text
 
 
-def section_of(annotation: Any) -> type[BaseModel] | None:
-    """The model that an annotation ``Model`` or ``Model | None`` stands for, if any."""
-    options = typing.get_args(annotation) if _is_union(annotation) else (annotation,)
-    for option in options:
+def sections_of(annotation: Any) -> dict[str, type[BaseModel]]:
+    """The models that an annotation stands for: ``Model``, ``Model | None`` or one of several.
+
+    Of several the key is the tag by which a validation tells them apart, else it is empty.
+    """
+    found: dict[str, type[BaseModel]] = {}
+    for option in typing.get_args(annotation) if _is_union(annotation) else (annotation,):
+        marks: list[Any] = []
+        if typing.get_origin(option) is typing.Annotated:
+            option, *marks = typing.get_args(option)
         if isinstance(option, type) and issubclass(option, BaseModel):
-            return option
-    return None
+            found[next((mark.tag for mark in marks if isinstance(mark, Tag)), "")] = option
+    return found
 
 
 def fields_of(section: type[BaseModel]) -> dict[str, FieldInfo]:
@@ -45,42 +52,74 @@ def is_free_table(field: FieldInfo) -> bool:
     return typing.get_origin(field.annotation) is dict
 
 
-def field_at(path: Sequence[str | int]) -> tuple[FieldInfo | None, Path]:
-    """The field that a path leads to, and the part of the path that exists.
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a path leads.
 
-    Returns
-    -------
-    field : FieldInfo or None
-        ``None`` when the path leads nowhere.
-    known : tuple
-        The path up to where it leaves the model; an item of an array or of a free table counts.
+    Parameters
+    ----------
+    path
+        The path as files write it, without the tags that a validation puts in.
+    field
+        The field there; ``None`` when the path leads nowhere.
+    known
+        The part of ``path`` that exists; an item of an array or of a free table counts.
+    holders
+        The sections that may hold the first key that does not exist; empty when all do.
     """
-    section: type[BaseModel] | None = SystemConfig
+
+    path: Path
+    field: FieldInfo | None
+    known: Path
+    holders: tuple[type[BaseModel], ...]
+
+
+def place_of(path: Sequence[str | int]) -> Place:
+    """Follow a path, of a file or of a validation, through the models."""
+    sections: dict[str, type[BaseModel]] = {"": SystemConfig}
     field: FieldInfo | None = None
-    for depth, step in enumerate(path):
-        if section is None:
-            free = field is not None and (is_free_table(field) or isinstance(step, int))
-            return (field, tuple(path[: depth + 1])) if free else (None, tuple(path[:depth]))
-        field = fields_of(section).get(str(step))
-        if field is None:
-            return None, tuple(path[:depth])
-        section = section_of(field.annotation)
-    return field, tuple(path)
+    plain: list[str | int] = []
+    known = 0
+    lost: tuple[type[BaseModel], ...] | None = None
+    for step in path:
+        if lost is None and len(sections) > 1 and step in sections:
+            sections = {"": sections[str(step)]}
+            continue
+        plain.append(step)
+        if lost is not None:
+            continue
+        inner = next(
+            (fields[str(step)] for fields in map(fields_of, sections.values()) if step in fields), None
+        )
+        if inner is not None:
+            field, sections, known = inner, sections_of(inner.annotation), known + 1
+        elif not sections and field is not None and (is_free_table(field) or isinstance(step, int)):
+            lost, known = (), known + 1
+        else:
+            lost, field = tuple(sections.values()), None
+    return Place(tuple(plain), field, tuple(plain[:known]), lost or ())
+
+
+def kinds_with(path: Path) -> list[str]:
+    """The kinds of a section that have the key at the end of a path, when there are several kinds."""
+    field = place_of(path[:-1]).field
+    variants = {} if field is None else sections_of(field.annotation)
+    return [kind for kind, section in variants.items() if path[-1] in fields_of(section)]
 
 
 @cache
 def all_keys() -> tuple[str, ...]:
     """Every key of the configuration, sections left out, as dotted text."""
-    return tuple(_leaves(SystemConfig, ""))
+    return tuple(dict.fromkeys(_leaves(SystemConfig, "")))
 
 
 def _leaves(section: type[BaseModel], prefix: str) -> Iterator[str]:
     for name, field in fields_of(section).items():
-        inner = section_of(field.annotation)
-        if inner is None:
+        inner = sections_of(field.annotation)
+        if not inner:
             yield prefix + name
-        else:
-            yield from _leaves(inner, f"{prefix}{name}.")
+        for one in inner.values():
+            yield from _leaves(one, f"{prefix}{name}.")
 
 
 def nearest(word: str, choices: Iterable[str]) -> str | None:
@@ -91,16 +130,12 @@ def nearest(word: str, choices: Iterable[str]) -> str | None:
 
 def nearest_key(path: Sequence[str | int]) -> str | None:
     """The key somebody probably meant: a neighbour, the same name elsewhere, or a similar path."""
-    _, known = field_at(path)
-    wrong = str(path[len(known)]) if len(known) < len(path) else str(path[-1])
-    holder: type[BaseModel] | None = None if known else SystemConfig
-    if known:
-        field, _ = field_at(known)
-        holder = None if field is None else section_of(field.annotation)
-    if holder is not None:
-        neighbour = nearest(wrong, fields_of(holder))
-        if neighbour is not None:
-            return dotted((*known, neighbour, *path[len(known) + 1 :]))
+    place = place_of(path)
+    path, depth = place.path, len(place.known)
+    neighbours = [name for holder in place.holders for name in fields_of(holder)]
+    neighbour = nearest(str(path[min(depth, len(path) - 1)]), neighbours)
+    if neighbour is not None:
+        return dotted((*place.known, neighbour, *path[depth + 1 :]))
     elsewhere = [key for key in all_keys() if key.rpartition(".")[2] == str(path[-1])]
     return nearest(dotted(path), elsewhere or all_keys()) or (elsewhere[0] if elsewhere else None)
 

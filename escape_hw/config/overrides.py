@@ -63,7 +63,7 @@ def apply(document: dict[str, Any], overrides: Iterable[Override]) -> list[tuple
 
 
 def _apply(document: dict[str, Any], override: Override) -> Problem | None:
-    if outline.field_at(override.path)[1] != override.path:
+    if outline.place_of(override.path).known != override.path:
         return unknown_key(override.path, override.value)
     table = document
     for depth, name in enumerate(override.path[:-1], start=1):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from escape_hw.config import outline
@@ -52,9 +53,14 @@ class Problem:
 
 def unknown_key(path: Sequence[str | int], value: Any) -> Problem:
     """A key that the configuration does not have."""
+    plain = outline.place_of(path).path
+    if outline.place_of(plain).known == plain:
+        # Another kind of this section has it.
+        others = ", ".join(f"'{kind}'" for kind in outline.kinds_with(plain))
+        return Problem(plain, show(value), f"is a key of kind = {others} only")
     meant = outline.nearest_key(path)
     hint = f" (did you mean '{meant}'?)" if meant else ""
-    return Problem(tuple(path), show(value), f"unknown key{hint}")
+    return Problem(plain, show(value), f"unknown key{hint}")
 
 
 def problems_of(error: ValidationError) -> list[Problem]:
@@ -76,15 +82,18 @@ def show(value: Any) -> str:
 
 
 def _translate(detail: ErrorDetails) -> list[Problem]:
-    path, kind, value = detail["loc"], detail["type"], detail["input"]
+    kind, value = detail["type"], detail["input"]
+    place = outline.place_of(detail["loc"])
+    path, field, known = place.path, place.field, place.known
     if kind == RULE_ERROR:
         return [
             Problem((*path, *breach.key.split(".")), show(breach.value), breach.message)
             for breach in detail["ctx"]["breaches"]
         ]
     if kind == "extra_forbidden":
-        return [unknown_key(path, value)]
-    field, known = outline.field_at(path)
+        return [unknown_key(detail["loc"], value)]
+    if kind == "union_tag_invalid":
+        return [_wrong_kind((*path, "kind"), value, field)]
     if field is None:
         return [Problem(path, show(value), _plain(detail))]
     if outline.is_free_table(field) and kind != "dict_type":
@@ -109,6 +118,14 @@ def _translate(detail: ErrorDetails) -> list[Problem]:
 
 def _plain(detail: ErrorDetails) -> str:
     return _WORDS.get(detail["type"], detail["msg"][:1].lower() + detail["msg"][1:])
+
+
+def _wrong_kind(path: Path, table: Any, field: FieldInfo | None) -> Problem:
+    kinds = [] if field is None else list(outline.sections_of(field.annotation))
+    value = table["kind"]
+    meant = outline.nearest(str(value), kinds)
+    hint = f" (did you mean '{meant}'?)" if meant else ""
+    return Problem(path, show(value), f"must be {' or '.join(map(repr, kinds))}{hint}")
 
 
 def _wrong_choice(detail: ErrorDetails) -> str:

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from escape_hw.api.device import Device
 from escape_hw.api.model import SyntheticModel
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.config.models import SystemConfig
 from escape_hw.config.outline import nearest
 from escape_hw.errors import ConfigError
@@ -23,7 +23,7 @@ TWIN = "sim-"
 #: one dictionary per opened system, through which the twins of one bench find each other.
 DeviceFactory = Callable[[str, SystemConfig, dict[str, object]], Device]
 #: ``factory(config, grid) -> model``; without a grid the model takes the nominal one.
-ModelFactory = Callable[[SystemConfig, SubApertureGrid | None], SyntheticModel]
+ModelFactory = Callable[[SystemConfig, SensorGeometry | None], SyntheticModel]
 #: Drivers that a script registered for its own process.
 _OWN: dict[str, DeviceFactory] = {}
 

@@ -8,7 +8,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from escape_hw.config.load import load_system
-from escape_hw.config.outline import fields_of, is_free_table, range_text, section_of
+from escape_hw.config.outline import fields_of, is_free_table, range_text, sections_of
 from escape_hw.config.toml_text import dump_toml, format_key, format_value
 
 
@@ -49,7 +49,7 @@ def _section(section: BaseModel, path: tuple[str, ...]) -> Iterator[str]:
         elif value is not None:
             yield f"# {_help(field)}"
             yield f"{format_key(key)} = {format_value(value)}"
-        elif section_of(field.annotation) is None:
+        elif not sections_of(field.annotation):
             yield f"# {_help(field)}"
             yield f"# {format_key(key)} ="
     for key, field, value in tables:

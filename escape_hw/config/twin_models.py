@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from escape_hw.api.registration import Registration
 from escape_hw.config.section import Breach, Listed, Section, enforce
+from escape_hw.config.twin_sky import TwinAtmosphere, TwinContamination, TwinStar
 
 
 class TwinRegistration(Section):
@@ -21,11 +22,19 @@ class TwinRegistration(Section):
     rotation: float = Field(0.0, ge=-180, le=180, description="rotation from +x towards +y, degrees")
     radial_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along x, % of the diameter")
     tangential_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along y, % of the diameter")
+    anamorphosis_angle: float = Field(
+        0.0, ge=-180, le=180, description="turns the axes of the two scalings from +y towards +x, degrees"
+    )
 
     def to_registration(self) -> Registration:
         """The registration as the models take it."""
         return Registration(
-            self.shift_x, self.shift_y, self.rotation, self.radial_scaling, self.tangential_scaling
+            self.shift_x,
+            self.shift_y,
+            self.rotation,
+            self.radial_scaling,
+            self.tangential_scaling,
+            self.anamorphosis_angle,
         )
 
 
@@ -47,11 +56,23 @@ class TwinMirror(Section):
         le=0.5,
         description="share of each influence function in wings wider than its core, fraction",
     )
+    influence_file: str = Field(
+        "", description="FITS file of measured influence functions (n_act, n, n); empty: Gaussians"
+    )
+    influence_pixel_m: float | None = Field(
+        None, gt=0, le=10, description="distance of its points on the pupil, metres; needed with a file"
+    )
     settling_s: float = Field(
         0.0, ge=0, le=1, description="time constant of the response to a command, seconds"
     )
     creep_fraction: float = Field(0.0, ge=0, le=0.5, description="share of a step that creeps, fraction")
     creep_time_s: float = Field(30.0, gt=0, le=1e5, description="time constant of the creep, seconds")
+
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        if self.influence_file and self.influence_pixel_m is None:
+            enforce([Breach("influence_pixel_m", "", "influence_file needs the distance of its points")])
+        return self
 
 
 class TwinCamera(Section):
@@ -63,6 +84,9 @@ class TwinCamera(Section):
     read_noise_e: float = Field(0.0, ge=0, le=1000, description="read noise of a pixel, e- rms")
     full_well_e: float = Field(10000.0, ge=100, le=1e7, description="signal of a pixel at full scale, e-")
     dark_e: float = Field(0.0, ge=0, le=1e5, description="dark signal of a pixel in one exposure, e-")
+    excess_noise: float = Field(
+        1.0, ge=1, le=1.4143, description="excess noise factor of a multiplying detector; 1: none"
+    )
     background: float = Field(
         0.0, ge=0, le=1e5, description="constant level under the image (offset), e- per pixel and frame"
     )
@@ -80,6 +104,32 @@ class TwinSensor(TwinCamera):
     pitch_px: float | None = Field(
         None, ge=2, le=1000, description="true pitch of the lenslets, pixels; absent: as sensor.pitch_px"
     )
+
+
+Offset = Listed[tuple[Annotated[float, Field(ge=-20, le=20)], Annotated[float, Field(ge=-20, le=20)]]]
+
+
+class TwinPyramid(Section):
+    """How the twin's pyramid and its modulator differ from the design."""
+
+    centre_offsets_px: Listed[tuple[Offset, Offset, Offset, Offset]] = Field(
+        ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
+        description="offset of each pupil image from sensor.pupils_px, (x, y) in pixels",
+    )
+    rooftop: float = Field(
+        0.0, ge=0, le=5, description="length of the edge that stands in for the pyramid's tip, lambda/D"
+    )
+    ellipse: float = Field(
+        0.0, ge=-0.5, le=0.5, description="difference of the modulation's radii along x and y, fraction"
+    )
+    phase: float = Field(
+        0.0, ge=-60, le=60, description="what the modulation's axes lack of a quarter turn, degrees"
+    )
+    drift: float = Field(
+        0.0, ge=0, le=5, description="amplitude of the slow drift of the modulation's centre, lambda/D"
+    )
+    drift_time_s: float = Field(600.0, gt=0, le=1e6, description="period of that drift, seconds")
+    start_s: float = Field(0.0, ge=0, le=60, description="time that the modulator takes to start, seconds")
 
 
 class TwinVibration(Section):
@@ -134,5 +184,13 @@ class TwinConfig(Section):
     science: TwinCamera = Field(
         default_factory=TwinCamera, description="light and noise of the science camera"
     )
+    pyramid: TwinPyramid = Field(
+        default_factory=TwinPyramid, description="imperfections of a pyramid and its modulator"
+    )
     vibration: TwinVibration = Field(default_factory=TwinVibration, description="tip-tilt vibration")
     ncpa: TwinNcpa = Field(default_factory=TwinNcpa, description="non-common-path aberration")
+    atmosphere: TwinAtmosphere | None = Field(None, description="open air above a telescope; absent: none")
+    star: TwinStar | None = Field(None, description="star and sky; absent: light as in twin.wfs")
+    contamination: TwinContamination = Field(
+        default_factory=TwinContamination, description="dust and uneven light on the pupil"
+    )

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.errors import IncompatibleProduct, ProductError
-from escape_hw.io import fits_file, fits_parts
+from escape_hw.io import fits_file, fits_geometry, fits_parts
 from escape_hw.io.provenance import Provenance
 
 KIND_MATRIX = "IM"
@@ -40,8 +40,8 @@ class MatrixProduct:
         return self.result.matrix
 
     @property
-    def grid(self) -> SubApertureGrid:
-        """The sub-aperture grid its slopes belong to."""
+    def grid(self) -> SensorGeometry:
+        """The sensor's geometry that its slopes belong to."""
         return self.result.grid
 
     @property
@@ -82,7 +82,7 @@ def save_matrix(path: Path, result: CalibrationResult, origin: Provenance | None
     origin = origin or Provenance()
     matrix = result.matrix
     if not np.array_equal(matrix.valid, result.grid.valid):
-        raise ValueError("the matrix and the grid mark different sub-apertures as valid")
+        raise ValueError(f"the matrix and the geometry mark different {result.grid.elements} as valid")
     if result.partial:
         path = partial_path(path)
     head = fits_file.primary(KIND_MATRIX, matrix.system, matrix.simulated, result.partial, origin)
@@ -94,7 +94,7 @@ def save_matrix(path: Path, result: CalibrationResult, origin: Provenance | None
         *_pack_matrix(matrix, ""),
         fits_file.image("M2C", matrix.m2c.astype(np.float64)),
         fits_file.image("VALID", matrix.valid),
-        *fits_parts.pack_grid(result.grid),
+        *fits_geometry.pack_grid(result.grid),
         fits_parts.pack_metrics(
             {"sky_seconds": float(result.sky_seconds), "notes": list(result.notes)}, "RUN"
         ),
@@ -116,6 +116,7 @@ def load_matrix(
     path: Path | str,
     *,
     expect_system: str | None = None,
+    expect_sensor: str | None = None,
     expect_basis: str | None = None,
     expect_modes: int | None = None,
     expect_actuators: int | None = None,
@@ -127,12 +128,12 @@ def load_matrix(
 
     Parameters
     ----------
-    expect_system, expect_basis, expect_modes, expect_actuators
-        Name of the system, kind of basis, number of modes and of actuators.
+    expect_system, expect_sensor, expect_basis, expect_modes, expect_actuators
+        Name of the system, kind of sensor, kind of basis, number of modes and of actuators.
     expect_m2c
         Mode-to-command matrix ``(n_act, n_modes)``, compared element by element.
     expect_sub_apertures
-        Shape ``(n_rows, n_columns)`` of the lenslet grid.
+        Shape ``(n_rows, n_columns)`` of the sub-apertures.
     allow_simulated
         False on hardware: a simulated matrix is refused.
 
@@ -155,11 +156,12 @@ def load_matrix(
     _expect(
         path, "system", header["SYSTEM"], None if expect_system is None else fits_file.plain(expect_system)
     )
+    _expect(path, "kind of sensor", product.grid.kind, expect_sensor)
     _expect(path, "kind of basis", header["BASIS"], expect_basis)
     _expect(path, "number of actuators", matrix.m2c.shape[0], expect_actuators)
     way = f"basis.n_modes={matrix.n_modes} would take this one"
     _expect(path, "number of modes", matrix.n_modes, expect_modes, way)
-    _expect(path, "lenslet grid", matrix.valid.shape, expect_sub_apertures)
+    _expect(path, "grid of sub-apertures", matrix.valid.shape, expect_sub_apertures)
     if expect_m2c is not None:
         _expect_basis(path, matrix.m2c, np.asarray(expect_m2c, float))
     if matrix.simulated and not allow_simulated:
@@ -199,7 +201,7 @@ def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> C
     frame = fits_file.array(path, hdus, "FRAME", np.float32) if "FRAME" in hdus else None
     return CalibrationResult(
         matrix=_unpack_matrix(path, hdus, header, ""),
-        grid=fits_parts.unpack_grid(path, hdus),
+        grid=fits_geometry.unpack_grid(path, hdus),
         frames=int(header["FRAMES"]),
         lost_frames=int(header["LOST"]),
         sky_seconds=float(run["sky_seconds"]),

@@ -13,7 +13,6 @@ from astropy.io import fits
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, SprintIteration, TemporalResponse
-from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.errors import ProductError
 from escape_hw.io import fits_file
 
@@ -54,43 +53,6 @@ def unpack_metrics(path: Path, hdus: fits.HDUList, name: str = "METRICS") -> dic
         }
     except (KeyError, ValueError, TypeError) as error:
         raise ProductError(f"{path}: extension {name} is no table of metrics ({error})") from error
-
-
-def pack_grid(grid: SubApertureGrid) -> list[Any]:
-    """The sub-aperture grid: reference positions with pitch and origin, and the flux map."""
-    return [
-        fits_file.image(
-            "GRID",
-            np.asarray(grid.references_px, np.float32),
-            "pixel",
-            PITCH=float(grid.pitch_px),
-            ORIGINX=float(grid.origin_px[0]),
-            ORIGINY=float(grid.origin_px[1]),
-            COUNTS=float(grid.counts),
-            MOTION=float(grid.motion_px),
-            BACKGND=float(grid.background),
-        ),
-        fits_file.image("FLUX", np.asarray(grid.flux, np.float32)),
-    ]
-
-
-def unpack_grid(path: Path, hdus: fits.HDUList) -> SubApertureGrid:
-    """Inverse of :func:`pack_grid`, with the mask from VALID."""
-    header = fits_file.need(path, hdus, "GRID").header
-    valid = fits_file.array(path, hdus, "VALID", np.uint8).astype(bool)
-    references = fits_file.array(path, hdus, "GRID", np.float32)
-    if references.shape != (int(valid.sum()), 2):
-        raise ProductError(f"{path}: GRID has shape {references.shape}, VALID marks {int(valid.sum())}")
-    return SubApertureGrid(
-        pitch_px=float(header["PITCH"]),
-        origin_px=(float(header["ORIGINX"]), float(header["ORIGINY"])),
-        valid=valid,
-        references_px=references,
-        flux=fits_file.array(path, hdus, "FLUX", np.float32),
-        counts=float(header["COUNTS"]),
-        motion_px=float(header["MOTION"]),
-        background=float(header["BACKGND"]),
-    )
 
 
 def pack_response(response: TemporalResponse) -> fits.BinTableHDU:

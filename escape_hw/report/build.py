@@ -5,6 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
 from escape_hw.io.storage import write_atomic
 from escape_hw.report import figures_bench, figures_matrix, figures_registration, html, tables
 from escape_hw.report.content import RunContent, read_run
@@ -76,7 +80,7 @@ def _facts(run: RunContent) -> dict[str, str]:
     # A matrix and what was computed from it share their frames: one number for both.
     shared: dict[str, list[str]] = {}
     for label, result in run.calibrations.items():
-        text = f"{result.frames:,} ({result.sky_seconds:.1f} s)".replace(",", "\u2009")
+        text = f"{result.frames:,} ({result.sky_seconds:.3g} s)".replace(",", "\u2009")
         shared.setdefault(text, []).append(label)
     for text, labels in shared.items():
         found[f"{' and '.join(labels)}: frames"] = text
@@ -194,20 +198,29 @@ def _sky_time(run: RunContent) -> str:
     return html.section("Sky time", html.figure("skytime", drawing, caption), remarks)
 
 
+def _mirror(run: RunContent, command: NDArray[np.float64]) -> Figure | None:
+    """The command on the map of the actuators, when the run knows where they stand."""
+    layout, places = run.layout, run.places_m
+    if layout is not None and command.size == int(layout.sum()):
+        return figures_bench.mirror(command, layout)
+    if places is not None and command.size == len(places):
+        return figures_bench.mirror_without_grid(command, places)
+    return None
+
+
 def _bench(run: RunContent) -> str:
     parts = []
     calibration = next((r for r in run.calibrations.values() if r.mean_frame is not None), None)
     if calibration is not None and calibration.mean_frame is not None:
         drawing = figures_bench.sensor(calibration.mean_frame, calibration.grid, "mean frame")
-        parts.append(html.figure("mean", drawing, "Mean sensor frame and the lenslet grid found on it."))
+        parts.append(html.figure("mean", drawing, "Mean sensor frame and what was found on it."))
     label, loop = next(reversed(run.loops.items()), ("", None))
     if loop is not None and loop.last_frame is not None:
         drawing = figures_bench.sensor(loop.last_frame, None, "one frame")
         parts.append(html.figure("frame", drawing, f"The last sensor frame of the {label} loop."))
-    layout = run.layout
-    if loop is not None and layout is not None and loop.last_command.size == int(layout.sum()):
-        drawing = figures_bench.mirror(loop.last_command, layout)
-        parts.append(html.figure("mirror", drawing, f"The last mirror command of the {label} loop."))
+    shape = None if loop is None else _mirror(run, loop.last_command)
+    if shape is not None:
+        parts.append(html.figure("mirror", shape, f"The last mirror command of the {label} loop."))
     response = next((r.response for r in run.calibrations.values() if r.response is not None), None)
     if response is not None:
         caption = "Temporal response of mirror and sensor, from the pokes themselves, with standard errors."

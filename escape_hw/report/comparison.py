@@ -32,6 +32,8 @@ class Comparison:
         The same over the whole matrix.
     common
         Number of sub-apertures that both have.
+    elements
+        What they are called.
     registration
         B minus A with combined standard errors; empty unless both have one.
     """
@@ -41,6 +43,7 @@ class Comparison:
     relative_rms: NDArray[np.float64]
     total_relative_rms: float
     common: int
+    elements: str
     registration: dict[str, Measured]
 
     def document(self) -> dict[str, Any]:
@@ -62,17 +65,21 @@ def compare(a: CalibrationResult, b: CalibrationResult) -> Comparison:
     Raises
     ------
     IncompatibleProduct
-        Another basis, number of modes or lenslet grid.
+        Another kind of sensor, basis, number of modes or grid.
     """
+    if a.grid.kind != b.grid.kind:
+        raise IncompatibleProduct(
+            f"one matrix is of a {a.grid.kind} sensor, the other of a {b.grid.kind}; they cannot be compared"
+        )
     if a.matrix.m2c.shape != b.matrix.m2c.shape or not np.allclose(a.matrix.m2c, b.matrix.m2c, atol=1e-9):
         raise IncompatibleProduct("the two matrices have different bases; their modes cannot be compared")
     if a.matrix.valid.shape != b.matrix.valid.shape:
         raise IncompatibleProduct(
-            f"the lenslet grids differ: {a.matrix.valid.shape} and {b.matrix.valid.shape} sub-apertures"
+            f"the grids differ: {a.matrix.valid.shape} and {b.matrix.valid.shape} {a.grid.elements}"
         )
     both = a.matrix.valid & b.matrix.valid
     if not both.any():
-        raise IncompatibleProduct("the two matrices have no valid sub-aperture in common")
+        raise IncompatibleProduct(f"the two matrices have no valid {a.grid.elements} in common")
     left, right = (np.asarray(m.data, float)[np.tile(both[m.valid], 2)] for m in (a.matrix, b.matrix))
     power_left, power_right = np.sum(left**2, axis=0), np.sum(right**2, axis=0)
     cross = np.sum(left * right, axis=0)
@@ -81,7 +88,9 @@ def compare(a: CalibrationResult, b: CalibrationResult) -> Comparison:
         gain = cross / power_left
         relative = np.sqrt(np.sum((right - left) ** 2, axis=0) / power_left)
     total = math.sqrt(float(np.sum((right - left) ** 2)) / max(float(power_left.sum()), 1e-300))
-    return Comparison(correlation, gain, relative, total, int(both.sum()), _registration(a, b))
+    return Comparison(
+        correlation, gain, relative, total, int(both.sum()), a.grid.elements, _registration(a, b)
+    )
 
 
 def _registration(a: CalibrationResult, b: CalibrationResult) -> dict[str, Measured]:
@@ -101,7 +110,7 @@ def _registration(a: CalibrationResult, b: CalibrationResult) -> dict[str, Measu
 def lines(result: Comparison) -> list[str]:
     """The comparison in a few lines."""
     return [
-        f"{result.correlation.size} modes over {result.common} common sub-apertures",
+        f"{result.correlation.size} modes over {result.common} common {result.elements}",
         f"correlation per mode: least {np.min(result.correlation):.4f}, "
         f"median {np.median(result.correlation):.4f}",
         f"gain of B relative to A: median {np.median(result.gain_ratio):.4f}",

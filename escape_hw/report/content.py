@@ -22,6 +22,7 @@ from escape_hw.io.run_folder import read_result
 #: How methods are called in figures and tables.
 METHOD_LABELS = {
     "push-pull": "push-pull",
+    "modulated": "modulation",
     "docrime": "DO-CRIME",
     "docrime-whitened": "DO-CRIME",
     "escape": "ESCAPE",
@@ -64,6 +65,12 @@ class RunContent:
         """Map of the actuators."""
         rows = self.document.get("bench", {}).get("layout")
         return np.array([[c == "1" for c in row] for row in rows], bool) if rows else None
+
+    @property
+    def places_m(self) -> NDArray[np.float64] | None:
+        """Where actuators without a grid stand ``(n_act, 2)``, in metres on the mirror."""
+        places = self.document.get("bench", {}).get("places_m")
+        return np.array(places, float).reshape(-1, 2) if places else None
 
     def matrices(self) -> dict[str, InteractionMatrix]:
         """All matrices by label: measured ones before what was computed from them."""

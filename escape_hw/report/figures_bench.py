@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, FigureBase
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Circle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from escape_hw.api.results import LoopResult, StrehlEstimate, TemporalResponse
-from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.report import style
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.report import outlines, style
 from escape_hw.report.tables import percent
 
 #: Half width of the PSF cut-outs in pixels, and decades of the log stretch.
@@ -145,19 +146,50 @@ def mirror(command: NDArray[np.float64], layout: NDArray[np.bool_], title: str =
     """
     values = np.full(layout.shape, np.nan)
     values[layout] = 100 * np.asarray(command, float)
-    limit = max(float(np.nanmax(np.abs(values), initial=0.0)), 1.0)
-    figure = style.new_figure(4.4, 3.7)
-    axes = style.bare(figure.subplots())
+    figure, axes, limit = _mirror_axes(values, title)
     axes.imshow(style.paint(values, style.DIVERGING, -limit, limit, ~layout), interpolation="nearest")
-    axes.set_title(title, color=style.INK, fontsize=9.5)
-    style.colour_bar(figure, [axes], style.DIVERGING, (-limit, limit), "command [% of full stroke]")
     return figure
 
 
-def sensor(
-    frame: NDArray[np.generic], grid: SubApertureGrid | None = None, title: str = "sensor frame"
+def mirror_without_grid(
+    command: NDArray[np.float64], places_m: NDArray[np.float64], title: str = "mirror command"
 ) -> Figure:
-    """A frame of the wavefront sensor with the sub-apertures that were found on it."""
+    """A mirror command where the actuators stand, in percent of full stroke.
+
+    Parameters
+    ----------
+    command
+        ``(n_act,)``.
+    places_m
+        Actuator positions ``(n_act, 2)`` as (x, y), y along the rows of other figures.
+    """
+    values = 100 * np.asarray(command, float)
+    figure, axes, limit = _mirror_axes(values, title)
+    distance = np.hypot(*(places_m[:, None, k] - places_m[:, k] for k in (0, 1)))
+    np.fill_diagonal(distance, np.inf)
+    radius = 0.5 * float(np.median(distance.min(axis=1))) if len(places_m) > 1 else 1.0
+    spots = PatchCollection([Circle((x, y), radius) for x, y in places_m], linewidths=0)
+    spots.set_facecolor([tuple(c) for c in style.paint(values, style.DIVERGING, -limit, limit)])
+    axes.add_collection(spots)
+    reach = float(np.abs(places_m).max(initial=0.0)) + radius
+    axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
+    return figure
+
+
+def _mirror_axes(values: NDArray[np.float64], title: str) -> tuple[Figure, Axes, float]:
+    """Figure, axes and the ends of the colour scale for a command in percent."""
+    limit = max(float(np.nanmax(np.abs(values), initial=0.0)), 1.0)
+    figure = style.new_figure(4.4, 3.7)
+    axes = style.bare(figure.subplots())
+    axes.set_title(title, color=style.INK, fontsize=9.5)
+    style.colour_bar(figure, [axes], style.DIVERGING, (-limit, limit), "command [% of full stroke]")
+    return figure, axes, limit
+
+
+def sensor(
+    frame: NDArray[np.generic], grid: SensorGeometry | None = None, title: str = "sensor frame"
+) -> Figure:
+    """A frame of the wavefront sensor with what was found on it."""
     image = np.asarray(frame, float)
     figure = style.new_figure(4.9, 4.2)
     axes = style.tidy(figure.subplots(), grid=False)
@@ -167,14 +199,7 @@ def sensor(
     scaled = np.sqrt(np.clip((image - low) / max(high - low, 1e-12), 0, 1))
     axes.imshow(scaled, cmap=_FRAME_MAP, interpolation="nearest", norm=Normalize(0, 1))
     if grid is not None:
-        half = grid.pitch_px / 2
-        for x, y in grid.centres_px():
-            axes.add_patch(
-                Rectangle(
-                    (x - half, y - half), 2 * half, 2 * half, fill=False, ec="#7fd6c0", lw=0.35, alpha=0.7
-                )
-            )
-        title = f"{title}, {grid.n_valid} valid sub-apertures of {grid.pitch_px:.2f} pixels"
+        title = f"{title}, {outlines.draw(grid, axes)}"
     axes.set_title(title, fontsize=9.5)
     axes.set(xlabel="x [pixel]", ylabel="y [pixel]")
     return figure

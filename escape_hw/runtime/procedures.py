@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.errors import ConfigError
 from escape_hw.runtime.records import without_turbulence
 
 #: The calibration methods, by the names that the command line knows as well.
-METHODS = ("push-pull", "docrime", "escape")
+METHODS = ("push-pull", "modulated", "docrime", "escape")
 
 
 def calibrate_by(
@@ -22,13 +22,14 @@ def calibrate_by(
     *,
     frames: int | None = None,
     poke: float | None = None,
-    grid: SubApertureGrid | None = None,
+    grid: SensorGeometry | None = None,
     whiten: bool = True,
+    estimator: str | None = None,
 ) -> Procedure[CalibrationResult]:
     """A calibration by the name of its method.
 
     Push-pull needs a source: the phase screen, where the bench moves one, is out of the beam
-    meanwhile. The other two take the light as it is.
+    meanwhile. The others take the light as it is.
 
     Parameters
     ----------
@@ -44,6 +45,8 @@ def calibrate_by(
         The sensor's grid, when it is known already.
     whiten
         False: the paper's plain estimator of ``docrime`` and ``escape``.
+    estimator
+        What ``escape`` fits: ``"matrix"``, ``"telemetry"`` or ``"auto"``; as configured by default.
 
     Raises
     ------
@@ -59,6 +62,10 @@ def calibrate_by(
 
         with without_turbulence(bench):
             return (yield from push_pull(bench, frames=frames, poke=poke, grid=grid))
+    if method == "modulated":
+        from escape_hw.calibration.modulated import modulated
+
+        return (yield from modulated(bench, frames=frames, poke=poke, grid=grid))
     if method == "docrime":
         from escape_hw.calibration.docrime import docrime
 
@@ -66,7 +73,9 @@ def calibrate_by(
     if method == "escape":
         from escape_hw.calibration.escape import escape
 
-        return (yield from escape(bench, frames=frames, poke=poke, grid=grid, whiten=whiten))
+        return (
+            yield from escape(bench, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator)
+        )
     raise ConfigError(f"calibration method '{method}' is unknown; it is one of {', '.join(METHODS)}")
 
 

@@ -29,6 +29,7 @@ class BenchRecord:
     basis: str
     serials: Mapping[str, str]
     layout: tuple[str, ...]
+    places_m: tuple[tuple[float, float], ...]
     psf_px: float | None
     planted: Registration | None
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
@@ -37,7 +38,7 @@ class BenchRecord:
     def of(cls, bench: Bench) -> BenchRecord:
         """Take it from an open bench."""
         config = bench.config
-        named = {"dm": bench.dm, "wfs": bench.wfs, "science": bench.science}
+        named = {"dm": bench.dm, "wfs": bench.wfs, "modulator": bench.modulator, "science": bench.science}
         simulated = bool(bench.simulated)
         science = config.devices.science
         return cls(
@@ -48,6 +49,7 @@ class BenchRecord:
             basis=config.basis.kind,
             serials={name: device.info.serial for name, device in named.items() if device is not None},
             layout=_layout(bench),
+            places_m=_places(bench),
             psf_px=None if science is None else float(science.psf_px),
             planted=config.twin.registration.to_registration() if simulated else None,
         )
@@ -64,7 +66,11 @@ class BenchRecord:
             "git": git_state(),
             "started_utc": utc_text(self.started),
             "planted": None if self.planted is None else self.planted.to_dict(),
-            "bench": {"layout": list(self.layout), "psf_px": self.psf_px},
+            "bench": {
+                "layout": list(self.layout),
+                "places_m": [list(place) for place in self.places_m],
+                "psf_px": self.psf_px,
+            },
         }
 
     def tail(self, wall_seconds: float) -> dict[str, Any]:
@@ -81,6 +87,12 @@ def _layout(bench: Bench) -> tuple[str, ...]:
     """Map of the actuators as rows of 0 and 1; empty when they do not stand on a grid."""
     layout = bench.dm.info.layout
     return () if layout is None else tuple("".join("1" if spot else "0" for spot in row) for row in layout)
+
+
+def _places(bench: Bench) -> tuple[tuple[float, float], ...]:
+    """Where actuators without a grid stand, (x, y) in metres; empty when they have one."""
+    info = bench.dm.info
+    return () if info.layout is not None else tuple((float(x), float(y)) for x, y in info.positions_m)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from escape_hw.calibration.acquire import measured_matrix
 from escape_hw.calibration.bound import registration_bound
 from escape_hw.calibration.docrime import docrime_run
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.escape import escape
 from escape_hw.calibration.sprint import sprint
 from escape_hw.config.device_models import DeviceConfig
 from escape_hw.config.load import load_system, load_text
@@ -31,8 +32,9 @@ RANGES = np.array([100.0, 100.0, 2.0, 4.0, 4.0])
 #: The accuracy asked for: rms errors in the same units.
 GOAL = np.array([1.0, 1.0, 0.02, 0.1, 0.1])
 #: Frames at which the errors are taken.
-FRAMES = (220, 300, 500, 1000)
-ESTIMATORS = ("plain", "whitened")
+FRAMES = (20, 50, 100, 220, 300, 500, 1000)
+#: The paper's matrix, the whitened one, and the whitened frames themselves.
+ESTIMATORS = ("plain", "whitened", "telemetry")
 #: How long an abort may wait for its turn.
 _PATIENCE_S = 0.2
 
@@ -109,6 +111,15 @@ def run_plant(
                 sigmas[e, f] = found.sigma
                 if order and count == max(frames):
                     bound = registration_bound(matrix, solution.covariance, model, found.registration)
+        for f, count in enumerate(frames):
+            # Frames of its own: a run this short must find the sensor's geometry on them as well.
+            try:
+                short = bench.run(escape(bench, frames=count, estimator="telemetry")).registration
+            except (TooFewFrames, CalibrationError):
+                continue
+            if short is not None:
+                errors[2, f] = short.registration.to_array() - plant.to_array()
+                sigmas[2, f] = short.sigma
     return PlantErrors(errors, sigmas, bound)
 
 

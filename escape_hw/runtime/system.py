@@ -14,13 +14,12 @@ from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Observer, Procedure
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.config.load import load_system
 
 if TYPE_CHECKING:
     from escape_hw.calibration.sensor_setup import SensorSetup
-    from escape_hw.pipeline.slopes import SlopeExtractor
 
 T = TypeVar("T")
 
@@ -71,7 +70,7 @@ class System(Bench):
             return run_procedure(procedure, observers=(*observers, view), abort=abort)
 
     def find_sensor(self, *, frames: int = 200, progress: bool = False) -> SensorSetup:
-        """Watch the sensor and find its lenslet grid; the mirror stays as it is.
+        """Watch the sensor and find its geometry; the mirror stays as it is.
 
         Parameters
         ----------
@@ -83,14 +82,14 @@ class System(Bench):
         Raises
         ------
         CalibrationError
-            No spots where the design says there should be.
+            No spots or pupil images where the design says there should be.
         """
         from escape_hw.calibration.sensor_setup import find_sensor
 
         return self.run(find_sensor(self, frames=frames), progress=progress)
 
-    def slopes_of(self, grid: SubApertureGrid) -> SlopeExtractor:
-        """A function that takes ``frame.data`` and returns slopes ``(n_slopes,)`` in pixels.
+    def slopes_of(self, grid: SensorGeometry) -> SlopeFunction:
+        """A function that takes ``frame.data`` and returns slopes ``(n_slopes,)``.
 
         Parameters
         ----------
@@ -107,8 +106,9 @@ class System(Bench):
         *,
         frames: int | None = None,
         poke: float | None = None,
-        grid: SubApertureGrid | None = None,
+        grid: SensorGeometry | None = None,
         whiten: bool = True,
+        estimator: str | None = None,
         progress: bool = False,
     ) -> CalibrationResult:
         """Measure an interaction matrix and, with ``"escape"``, the registration behind it.
@@ -117,15 +117,20 @@ class System(Bench):
         ----------
         method
             ``"push-pull"`` (needs a source: the phase screen, where the bench moves one, is out of
-            the beam meanwhile), ``"docrime"`` or ``"escape"`` (both under turbulence).
+            the beam meanwhile), ``"modulated"`` (with or without one), ``"docrime"`` or ``"escape"``
+            (both under turbulence).
         frames
-            Frames to measure with (push-pull: per push and per pull); as configured by default.
+            Frames to measure with (push-pull: per push and per pull; modulated: per batch of modes);
+            as configured by default.
         poke
             Rms surface as fraction of full stroke; as configured by default.
         grid
             The sensor's grid, when it is known already; found on the frames by default.
         whiten
             False: the paper's plain estimator of ``"docrime"`` and ``"escape"``.
+        estimator
+            What ``"escape"`` fits: ``"matrix"``, ``"telemetry"`` (fewer frames than modes are enough)
+            or ``"auto"``; as configured by default.
         progress
             Show a bar with the time left.
 
@@ -145,10 +150,12 @@ class System(Bench):
         """
         from escape_hw.runtime.procedures import calibrate_by
 
-        procedure = calibrate_by(self, method, frames=frames, poke=poke, grid=grid, whiten=whiten)
+        procedure = calibrate_by(
+            self, method, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator
+        )
         return self.run(procedure, progress=progress)
 
-    def find_registration(self, matrix: InteractionMatrix, grid: SubApertureGrid) -> RegistrationEstimate:
+    def find_registration(self, matrix: InteractionMatrix, grid: SensorGeometry) -> RegistrationEstimate:
         """Where the mirror sits on the sensor, from a measured matrix (SPRINT); nothing moves.
 
         ``calibrate("escape")`` does this as well, and its error bars are the better ones: it still
@@ -201,7 +208,7 @@ class System(Bench):
     def close_loop(
         self,
         matrix: InteractionMatrix,
-        grid: SubApertureGrid,
+        grid: SensorGeometry,
         *,
         gain: float | None = None,
         leak: float | None = None,
@@ -248,7 +255,7 @@ class System(Bench):
     def find_best_gain(
         self,
         matrix: InteractionMatrix,
-        grid: SubApertureGrid,
+        grid: SensorGeometry,
         *,
         gains: tuple[float, ...] | None = None,
         frames: int = 1500,

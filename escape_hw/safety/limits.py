@@ -84,3 +84,39 @@ def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:
         for both in [(a >= 0) & (b >= 0)]
     ]
     return np.concatenate(pairs)
+
+
+def nearest_pairs(positions: NDArray[np.float64], reach: float = 1.3) -> NDArray[np.intp]:
+    """Pairs of adjacent actuators anywhere on a mirror, by their distance.
+
+    On a square grid these are the pairs of :func:`neighbour_pairs`, for diagonals are 1.41 pitches.
+
+    Parameters
+    ----------
+    positions
+        Actuator positions ``(n_act, 2)``.
+    reach
+        Largest distance of a pair, in units of the usual distance (median) to the nearest actuator.
+
+    Returns
+    -------
+    ndarray of int, ``(n_pairs, 2)``
+        Every pair once, lower number first.
+
+    Raises
+    ------
+    ValueError
+        The positions are not pairs of finite coordinates, or two actuators stand in one place.
+    """
+    at = np.asarray(positions, dtype=float)
+    if at.ndim != 2 or at.shape[1] != 2 or not np.isfinite(at).all():
+        raise ValueError(f"positions have shape {at.shape}; they must be finite, (n_act, 2)")
+    if len(at) < 2:
+        return np.empty((0, 2), dtype=np.intp)
+    distance = np.hypot(*(at[:, None, k] - at[:, k] for k in (0, 1)))
+    np.fill_diagonal(distance, np.inf)
+    nearest = distance.min(axis=1)
+    if not nearest.min() > 0:
+        one = int(nearest.argmin())
+        raise ValueError(f"actuators {one} and {int(distance[one].argmin())} stand in the same place")
+    return np.argwhere(np.triu(distance <= reach * np.median(nearest))).astype(np.intp)

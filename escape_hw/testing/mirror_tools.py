@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.mirror import DeformableMirror
-from escape_hw.safety.limits import neighbour_pairs
+from escape_hw.safety.limits import nearest_pairs, neighbour_pairs
 from escape_hw.testing.checks import replaced
 
 #: Largest breach that counts as rounding, fraction of full stroke.
@@ -61,9 +61,10 @@ def breaches(dm: DeformableMirror, before: NDArray[np.float64], after: NDArray[n
     enabled = np.setdiff1d(np.arange(after.size), lim.disabled)
     if lim.max_mean is not None and enabled.size and abs(after[enabled].mean()) > lim.max_mean + ROUNDING:
         found.append(f"mean {after[enabled].mean():.6g} > {lim.max_mean}")
-    layout = dm.info.layout
-    if lim.max_neighbour is not None and layout is not None:
-        steps = [abs(after[a] - after[b]) for a, b in neighbour_pairs(layout)]
+    if lim.max_neighbour is not None:
+        layout = dm.info.layout
+        pairs = nearest_pairs(dm.info.positions_m) if layout is None else neighbour_pairs(layout)
+        steps = [abs(after[a] - after[b]) for a, b in pairs]
         if max(steps, default=0.0) > lim.max_neighbour + ROUNDING:
             found.append(f"neighbours differ by {max(steps):.6g} > {lim.max_neighbour}")
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from escape_hw.api.modulator import Modulation, TipTiltModulator
+from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
 from escape_hw.errors import SettingRejected
 from escape_hw.testing.checks import READS, TINY, Check, Factory, check, opened, refused, replaced, up_to
 from escape_hw.testing.common import COMMON
@@ -24,6 +24,20 @@ def _wish(modulator: TipTiltModulator) -> Modulation:
             continue
         return want
     raise AssertionError(f"{modulator.name}: refuses {_SMALL_RAD} rad at every rate from 1 Hz to 1 kHz")
+
+
+@check(READS)
+def check_modulator_info(factory: Factory) -> None:
+    """``info`` says what the stage is and how far it tilts, and that is what ``check`` holds it to."""
+    with opened(factory) as modulator:
+        info = modulator.info
+        assert isinstance(info, ModulatorInfo), f"info is {type(info).__name__}, not ModulatorInfo"
+        assert info.model.strip(), "info.model is empty; products could not say which stage it was"
+        assert type(info.simulated) is bool, f"info.simulated is {info.simulated!r}, neither true nor false"
+        limit = info.max_tilt_rad
+        assert 0 < limit < math.inf, f"info.max_tilt_rad is {limit}; it must be positive and finite"
+        wide = replace(_wish(modulator), radius_rad=1.01 * limit)
+        refused(modulator, SettingRejected, "a radius beyond info.max_tilt_rad", modulator.check, wide)
 
 
 @check(READS)
@@ -99,6 +113,7 @@ def check_modulator_is_parked_when_closed(factory: Factory) -> None:
 
 MODULATOR: tuple[Check, ...] = (
     *COMMON,
+    check_modulator_info,
     check_modulator_check_changes_nothing,
     check_modulator_refuses_meaningless,
     check_modulator_tells_the_truth,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from escape_hw.api.camera import Camera
 from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
 from escape_hw.api.mirror import DeformableMirror, DMInfo
-from escape_hw.api.modulator import Modulation, TipTiltModulator
+from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
 from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.errors import FrameTimeout, SettingRejected
 from escape_hw.safety.limits import MirrorLimits
@@ -137,6 +137,11 @@ class QuantisedModulator(TipTiltModulator):
         self._modulation: Modulation | None = None
 
     @property
+    def info(self) -> ModulatorInfo:
+        """Identity; a milliradian of tilt."""
+        return ModulatorInfo("quantised", "REF-MOD", 1e-3, simulated=True)
+
+    @property
     def modulation(self) -> Modulation | None:
         """The modulation in force."""
         return self._modulation
@@ -148,8 +153,6 @@ class QuantisedModulator(TipTiltModulator):
         """Nothing to disconnect from."""
 
     def _check(self, want: Modulation) -> Modulation:
-        if want.radius_rad > 1e-3:
-            raise SettingRejected(self.name, f"radius_rad is {want.radius_rad}; it does 0 to 1e-3 rad")
         steps = round(1 / (want.frequency_hz * self.STEP_S))
         if not 4 <= steps <= 100_000:
             raise SettingRejected(self.name, f"frequency_hz is {want.frequency_hz}; it does 0.2 to 5000 Hz")

@@ -1,39 +1,79 @@
-"""Camera detector: photon, read and fixed-pattern noise, full well, quantisation."""
+"""Camera detector: photon, multiplication, read and fixed-pattern noise, full well, quantisation."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from escape_sim.poisson import MOST, draw_poisson, poisson_tables, uniform_pair
+
+#: Read noise in electrons above which faint light may count as Gaussian: the skewness of the sum is
+#: below 0.385 / read noise, less than a tenth.
+COUNTING_NOISE_E = 4.0
+#: Largest excess noise factor: that of a long multiplying register.
+MOST_EXCESS = math.sqrt(2)
+_MOST = np.float32(MOST)
+
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _expose(intensity, photons, dark, read2, gain, offset, noise, start, sign, well, top, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _digitise(value, k, gain, offset, well, top, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Counts of a pixel, clipped to the full well and to the converter; 1 when it is saturated."""
+    full = value >= well
+    value = min(value, well)
+    count = max(np.float32(0), value * gain[k] + offset[k])
+    level = min(np.int32(count + np.float32(0.5)), np.int32(top))
+    # The pattern is one of sensitivities: whatever its own, a full pixel stands at the top.
+    if full:
+        level = np.int32(top)
+    out[k] = level
+    return 1 if level == top else 0
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _expose(intensity, photons, dark, read2, excess2, gain, offset, noise, start, sign, well, top, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     saturated = 0
-    n = intensity.size
-    for k in range(n):
+    for k in range(intensity.size):
         mean = intensity[k] * photons + dark
-        value = mean + sign * noise[start + k] * np.sqrt(mean + read2)
-        full = value >= well
-        value = min(value, well)
-        count = value * gain[k] + offset[k]
-        count = max(np.float32(0), count)
-        level = np.int32(count + np.float32(0.5))
-        level = min(level, np.int32(top))
-        # A pixel of low gain is full before the converter reaches its top.
-        if full or level == top:
-            saturated += 1
-        out[k] = level
+        value = mean + sign * noise[start + k] * np.sqrt(mean * excess2 + read2)
+        saturated += _digitise(value, k, gain, offset, well, top, out)
+    return saturated
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _count(settings, key, cumulative, entry):  # type: ignore[no-untyped-def]  # pragma: no cover
+    intensity, photons, dark, read2, excess2, gain, offset, noise, start, sign, well, top, out = settings
+    saturated = 0
+    read = np.sqrt(read2)
+    spread = excess2 - np.float32(1)
+    for k in range(intensity.size):
+        mean = intensity[k] * photons + dark
+        normal = sign * noise[start + k]
+        if mean >= _MOST:
+            value = mean + normal * np.sqrt(mean * excess2 + read2)
+        else:
+            first, second = uniform_pair(key, k)
+            value = draw_poisson(mean, first, second, cumulative, entry)
+            if spread > 0 and value > 0:
+                # Gamma distributed with this mean and variance value x spread (Wilson and Hilferty 1931).
+                small = spread / (np.float32(9) * value)
+                root = np.float32(1) - small + noise[noise.size - 1 - start - k] * np.sqrt(small)
+                value *= max(root, np.float32(0)) ** 3
+            value += normal * read
+        saturated += _digitise(value, k, gain, offset, well, top, out)
     return saturated
 
 
 class Detector:
     """Turns intensities into counts.
 
-    Shot and read noise together are Gaussian with variance ``mean + read_noise^2``: exact enough
-    for a CMOS camera whose read noise is several electrons, not meant for photon counting. The
-    normal deviates come from a long pool, entered at a random place with a random sign for each
-    frame, which costs a tenth of drawing them afresh.
+    Shot and read noise together are Gaussian with variance ``mean + read_noise^2``, which is exact
+    enough for a CMOS camera whose read noise is several electrons. Where the read noise is below
+    :data:`COUNTING_NOISE_E`, light below 20 electrons is counted: true Poisson numbers, spread by the
+    multiplication if there is one. Normal deviates come from a long pool, entered at a random place
+    with a random sign for each frame, which costs a tenth of drawing them afresh.
 
     Parameters
     ----------
@@ -44,7 +84,7 @@ class Detector:
     full_well_e
         Electrons at which a pixel saturates; the converter's top stands at this level.
     read_noise_e, dark_e
-        Read noise (rms) and dark signal per frame in electrons.
+        Read noise (rms) and dark signal per frame in electrons (before multiplication).
     background_e
         Mean black level in electrons; it carries no shot noise.
     fixed_pattern
@@ -52,6 +92,14 @@ class Detector:
         counts.
     rng
         Source of randomness.
+    excess_noise
+        Excess noise factor F of a multiplying detector: shot noise is F times that of the light. 1 for
+        none, 1.25 for an avalanche photodiode array, 1.41 for an electron-multiplying CCD.
+
+    Raises
+    ------
+    ValueError
+        ``excess_noise`` is not in 1..1.4143.
     """
 
     POOL = 1 << 22
@@ -66,7 +114,10 @@ class Detector:
         background_e: float,
         fixed_pattern: float,
         rng: np.random.Generator,
+        excess_noise: float = 1.0,
     ) -> None:
+        if not 1 <= excess_noise <= MOST_EXCESS + 1e-4:
+            raise ValueError(f"excess_noise is {excess_noise}; it must lie in 1..{MOST_EXCESS:.4f}")
         size = shape[0] * shape[1]
         self.shape, self.top = shape, 2**bit_depth - 1
         self._rng = rng
@@ -75,10 +126,14 @@ class Detector:
         scatter = 100 * fixed_pattern * rng.standard_normal(size)
         self._offset = (adu * background_e + scatter).astype(np.float32)
         self._dark, self._read2 = np.float32(dark_e), np.float32(read_noise_e**2)
+        self._excess2 = np.float32(excess_noise**2)
         self._well = np.float32(full_well_e)
         self._noise = rng.standard_normal(max(self.POOL, 2 * size), dtype=np.float32)
+        self._tables = poisson_tables() if read_noise_e < COUNTING_NOISE_E else None
 
-    def expose(self, intensity: NDArray[np.float32], photons: float) -> tuple[NDArray[np.uint16], int]:
+    def expose(
+        self, intensity: NDArray[np.float32], photons: float, sky_e: float = 0.0
+    ) -> tuple[NDArray[np.uint16], int]:
         """One frame.
 
         Parameters
@@ -87,6 +142,8 @@ class Detector:
             Relative intensity ``(rows, columns)``.
         photons
             Electrons per unit of intensity.
+        sky_e
+            Further light, the same on every pixel, in electrons.
 
         Returns
         -------
@@ -96,8 +153,14 @@ class Detector:
         out = np.empty(self.shape, np.uint16)
         start = int(self._rng.integers(0, self._noise.size - intensity.size))
         sign = np.float32(1 if self._rng.random() < 0.5 else -1)
-        saturated = _expose(
-            intensity.ravel(), np.float32(photons), self._dark, self._read2, self._gain, self._offset,
-            self._noise, start, sign, self._well, self.top, out.ravel(),
+        settings = (
+            intensity.ravel(), np.float32(photons), self._dark + np.float32(sky_e), self._read2,
+            self._excess2, self._gain, self._offset, self._noise, start, sign, self._well, self.top,
+            out.ravel(),
         )  # fmt: skip
+        if self._tables is None:
+            saturated = _expose(*settings)
+        else:
+            key = self._rng.integers(0, 1 << 63, dtype=np.uint64)
+            saturated = _count(settings, key, *self._tables)
         return out, int(saturated)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,6 @@ from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.errors import ConfigError, FrameTimeout, SettingRejected
 from escape_sim.detector import Detector
-from escape_sim.influence import layout_positions
 from escape_sim.psf import FocalPlane
 from escape_sim.sim_bench import SimBench
 
@@ -59,10 +59,9 @@ class SimMirror(DeformableMirror):
         super().__init__(name, bench.config.devices.dm.limits.to_limits())
         self._bench = bench
         dm = bench.config.devices.dm
-        layout = dm.actuator_map()
         self._info = DMInfo(
-            "simulated ALPAO DM97-15", dm.serial, int(layout.sum()), layout,
-            layout_positions(layout, dm.pitch_m), dm.stroke_m, True,
+            "simulated ALPAO DM97-15", dm.serial, dm.n_act, dm.actuator_map(), dm.positions() * dm.pitch_m,
+            dm.stroke_m, True,
         )  # fmt: skip
 
     @property
@@ -145,7 +144,7 @@ class _SimCamera(Camera):
 
     def _newest(self, arrival_delay_s: float) -> int:
         """Number of the frame to deliver next: a late reader gets the newest complete one."""
-        period = 1 / self._settings.frame_rate_hz
+        period = 1 / self.settings.frame_rate_hz
         complete = int((self._bench.now_s - self._start_s - arrival_delay_s) / period + 1e-9)
         return max(self._next, complete)
 
@@ -155,14 +154,18 @@ class _SimCamera(Camera):
             bench.advance_to(bench.now_s + timeout_s)
             raise FrameTimeout(
                 self.name,
-                f"no frame within {timeout_s:g} s; check trigger, exposure ({self._settings.exposure_s:g} s) "
+                f"no frame within {timeout_s:g} s; check trigger, exposure ({self.settings.exposure_s:g} s) "
                 "and cable, or allow a longer timeout",
             )
         bench.advance_to(arrival_s)
 
 
 class SimWavefrontSensorCamera(_SimCamera):
-    """Twin of the XIMEA camera behind the lenslets: rate limits, noise, lost frames."""
+    """Twin of the XIMEA camera behind lenslets or pyramid: rate limits, noise, lost frames.
+
+    A modulator triggers it once per turn, or once in so many turns as its own rate comes nearest to;
+    then it exposes whole turns.
+    """
 
     def __init__(self, name: str, bench: SimBench) -> None:
         c = bench.config.devices.wfs
@@ -174,6 +177,20 @@ class SimWavefrontSensorCamera(_SimCamera):
             1e-6,
         )
         self._nominal = Region(*c.region)
+        self._period, self._first = 0.0, 0
+
+    @property
+    def settings(self) -> CameraSettings:
+        """The settings in force."""
+        return self._followed(self._settings)
+
+    def _followed(self, settings: CameraSettings) -> CameraSettings:
+        """The settings as the modulator's trigger changes them."""
+        turn = self._bench.beam_circle.turn_s
+        if turn is None:
+            return settings
+        frame = max(1, round(1 / (settings.frame_rate_hz * turn))) * turn
+        return replace(settings, exposure_s=frame, frame_rate_hz=1 / frame)
 
     def _check(self, want: CameraSettings) -> CameraSettings:
         if want.region != self._nominal and (
@@ -185,11 +202,23 @@ class SimWavefrontSensorCamera(_SimCamera):
             raise SettingRejected(
                 self.name, f"region {want.region} leaves the lit part of the sensor, {self._nominal}"
             )
-        return super()._check(want)
+        return self._followed(super()._check(want))
+
+    def _start(self) -> None:
+        super()._start()
+        self._period, self._first = 1 / self.settings.frame_rate_hz, 0
+
+    def _follow(self) -> None:
+        """Count on from here when the modulator has started, stopped or changed its pace."""
+        period = 1 / self.settings.frame_rate_hz
+        if period != self._period:
+            self._first, self._period = self._first + self._next, period
+            self._start_s, self._next = self._bench.now_s, 0
 
     def _next_frame(self, timeout_s: float) -> Frame:
-        bench, s, twin = self._bench, self._settings, self._bench.config.twin
-        period = 1 / s.frame_rate_hz
+        self._follow()
+        bench, s, twin = self._bench, self.settings, self._bench.config.twin
+        period = self._period
         deadline = bench.now_s + timeout_s
         while True:
             k = self._newest(s.exposure_s + twin.readout_s)
@@ -201,13 +230,13 @@ class SimWavefrontSensorCamera(_SimCamera):
                 break
         image, opd = bench.wfs_image(start, end)
         bench.observe(opd, end)
-        electrons = twin.wfs.photons_per_frame * s.exposure_s / bench.config.devices.wfs.exposure_s
-        electrons *= 0.0 if bench.beam_blocked else 10 ** (s.gain_db / 20)
-        data, saturated = bench.wfs_detector.expose(image, electrons)
+        gain = 10 ** (s.gain_db / 20)
+        source, sky = bench.wfs_light(s.exposure_s)
+        data, saturated = bench.wfs_detector.expose(image, source * gain, sky * gain)
         r, n = s.region, self._nominal
         data = data[r.y - n.y : r.y - n.y + r.height, r.x - n.x : r.x - n.x + r.width]
         data.flags.writeable = False
-        return Frame(data, k, round(end * 1e9), bench.now_ns, saturated)
+        return Frame(data, self._first + k, round(end * 1e9), bench.now_ns, saturated)
 
 
 class SimScienceCamera(_SimCamera):

@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_sim.influence import layout_positions
+from escape_sim.telescope_pupil import passed_share, soiled_share
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
 
 #: Pupil samples across one lenslet: alias-free to +-4 lambda/d, several times the largest tilt.
 PUPIL_SAMPLES = 8
+#: Pupil samples across one actuator pitch that a pyramid needs at least: a Gaussian influence function
+#: keeps less than a ten-thousandth of its amplitude beyond their highest frequency.
+SAMPLES_PER_PITCH = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PupilGeometry:
-    """Sampled pupil of a Shack-Hartmann system.
+    """Sampled pupil of a system.
 
     Parameters
     ----------
+    n_sub, n_pix
+        Sub-apertures across the pupil, and samples across each of them.
+    sub_aperture_m
+        Size of a sub-aperture in metres.
     coordinates_m
         Coordinates of the samples along either axis ``(n,)`` in metres, from the grid's centre.
     amplitude
@@ -46,20 +54,50 @@ class PupilGeometry:
         return np.asarray(self.amplitude > 0)
 
 
-def pupil_geometry(config: SystemConfig, n_pix: int = PUPIL_SAMPLES) -> PupilGeometry:
-    """The pupil that the configuration describes: round, lit by a Gaussian beam."""
+def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeometry:
+    """The pupil that the configuration describes: round, lit by a Gaussian beam, partly obscured.
+
+    Parameters
+    ----------
+    config
+        The system.
+    n_pix
+        Samples across a sub-aperture; as usual for the kind of sensor by default.
+    """
+    n_pix = n_pix or usual_samples(config)
     n_sub, diameter = config.sensor.n_sub, config.system.pupil_m
     d = diameter / n_sub
     n = n_sub * n_pix
     x = (np.arange(n) - (n - 1) / 2) * d / n_pix
     r2 = x[:, None] ** 2 + x[None, :] ** 2
     amplitude = np.where(r2 <= (diameter / 2) ** 2, np.exp(-r2 / config.sensor.beam_radius_m**2), 0.0)
+    if config.telescope.obscuration or config.telescope.spiders_deg:
+        # A sample that is covered in part keeps its share of the light, not of the amplitude.
+        amplitude *= np.sqrt(passed_share(config.telescope, diameter, x))
     return PupilGeometry(n_sub, n_pix, d, x, amplitude.astype(np.float32))
+
+
+def usual_samples(config: SystemConfig) -> int:
+    """Pupil samples across a sub-aperture: as many as the mirror or the lenslets ask for.
+
+    A pyramid's sub-aperture is a pixel of the pupil image, which may be wider than an actuator pitch.
+    """
+    if config.sensor.kind != "pyramid":
+        return PUPIL_SAMPLES
+    least = SAMPLES_PER_PITCH * config.devices.dm.pitches_across_pupil / config.sensor.n_sub
+    return max(1, math.ceil(least))
+
+
+def soiled_pupil(config: SystemConfig, rng: np.random.Generator) -> PupilGeometry:
+    """The pupil of the twin, with whatever ``twin.contamination`` puts on it."""
+    pupil, dirt = pupil_geometry(config), config.twin.contamination
+    share = soiled_share(dirt, config.system.pupil_m, pupil.coordinates_m, rng)
+    return replace(pupil, amplitude=(pupil.amplitude * np.sqrt(share)).astype(np.float32))
 
 
 def actuator_positions(config: SystemConfig) -> NDArray[np.float64]:
     """Actuator positions ``(n_act, 2)`` as (x, y) in metres on the pupil."""
-    return layout_positions(config.devices.dm.actuator_map(), pitch_on_pupil(config))
+    return config.devices.dm.positions() * pitch_on_pupil(config)
 
 
 def pitch_on_pupil(config: SystemConfig) -> float:

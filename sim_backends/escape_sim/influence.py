@@ -6,8 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import factorial
 
 from escape_hw.api.registration import Registration
+
+#: Share of an influence function's peak below which a term of a series is left out.
+_NEGLIGIBLE = 1e-13
 
 
 def layout_positions(layout: NDArray[np.bool_], pitch_m: float) -> NDArray[np.float64]:
@@ -23,8 +27,8 @@ class InfluenceFunctions:
 
     The surface per unit command is ``(1 - w) G(s_i) + w G(wing_scale s_i)`` times the actuator's
     gain, where ``G`` is a Gaussian of peak 1 that falls to ``coupling`` at one pitch. As in
-    OOPAO (``DeformableMirror.modesComputation``), scalings stretch the widths along x and y, and
-    rotation moves the actuators without turning their shapes.
+    OOPAO (``DeformableMirror.modesComputation``), scalings stretch the shapes as they do the
+    positions, and rotation moves the actuators without turning their shapes.
 
     Parameters
     ----------
@@ -82,21 +86,27 @@ class InfluenceFunctions:
         -------
         along_x : ndarray, ``(n_x, n_act, n_terms)``
         along_y : ndarray, ``(n_y, n_act, n_terms)``
-            The surface of actuator ``a`` is ``sum_t along_y[:, a, t] x along_x[:, a, t]``.
+            The surface of actuator ``a`` is ``sum_t along_y[:, a, t] x along_x[:, a, t]``: one term,
+            two with wings, and a dozen times as many under an anamorphosis angle, which makes an
+            ellipse that no product of functions of x and y is.
         """
         at = self.placed(registration, sub_aperture_m)
         sigma = np.broadcast_to(
             np.asarray(self.width) * self.pitch_m / np.sqrt(2 * np.log(1 / self.coupling)), (self.n_act,)
         )
-        stretch = 1 + np.array([registration.radial_scaling, registration.tangential_scaling]) / 100
-        terms = [(1.0 - self.wing, 1.0)] + ([(self.wing, self.wing_scale)] if self.wing else [])
+        # exp(-(d, Q d) / (2 sigma^2)) with Q = S^-2, so that shapes are stretched as positions are.
+        inverse = np.linalg.inv(registration.stretch)
+        q = inverse @ inverse
+        dx = (x_m[:, None] - at[:, 0]) / sigma
+        dy = (y_m[:, None] - at[:, 1]) / sigma
         gain = np.broadcast_to(np.asarray(self.gain, dtype=float), (self.n_act,))
         x, y = [], []
-        for share, scale in terms:
-            x.append(np.exp(-0.5 * ((x_m[:, None] - at[:, 0]) / (sigma * scale * stretch[0])) ** 2))
-            y.append(
-                share * gain * np.exp(-0.5 * ((y_m[:, None] - at[:, 1]) / (sigma * scale * stretch[1])) ** 2)
-            )
+        for share, scale in [(1.0 - self.wing, 1.0)] + ([(self.wing, self.wing_scale)] if self.wing else []):
+            u, v = dx / scale, dy / scale
+            gauss_x, gauss_y = np.exp(-0.5 * q[0, 0] * u**2), share * gain * np.exp(-0.5 * q[1, 1] * v**2)
+            for power, weight in enumerate(_cross_series(q)):
+                x.append(gauss_x * u**power if power else gauss_x)
+                y.append(gauss_y * (weight * v**power) if power else gauss_y)
         return np.stack(x, axis=2), np.stack(y, axis=2)
 
     def surfaces(
@@ -111,23 +121,14 @@ class InfluenceFunctions:
         return np.asarray(np.einsum("yat,xat->ayx", along_y, along_x))
 
 
-class MirrorSurface:
-    """Fast surface of all actuators together on a fixed grid, in single precision."""
+def _cross_series(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights ``(n,)`` of the powers of ``u v`` in ``exp(-q_xy u v)``.
 
-    def __init__(
-        self,
-        influence: InfluenceFunctions,
-        registration: Registration,
-        sub_aperture_m: float,
-        x_m: NDArray[np.float64],
-        y_m: NDArray[np.float64],
-    ) -> None:
-        along_x, along_y = influence.factors(registration, sub_aperture_m, x_m, y_m)
-        self._terms = along_x.shape[2]
-        self._x = np.ascontiguousarray(along_x.reshape(x_m.size, -1).T, dtype=np.float32)
-        self._y = np.ascontiguousarray(along_y.reshape(y_m.size, -1), dtype=np.float32)
-
-    def __call__(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``."""
-        weights = np.repeat(command, self._terms).astype(np.float32)
-        return np.asarray((self._y * weights) @ self._x)
+    Beside ``exp(-q_xx u^2 / 2 - q_yy v^2 / 2)`` the k-th term is at most ``r^k / sqrt(2 pi k)`` with
+    ``r = |q_xy| / sqrt(q_xx q_yy)``, which a mirror that is nearly square keeps far below one.
+    """
+    ratio = abs(q[0, 1]) / np.sqrt(q[0, 0] * q[1, 1])
+    if ratio < _NEGLIGIBLE:
+        return np.ones(1)
+    k = np.arange(1 + int(np.ceil(np.log(_NEGLIGIBLE) / np.log(ratio))))
+    return np.asarray((-q[0, 1]) ** k / factorial(k))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 
 import numpy as np
@@ -51,6 +52,10 @@ class MirrorDynamics:
             return self._position + self._creep_share * self._creep
         total = self._advance(end_s)
         return total / (end_s - start) + self._creep_share * self._creep
+
+    def at(self, time_s: float) -> NDArray[np.float64]:
+        """Displacement ``(n_act,)`` at a moment to come, fractions of full stroke; time does not pass."""
+        return copy.deepcopy(self).mean(time_s, time_s)
 
     def _advance(self, until_s: float) -> NDArray[np.float64]:
         """Move on and return the integral of the position over the way."""

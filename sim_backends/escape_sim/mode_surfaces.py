@@ -67,10 +67,13 @@ def gaussian_factors(
     Raises
     ------
     ValueError
-        The influence functions have a wing, or one width or gain per actuator.
+        The influence functions have a wing, or one width or gain per actuator; or the registration
+        has an anamorphosis angle.
     """
     if influence.wing or np.ndim(influence.width) or np.ndim(influence.gain):
         raise ValueError("derivatives are known for equal Gaussian influence functions without a wing only")
+    if registration.anamorphosis_angle:
+        raise ValueError("derivatives are known without an anamorphosis angle only; no solver asks for one")
     at = influence.placed(registration, sub_aperture_m)
     sigma = float(influence.width) * influence.pitch_m / np.sqrt(2 * np.log(1 / influence.coupling))
     stretch = 1 + np.array([registration.radial_scaling, registration.tangential_scaling]) / 100

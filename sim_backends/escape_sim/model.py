@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, of_kind
+from escape_hw.config.sensor_models import ShackHartmannSection
 from escape_sim.geometry import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.influence import InfluenceFunctions
 from escape_sim.mode_surfaces import N_DERIVATIVES, GaussianFactors, gaussian_factors, mode_surfaces
@@ -25,9 +28,15 @@ _MOTION_DOUBT = 0.25
 _FEW = 12
 
 
-def make_model(config: SystemConfig, grid: SubApertureGrid | None) -> ShackHartmannModel:
+def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticModel:
     """Entry point ``fast``; without a grid, the nominal one of the design."""
-    return ShackHartmannModel(config, grid or nominal_grid(config))
+    if config.sensor.kind == "pyramid":
+        from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+
+        return PyramidModel(config, nominal_pupils(config) if grid is None else of_kind(grid, PyramidPupils))
+    return ShackHartmannModel(
+        config, nominal_grid(config) if grid is None else of_kind(grid, SubApertureGrid)
+    )
 
 
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:
@@ -37,7 +46,7 @@ def nominal_grid(config: SystemConfig) -> SubApertureGrid:
     flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
     flux /= np.percentile(flux[flux > 0], 95)
     valid = flux >= config.sensor.min_flux
-    pitch = config.sensor.pitch_px
+    pitch = config.sensor_as(ShackHartmannSection).pitch_px
     width, height = config.devices.wfs.region[2:]
     origin = ((width - 1) / 2 - pitch * (n - 1) / 2, (height - 1) / 2 - pitch * (n - 1) / 2)
     references = np.zeros((int(valid.sum()), 2), np.float32)

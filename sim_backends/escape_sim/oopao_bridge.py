@@ -69,7 +69,9 @@ def oopao() -> SimpleNamespace:
     ConfigError
         OOPAO is not installed.
     """
-    names = ("DeformableMirror", "MisRegistration", "OPD_map", "ShackHartmann", "Source", "Telescope")
+    names = (
+        "DeformableMirror", "MisRegistration", "OPD_map", "Pyramid", "ShackHartmann", "Source", "Telescope",
+    )  # fmt: skip
     with quiet():
         try:
             return SimpleNamespace(**{name: getattr(import_module(f"OOPAO.{name}"), name) for name in names})
@@ -87,6 +89,7 @@ def mis_registration(registration: Registration, sub_aperture_m: float) -> Any:
     out.rotationAngle = registration.rotation
     out.radialScaling = registration.radial_scaling / 100
     out.tangentialScaling = registration.tangential_scaling / 100
+    out.anamorphosisAngle = registration.anamorphosis_angle
     return out
 
 
@@ -160,4 +163,33 @@ def make_lenslets(light: Light, n_sub: int, window: int) -> Any:
         sensor.cpu_batch_memory = 1.5e8
         # fft_workers only helps asterisms; -1 would start a thread per core.
         sensor.fft_workers = 1
+    return sensor
+
+
+def make_pyramid(light: Light, n_sub: int, separation: int, edge: int, roof: float = 0.0) -> Any:
+    """A noise-free ``Pyramid`` at rest, every pixel valid.
+
+    Parameters
+    ----------
+    light
+        Source and telescope.
+    n_sub
+        Camera pixels across the pupil map.
+    separation, edge
+        Pixels between two pupil images, and beside them.
+    roof
+        Its ``rooftop``.
+    """
+    with quiet():
+        sensor = oopao().Pyramid(
+            nSubap=n_sub,
+            telescope=light.telescope,
+            modulation=0,
+            lightRatio=0,
+            n_pix_separation=separation,
+            n_pix_edge=edge,
+            rooftop=roof,
+        )
+        # Its image of the focal plane is not looked at.
+        sensor.compute_focal_plane = False
     return sensor

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.config.sensor_models import PyramidSection, ShackHartmannSection
 from escape_sim.geometry import PupilGeometry
+from escape_sim.modulation import Modulation
+from escape_sim.pyramid import PyramidOptics
 from escape_sim.shack_hartmann import ShackHartmannOptics
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
+    from escape_sim.oopao_pyramid import OOPAOPyramid
 
 
 class SensorOptics(Protocol):
@@ -24,19 +28,57 @@ class SensorOptics(Protocol):
         ...
 
 
+@runtime_checkable
+class ModulatedOptics(SensorOptics, Protocol):
+    """Optics of a pyramid: the beam's points on it may be changed at any time."""
+
+    modulation: Modulation
+
+
 def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOptics:
     """The twin's sensor as it really stands, which the design does not know exactly."""
+    amplitude = pupil.amplitude / np.sqrt(np.sum(np.square(pupil.amplitude, dtype=float)))
+    if isinstance(config.sensor, PyramidSection):
+        return make_pyramid(config, config.sensor, pupil, amplitude.astype(np.float32))
+    return _make_lenslets(config, config.sensor, pupil, amplitude.astype(np.float32))
+
+
+def make_pyramid(
+    config: SystemConfig, sensor: PyramidSection, pupil: PupilGeometry, amplitude: NDArray[np.float32]
+) -> PyramidOptics | OOPAOPyramid:
+    """A pyramid with its images where they really fall, not modulated yet."""
+    make: type[PyramidOptics | OOPAOPyramid] = PyramidOptics
+    if config.system.optics == "oopao":
+        # Imported here: OOPAO loads for two seconds and 1,600 modules.
+        from escape_sim.oopao_pyramid import OOPAOPyramid
+
+        make = OOPAOPyramid
+    twin = config.twin.pyramid
+    width, height = config.devices.wfs.region[2:]
+    return make(
+        amplitude,
+        float(pupil.n_sub),
+        config.system.wavelength_m,
+        np.add(sensor.pupils_px, twin.centre_offsets_px),
+        (height, width),
+        Modulation.circle(0.0),
+        rooftop=twin.rooftop,
+        samples=pupil.n_pix,
+    )
+
+
+def _make_lenslets(
+    config: SystemConfig, sensor: ShackHartmannSection, pupil: PupilGeometry, amplitude: NDArray[np.float32]
+) -> SensorOptics:
     c, twin = config, config.twin.wfs
-    n_sub, pitch = c.sensor.n_sub, twin.pitch_px or c.sensor.pitch_px
+    n_sub, pitch = sensor.n_sub, twin.pitch_px or sensor.pitch_px
     width, height = c.devices.wfs.region[2:]
     origin = (
         (width - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[0],
         (height - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[1],
     )
-    amplitude = pupil.amplitude / np.sqrt(np.sum(np.square(pupil.amplitude, dtype=float)))
     geometry = (
-        n_sub, pupil.n_pix, c.system.wavelength_m, pitch, c.sensor.spot_px, origin, (height, width),
-        amplitude.astype(np.float32),
+        n_sub, pupil.n_pix, c.system.wavelength_m, pitch, sensor.spot_px, origin, (height, width), amplitude,
     )  # fmt: skip
     if c.system.optics == "oopao":
         # Imported here: OOPAO loads for two seconds and 1,600 modules.

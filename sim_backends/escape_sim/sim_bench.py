@@ -11,13 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.errors import ConfigError
+from escape_sim.atmosphere import Atmosphere
+from escape_sim.beam_circle import BeamCircle
 from escape_sim.detector import Detector
-from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
-from escape_sim.influence import InfluenceFunctions, MirrorSurface
+from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry, soiled_pupil
+from escape_sim.influence import InfluenceFunctions
+from escape_sim.measured_influence import MeasuredInfluence, read_influence
 from escape_sim.mirror_dynamics import MirrorDynamics
+from escape_sim.mirror_surface import InfluenceShapes, mirror_surface
 from escape_sim.phase_plates import PhasePlates
 from escape_sim.psf import FocalPlane
-from escape_sim.sensor_optics import SensorOptics, make_sensor_optics
+from escape_sim.sensor_optics import ModulatedOptics, SensorOptics, make_sensor_optics
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
@@ -39,18 +43,21 @@ class SimBench:
 
     def __init__(self, config: SystemConfig) -> None:
         self.config = config
-        streams = np.random.SeedSequence(config.system.seed).spawn(6)
-        plates, hidden, latency, frames, wfs_noise, science_noise = streams
+        streams = np.random.SeedSequence(config.system.seed).spawn(8)
+        plates, hidden, latency, frames, wfs_noise, science_noise, sky, dirt = streams
         self.latency_rng, self.frame_rng = np.random.default_rng(latency), np.random.default_rng(frames)
         truth = np.random.default_rng(hidden)
-        self.pupil = pupil_geometry(config)
+        self.pupil = soiled_pupil(config, np.random.default_rng(dirt))
+        clean = np.square(pupil_geometry(config).amplitude, dtype=float).sum()
+        #: Share of the light that the soiled pupil lets through.
+        self._passed = float(np.square(self.pupil.amplitude, dtype=float).sum() / clean)
         self._clock_ns = 0
         self._wall_start = time.monotonic()
         dm, twin = config.devices.dm, config.twin
         self.influence = self._true_influence(truth)
         self.registration = twin.registration.to_registration()
         x = self.pupil.coordinates_m
-        self._surface = MirrorSurface(self.influence, self.registration, self.pupil.sub_aperture_m, x, x)
+        self._surface = mirror_surface(self.influence, self.registration, self.pupil.sub_aperture_m, x, x)
         self.dynamics = MirrorDynamics(
             self.influence.n_act, twin.mirror.settling_s, twin.mirror.creep_fraction, twin.mirror.creep_time_s
         )
@@ -59,14 +66,19 @@ class SimBench:
         self._ncpa = self._aberration(truth, twin.ncpa.rms_m, twin.ncpa.n_modes)
         self._vibration_phase = truth.uniform(0, 2 * np.pi, (2, len(twin.vibration.frequency_hz)))
         self._sensor: SensorOptics | None = None
+        self.beam_circle = BeamCircle(config, truth.uniform(0, 2 * np.pi, 2))
+        self._circle_in_force: object = self
         self.wfs_detector = Detector(
             (config.devices.wfs.region[3], config.devices.wfs.region[2]), config.devices.wfs.bit_depth,
             twin.wfs.full_well_e, twin.wfs.read_noise_e, twin.wfs.dark_e, twin.wfs.background,
-            twin.wfs.fixed_pattern, np.random.default_rng(wfs_noise),
+            twin.wfs.fixed_pattern, np.random.default_rng(wfs_noise), twin.wfs.excess_noise,
         )  # fmt: skip
         self._science_rng = np.random.default_rng(science_noise)
         self._exposures: _Exposures | None = None
         self.plates = PhasePlates(config, self.pupil, plates)
+        self.air: Atmosphere | None = None
+        if twin.atmosphere is not None:
+            self.air = Atmosphere(twin.atmosphere, self.pupil.pixel_m, self.pupil.lit, sky)
         self.beam_blocked = False
 
     # ------------------------------------------------------------------ clock
@@ -98,6 +110,8 @@ class SimBench:
         opd = self._surface(self.dynamics.mean(start_s, end_s))
         opd *= self._metres
         self.plates.add(middle, opd)
+        if self.air is not None:
+            self.air.add(middle, opd)
         tip, tilt = self._vibration(middle)
         if tip or tilt:
             x = self.pupil.coordinates_m.astype(np.float32)
@@ -113,14 +127,35 @@ class SimBench:
         opd = np.zeros(self.pupil.amplitude.shape, np.float32)
         for a, b in pairwise(edges):
             opd = self.optical_path(float(a), float(b))
-            sensor.frame(opd + self._ncpa, image)
+            sensor.frame(opd + self._ncpa + self._drift(float(a)), image)
         return (image / np.float32(steps) if steps > 1 else image), opd
+
+    def wfs_light(self, exposure_s: float) -> tuple[float, float]:
+        """Electrons of an exposure: from the source over the whole sensor, from the sky on each pixel."""
+        twin, camera = self.config.twin, self.config.devices.wfs
+        if self.beam_blocked:
+            return 0.0, 0.0
+        if twin.star is None:
+            return self._passed * twin.wfs.photons_per_frame * exposure_s / camera.exposure_s, 0.0
+        sky = twin.star.sky_electrons(exposure_s) / (camera.region[2] * camera.region[3])
+        return self._passed * twin.star.electrons(exposure_s), self._passed * sky
 
     def sensor(self) -> SensorOptics:
         """The sensor's optics, built when first used."""
         if self._sensor is None:
             self._sensor = make_sensor_optics(self.config, self.pupil)
+        circle = self.beam_circle.modulation
+        if isinstance(self._sensor, ModulatedOptics) and circle is not self._circle_in_force:
+            self._sensor.modulation, self._circle_in_force = self.beam_circle.points(), circle
         return self._sensor
+
+    def _drift(self, time_s: float) -> NDArray[np.float32] | np.float32:
+        """Tilt ``(n, n)`` in metres of the beam on a pyramid, whose modulation's centre wanders."""
+        if not self.config.twin.pyramid.drift:
+            return np.float32(0)
+        x, y = self.beam_circle.drift(time_s) * self.config.system.wavelength_m / self.config.system.pupil_m
+        at = self.pupil.coordinates_m
+        return np.asarray(x * at[None, :] + y * at[:, None], np.float32)
 
     def focal_plane(self, shape: tuple[int, int]) -> FocalPlane:
         """The science camera's optics for a region."""
@@ -142,7 +177,7 @@ class SimBench:
             raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
         return Detector(
             shape, science.bit_depth, twin.full_well_e, twin.read_noise_e, twin.dark_e,
-            twin.background, twin.fixed_pattern, self._science_rng,
+            twin.background, twin.fixed_pattern, self._science_rng, twin.excess_noise,
         )  # fmt: skip
 
     # ------------------------------------------------------------------ science camera
@@ -173,10 +208,13 @@ class SimBench:
         return exposures.take(number)
 
     # ------------------------------------------------------------------ construction
-    def _true_influence(self, truth: np.random.Generator) -> InfluenceFunctions:
+    def _true_influence(self, truth: np.random.Generator) -> InfluenceShapes:
         mirror = self.config.twin.mirror
         positions = actuator_positions(self.config)
         n = len(positions)
+        if mirror.influence_file and mirror.influence_pixel_m is not None:
+            gain = 1 + mirror.gain_scatter * truth.standard_normal(n)
+            return MeasuredInfluence(read_influence(mirror.influence_file, n), mirror.influence_pixel_m, gain)
         return InfluenceFunctions(
             positions,
             pitch_on_pupil(self.config),

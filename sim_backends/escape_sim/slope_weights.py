@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.config.sensor_models import ShackHartmannSection
 from escape_hw.pipeline.slopes import windows
 from escape_sim.geometry import PupilGeometry
 from escape_sim.shack_hartmann import field_pixels, first_pixels, lenslet_transform
@@ -63,7 +64,8 @@ class _Views:
     """Images of a window's nine lenslets on the window's pixels, for all windows at once."""
 
     def __init__(self, config: SystemConfig, grid: SubApertureGrid, pupil: PupilGeometry) -> None:
-        n, p, spot = pupil.n_sub, pupil.n_pix, config.sensor.spot_px
+        sensor = config.sensor_as(ShackHartmannSection)
+        n, p, spot = pupil.n_sub, pupil.n_pix, sensor.spot_px
         width, height = config.devices.wfs.region[2:]
         boxes = windows(grid.centres_px(), grid.pitch_px, (height, width)).astype(np.intp)
         rows, columns = np.nonzero(grid.valid)
@@ -77,7 +79,7 @@ class _Views:
         self._inside = in_y[:, :, None] & in_x[:, None, :]
         blocks = pupil.amplitude.reshape(n, p, n, p).transpose(0, 2, 1, 3).astype(float)
         light = np.square(blocks).sum(axis=(2, 3))
-        counts = config.sensor.threshold * (2**config.devices.wfs.bit_depth - 1)
+        counts = sensor.threshold * (2**config.devices.wfs.bit_depth - 1)
         # The threshold in the units of the intensities here, by the light of a bright sub-aperture.
         self._cut = counts / grid.counts * float(np.percentile(light[light > 0], 95)) if grid.counts else 0.0
         self._samples = (np.arange(p) - (p - 1) / 2) / p

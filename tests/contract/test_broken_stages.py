@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 
 from escape_hw.api.device import Device
+from escape_hw.api.modulator import ModulatorInfo
 from escape_hw.api.screen import ScreenInfo
 from escape_hw.errors import SettingRejected
 from escape_hw.testing import modulator_checks, screen_checks
@@ -54,7 +56,13 @@ def repairs_screen(self: Any, **change: Any) -> Any:
         return self._state
 
 
+def brags(self: Any) -> ModulatorInfo:
+    """Claim to reach everywhere."""
+    return ModulatorInfo("bragging", "REF-MOD", math.inf, simulated=True)
+
+
 BROKEN: list[Broken] = [
+    ("brags of its reach", QuantisedModulator, "modulator_info", {"info": property(brags)}),
     ("check moves", QuantisedModulator, "modulator_check_changes_nothing", {"_check": checks_by_moving}),
     ("any modulation", QuantisedModulator, "modulator_refuses_meaningless", {"check": takes_all}),
     ("modulate lies", QuantisedModulator, "modulator_tells_the_truth", {"modulate": modulates_as_asked}),

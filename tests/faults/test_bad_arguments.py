@@ -51,10 +51,20 @@ def test_pokes_that_mean_nothing(shared, procedure, poke):
     refuse(shared, procedure(shared, poke=poke), ConfigError, "poke is")
 
 
-@pytest.mark.parametrize("procedure", [docrime, escape])
 @pytest.mark.parametrize("frames", [1, 50, 81])
-def test_too_few_frames_say_how_many(shared, procedure, frames):
-    refuse(shared, procedure(shared, frames=frames), TooFewFrames, f"{frames} frames .* at least 82 frames")
+def test_too_few_frames_say_how_many(shared, frames):
+    refuse(shared, docrime(shared, frames=frames), TooFewFrames, f"{frames} frames .* at least 82 frames")
+    matrix = escape(shared, frames=frames, estimator="matrix")
+    refuse(shared, matrix, TooFewFrames, f"{frames} frames .* at least 82 frames")
+
+
+@pytest.mark.parametrize("frames", [1, 12])
+def test_too_few_frames_for_the_telemetry(shared, frames):
+    refuse(shared, escape(shared, frames=frames), TooFewFrames, f"{frames} frames .* at least 13 frames")
+
+
+def test_an_unknown_estimator(shared):
+    refuse(shared, escape(shared, estimator="magic"), ConfigError, "'magic' is unknown; it is one of auto")
 
 
 @pytest.mark.parametrize(

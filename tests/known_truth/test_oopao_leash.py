@@ -20,7 +20,9 @@ def _run(code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, timeout=120)
 
 
-@pytest.mark.parametrize("module", ["model", "oopao_bridge", "oopao_model", "oopao_optics", "devices"])
+@pytest.mark.parametrize(
+    "module", ["model", "oopao_bridge", "oopao_model", "oopao_optics", "oopao_pyramid", "pyramid", "devices"]
+)
 def test_importing_the_twin_does_not_import_oopao(module):
     done = _run(
         f"import sys, escape_sim.{module}; print('OOPAO' in sys.modules, 'matplotlib' in sys.modules)"

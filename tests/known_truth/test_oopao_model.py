@@ -15,7 +15,7 @@ from escape_hw.config.models import SystemConfig
 from escape_hw.errors import CalibrationError
 from escape_sim import model as fast_model
 from escape_sim import oopao_model
-from escape_sim.oopao_bridge import make_lenslets, mis_registration, quiet
+from escape_sim.oopao_bridge import make_lenslets, quiet
 
 PAPER = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
 #: Relative, with no gain or any other freedom; 5e-8 is what we see.
@@ -112,12 +112,10 @@ def test_the_matrix_is_that_of_oopao_itself(config, oopao):
     """OOPAO's own calibration routine with its own centroids, over its own whole-pixel windows."""
     from OOPAO.calibration.InteractionMatrix import InteractionMatrix
 
-    light, edge = oopao._light, oopao._edge
+    light = oopao._light
     lenslets = make_lenslets(light, 24, 14)
     with quiet():
-        mirror = oopao._mirror(1.0).apply_mis_registration(
-            mis_registration(PAPER, oopao.sub_aperture_m * edge)
-        )
+        mirror = oopao._mirror.moved(PAPER, 1.0)
         own = InteractionMatrix(
             light.source,
             light.telescope,

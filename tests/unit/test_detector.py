@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from escape_sim.detector import Detector
 
@@ -73,10 +74,10 @@ def test_counts_are_rounded_to_the_nearest():
     # Full well at the converter's top: one electron per count; the noise is of the photons alone.
     frame, _ = camera.expose(np.zeros(SHAPE, np.float32), 1.0)
     assert not frame.any()
-    # 1e-4 of a photon beside a black level of so many counts: the noise is a hundredth of a count.
+    # Nothing but a black level of so many counts.
     for level, want in ((41.3, 41), (41.7, 42), (300.4, 300)):
         still = detector(read_noise_e=0.0, background_e=level, full_well_e=1023.0)
-        frame, _ = still.expose(np.full(SHAPE, 1e-4, np.float32), 1.0)
+        frame, _ = still.expose(np.zeros(SHAPE, np.float32), 1.0)
         assert (frame == want).all()
 
 
@@ -99,7 +100,7 @@ def test_saturated_pixels_are_counted(fixed_pattern):
     image[10:14, 20:27] = 40000.0
     frame, saturated = camera.expose(image, 1.0)
     assert saturated == 28
-    assert frame[10:14, 20:27].min() > 0.85 * camera.top
+    assert (frame[10:14, 20:27] == camera.top).all()
     assert np.median(frame) < 0.2 * camera.top
 
 
@@ -121,3 +122,86 @@ def test_fixed_pattern_is_fixed():
     assert dark.std() == pytest.approx(2.0, rel=0.15)
     again = stack(camera, 5000.0, n=100).mean(axis=0)
     assert np.corrcoef(bright.ravel(), again.ravel())[0, 1] > 0.98
+
+
+COUNTING = {"read_noise_e": 0.0, "background_e": 0.0, "bit_depth": 16, "full_well_e": 65535.0}
+
+
+@pytest.mark.parametrize("mean", [0.003, 0.4, 1.0, 3.37, 9.99, 19.99])
+def test_faint_light_is_poisson(mean):
+    # One count per electron; the dark signal is counted like the light.
+    counts = stack(detector(**COUNTING, dark_e=0.25 * mean), 0.75 * mean, n=60).astype(int).ravel()
+    most = int(mean + 8 * np.sqrt(mean) + 6)
+    found = np.bincount(counts, minlength=most + 1)
+    assert found.size == most + 1
+    want = stats.poisson.pmf(np.arange(most + 1), mean) * counts.size
+    likely = want > 10
+    chi2 = ((found - want)[likely] ** 2 / want[likely]).sum()
+    assert chi2 < stats.chi2.isf(1e-4, likely.sum())
+    assert found[~likely].sum() < 10 * likely.size
+
+
+@pytest.mark.parametrize("mean", [2.0, 15.0, 21.0, 300.0])
+def test_mean_and_variance_hold_across_the_change_to_gaussian(mean):
+    frames = stack(detector(**{**COUNTING, "read_noise_e": 0.6, "background_e": 20.0}), mean)
+    variance = mean + 0.36 + 1 / 12
+    fourth = np.sqrt((2 + 1 / mean) / frames.size)
+    assert frames.mean() == pytest.approx(mean + 20, abs=5 * np.sqrt(variance / frames.size))
+    assert frames.var() == pytest.approx(variance, rel=5 * fourth + 0.01)
+
+
+@pytest.mark.parametrize("mean", [0.5, 6.0, 200.0])
+@pytest.mark.parametrize("excess", [1.25, 1.4142])
+def test_multiplication_adds_its_noise(mean, excess):
+    camera = detector(**{**COUNTING, "background_e": 2000.0, "full_well_e": 6553.5}, excess_noise=excess)
+    frames = (stack(camera, mean, n=100) - 20000) / 10
+    # The rare large numbers of a faint light make its variance uncertain.
+    kurtosis = 2 + 8 / mean
+    variance = excess**2 * mean
+    assert frames.mean() == pytest.approx(mean, abs=5 * np.sqrt(variance / frames.size))
+    assert frames.var() == pytest.approx(variance, rel=5 * np.sqrt(kurtosis / frames.size) + 0.005)
+
+
+def test_darkness_counts_nothing():
+    assert not stack(detector(**COUNTING), 0.0).any()
+    assert not stack(detector(**COUNTING, excess_noise=1.4), 0.0).any()
+
+
+def test_counted_pixels_and_frames_are_independent():
+    frames = stack(detector(**COUNTING), 4.0, n=80)
+    frames -= frames.mean()
+    for left, right in (
+        (frames[:, :, 1:], frames[:, :, :-1]),
+        (frames[:, 1:], frames[:, :-1]),
+        (frames[1:], frames[:-1]),
+    ):
+        assert abs(np.mean(left * right)) < 5 * frames.var() / np.sqrt(left.size)
+
+
+def test_counting_is_seeded():
+    image = np.full(SHAPE, 5.0, np.float32)
+    first, again, other = (detector(seed, **COUNTING).expose(image, 1.0)[0] for seed in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_the_sky_is_counted_like_the_light():
+    camera = detector(**COUNTING)
+    frames = np.array([camera.expose(np.zeros(SHAPE, np.float32), 7.0, 3.0)[0] for _ in range(40)], float)
+    assert frames.mean() == pytest.approx(3.0, abs=5 * np.sqrt(3 / frames.size))
+    assert frames.var() == pytest.approx(3.0, rel=5 * np.sqrt(2.4 / frames.size))
+
+
+@pytest.mark.parametrize("bit_depth", [8, 10, 12, 16])
+@pytest.mark.parametrize("read_noise", [0.5, 20.0])
+def test_overexposure_stops_at_the_top(bit_depth, read_noise):
+    camera = detector(bit_depth=bit_depth, read_noise_e=read_noise, fixed_pattern=0.02)
+    frame, saturated = camera.expose(np.full(SHAPE, 3e9, np.float32), 1.0)
+    assert saturated == frame.size
+    assert (frame == 2**bit_depth - 1).all()
+
+
+@pytest.mark.parametrize("excess", [0.9, 1.6, float("nan")])
+def test_an_impossible_excess_noise_is_refused(excess):
+    with pytest.raises(ValueError, match="excess_noise"):
+        detector(excess_noise=excess)

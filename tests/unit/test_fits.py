@@ -279,7 +279,8 @@ def test_wrong_kind_and_foreign_files(tmp_path):
         ({"expect_actuators": 277}, "number of actuators is 97"),
         ({"expect_m2c": np.zeros((97, 5))}, "basis differs"),
         ({"expect_m2c": np.zeros((97, 6))}, "shape of the basis"),
-        ({"expect_sub_apertures": (24, 24)}, "lenslet grid"),
+        ({"expect_sub_apertures": (24, 24)}, "grid of sub-apertures"),
+        ({"expect_sensor": "pyramid"}, "kind of sensor is 'shack-hartmann'"),
         ({"allow_simulated": False}, "made in simulation"),
     ],
 )

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from escape_hw.api.registration import Registration
-from escape_sim.influence import InfluenceFunctions, MirrorSurface, layout_positions
+from escape_hw.errors import ConfigError
+from escape_sim.influence import InfluenceFunctions, layout_positions
+from escape_sim.measured_influence import MeasuredInfluence, read_influence
+from escape_sim.mirror_surface import MirrorSurface, StampedSurface, WindowedSurface, mirror_surface
 
 PITCH, D = 0.75e-3, 0.28e-3
 X = np.linspace(-4e-3, 4e-3, 81)
 Y = np.linspace(-3.5e-3, 3.5e-3, 61)
 #: A rotation, unequal scalings and shifts at once.
 GENERAL = Registration(37.0, -61.0, 1.7, 2.3, -3.1)
+ANAMORPHIC = Registration(37.0, -61.0, 1.7, 5.3, -3.1, 33.0)
 
 
 def mirror(**options):
@@ -31,7 +36,10 @@ def dense(m, registration):
     for a, position in enumerate(m.positions_m):
         x, y = matrix @ position + offset
         for share, scale in ((1 - m.wing, 1.0), (m.wing, m.wing_scale)):
-            r2 = ((X[None, :] - x) / sx) ** 2 + ((Y[:, None] - y) / sy) ** 2
+            # Along the radial direction, which lies at minus the anamorphosis angle, and across it.
+            c, s = (f(np.deg2rad(registration.anamorphosis_angle)) for f in (np.cos, np.sin))
+            dx, dy = X[None, :] - x, Y[:, None] - y
+            r2 = ((c * dx - s * dy) / sx) ** 2 + ((s * dx + c * dy) / sy) ** 2
             out[a] += share * gain[a] * np.exp(-0.5 * r2 / (width[a] * scale) ** 2)
     return out
 
@@ -46,7 +54,7 @@ def rough(n):
     }
 
 
-@pytest.mark.parametrize("registration", [Registration(), GENERAL])
+@pytest.mark.parametrize("registration", [Registration(), GENERAL, ANAMORPHIC])
 @pytest.mark.parametrize("options", [{}, rough(33)], ids=["plain", "with scatter and wings"])
 def test_separable_factors_make_the_dense_formula(registration, options):
     m = mirror(**options)
@@ -54,9 +62,11 @@ def test_separable_factors_make_the_dense_formula(registration, options):
     assert np.abs(m.surfaces(registration, D, X, Y) - want).max() < 1e-14
     rng = np.random.default_rng(1)
     command = rng.uniform(-1, 1, m.n_act)
-    fast = MirrorSurface(m, registration, D, X, Y)(command)
-    assert fast.dtype == np.float32
-    assert np.abs(fast - np.tensordot(command, want, 1)).max() < 2e-6
+    factors = m.factors(registration, D, X, Y)
+    for fast in (MirrorSurface(*factors), WindowedSurface(*factors), StampedSurface(want)):
+        surface = fast(command)
+        assert surface.dtype == np.float32
+        assert np.abs(surface - np.tensordot(command, want, 1)).max() < 4e-6
 
 
 def test_positions_are_row_major_and_centred():
@@ -110,3 +120,103 @@ def test_scaling_comes_before_rotation():
     registration = Registration(rotation=90.0, radial_scaling=20.0)
     assert moved(registration, (1e-3, 0.0)) == pytest.approx((0.0, 1.2e-3), abs=1e-7)
     assert moved(registration, (0.0, 1e-3)) == pytest.approx((-1e-3, 0.0), abs=1e-7)
+
+
+def test_the_anamorphosis_angle_turns_the_axes_of_the_scalings():
+    turned = Registration(radial_scaling=10.0, tangential_scaling=-10.0, anamorphosis_angle=90.0)
+    swapped = Registration(radial_scaling=-10.0, tangential_scaling=10.0)
+    m = mirror()
+    assert m.surfaces(turned, D, X, Y) == pytest.approx(m.surfaces(swapped, D, X, Y), abs=1e-12)
+    # At 30 degrees the radial axis points towards -y.
+    at = moved(Registration(radial_scaling=10.0, anamorphosis_angle=30.0), (1e-3, -1e-3 * np.tan(np.pi / 6)))
+    assert at == pytest.approx((1.1e-3, -1.1e-3 * np.tan(np.pi / 6)), abs=1e-7)
+
+
+def test_scalings_alike_need_no_angle():
+    plain, turned = (
+        Registration(radial_scaling=4.0, tangential_scaling=4.0, anamorphosis_angle=a) for a in (0, 50)
+    )
+    m = mirror()
+    assert m.factors(turned, D, X, Y)[0].shape[2] == 1
+    assert m.surfaces(turned, D, X, Y) == pytest.approx(m.surfaces(plain, D, X, Y), abs=1e-12)
+
+
+def test_the_faster_way_is_taken():
+    few = mirror_surface(mirror(), Registration(), D, X, Y)
+    assert isinstance(few, MirrorSurface)
+    line = np.linspace(-1, 1, 120)
+    many = InfluenceFunctions(layout_positions(np.ones((30, 30), bool), 2 / 30), 2 / 30, 0.3)
+    fast = mirror_surface(many, Registration(rotation=3.0), 0.1, line, line)
+    assert isinstance(fast, WindowedSurface)
+    command = np.random.default_rng(3).uniform(-1, 1, 900)
+    command[5] = 0.0
+    want = np.tensordot(command, many.surfaces(Registration(rotation=3.0), 0.1, line, line), 1)
+    assert np.abs(fast(command) - want).max() < 1e-5
+
+
+FINE = 0.1e-3
+GRID = (np.arange(121) - 60) * FINE
+
+
+def measured(**options):
+    """What an interferometer would see of the Gaussian mirror, on a grid of its own."""
+    return MeasuredInfluence(mirror().surfaces(Registration(), D, GRID, GRID), FINE, **options)
+
+
+@pytest.mark.parametrize(
+    "registration",
+    [
+        Registration(),
+        Registration(37.0, -61.0),
+        Registration(radial_scaling=4.0, tangential_scaling=-2.0),
+        Registration(20.0, 0.0, 0.0, 4.0, -2.0, 25.0),
+    ],
+    ids=str,
+)
+def test_measured_shapes_follow_a_registration_as_gaussians_do(registration):
+    found = measured().surfaces(registration, D, X, Y)
+    want = mirror().surfaces(registration, D, X, Y)
+    assert found.shape == want.shape
+    assert np.abs(found - want).max() < 2e-5
+
+
+def test_measured_shapes_turn_with_the_mirror():
+    # An ellipse along x, turned by a right angle, lies along y.
+    wide = np.exp(-((GRID[None, :] / 1e-3) ** 2) - (GRID[:, None] / 0.5e-3) ** 2)[None]
+    turned = MeasuredInfluence(wide, FINE).surfaces(Registration(rotation=90.0), D, GRID, GRID)
+    assert turned[0] == pytest.approx(wide[0].T, abs=1e-9)
+
+
+def test_measured_shapes_carry_gains_and_end_where_nothing_was_measured():
+    found = measured(gain=np.full(33, 2.0)).surfaces(Registration(), D, GRID, GRID)
+    assert found == pytest.approx(2 * mirror().surfaces(Registration(), D, GRID, GRID), abs=1e-6)
+    beyond = np.array([6.6e-3, 9e-3])
+    assert not measured().surfaces(Registration(), D, beyond, GRID).any()
+    fast = mirror_surface(measured(), GENERAL, D, X, Y)
+    assert isinstance(fast, StampedSurface)
+    command = np.random.default_rng(2).uniform(-1, 1, 33)
+    want = np.tensordot(command, measured().surfaces(GENERAL, D, X, Y), 1)
+    assert np.abs(fast(command) - want).max() < 5e-6
+
+
+@pytest.mark.parametrize("cube", [np.zeros((3, 4)), np.zeros((2, 4, 5)), np.full((2, 4, 4), np.nan)])
+def test_what_is_no_stack_of_surfaces_is_refused(cube):
+    with pytest.raises(ValueError, match="influence functions"):
+        MeasuredInfluence(cube, FINE)
+
+
+def test_influence_functions_from_a_file(tmp_path):
+    cube = np.random.default_rng(1).normal(size=(5, 8, 8))
+    fits.writeto(tmp_path / "if.fits", cube)
+    assert np.array_equal(read_influence(str(tmp_path / "if.fits"), 5), cube)
+    with pytest.raises(ConfigError, match=r"shape \(5, 8, 8\); influence functions of 97"):
+        read_influence(str(tmp_path / "if.fits"), 97)
+    with pytest.raises(ConfigError, match=r"cannot be read from .*none\.fits"):
+        read_influence(str(tmp_path / "none.fits"), 5)
+    (tmp_path / "text.fits").write_text("no")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_influence(str(tmp_path / "text.fits"), 5)
+    cube[0, 0, 0] = np.nan
+    fits.writeto(tmp_path / "nan.fits", cube)
+    with pytest.raises(ConfigError, match="not finite"):
+        read_influence(str(tmp_path / "nan.fits"), 5)

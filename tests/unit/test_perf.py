@@ -45,7 +45,9 @@ def test_the_ratio_says_how_many_times_better():
         "unit": "us",
         "better": "lower",
         "note": "note",
+        "floor": None,
         "ratio": 3.0,
+        "reached": None,
     }
 
 

@@ -58,3 +58,13 @@ def test_every_parameter_has_a_unit() -> None:
 def test_five_numbers_are_needed(size: int) -> None:
     with pytest.raises(ValueError, match="reshape"):
         Registration.from_array(np.zeros(size))
+
+
+def test_the_anamorphosis_angle_turns_the_scalings_from_y_towards_x() -> None:
+    both = {"radial_scaling": 10.0, "tangential_scaling": -10.0, "anamorphosis_angle": 45.0}
+    np.testing.assert_allclose(placed(EAST - SOUTH, **both), 1.1 * (EAST - SOUTH))
+    np.testing.assert_allclose(placed(EAST + SOUTH, **both), 0.9 * (EAST + SOUTH))
+    turned = Registration(**both)
+    assert turned.to_dict()["anamorphosis_angle"] == 45.0
+    assert Registration(**turned.to_dict()) == turned
+    assert turned.to_array().size == 5

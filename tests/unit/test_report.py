@@ -13,12 +13,14 @@ import pytest
 
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Measured
+from escape_hw.config import layouts
 from escape_hw.errors import IncompatibleProduct, ProductError
 from escape_hw.io import documents
 from escape_hw.io.fits import save_matrix
 from escape_hw.io.psf import save_loop
 from escape_hw.io.run_folder import RunFolder
 from escape_hw.report import (
+    build,
     comparison,
     figures_bench,
     figures_matrix,
@@ -27,7 +29,7 @@ from escape_hw.report import (
     tables,
 )
 from escape_hw.report.build import write_report
-from escape_hw.report.content import read_run
+from escape_hw.report.content import RunContent, read_run
 from escape_hw.report.picture import draw, write_picture
 
 LOOPS = {
@@ -203,6 +205,27 @@ def test_loops_without_images_or_strehl_draw():
     only = dataclasses.replace(LOOPS["ESCAPE"], strehl=None, model_psf=None)
     style.png(figures_bench.stacked_psfs({"only": only}), 40)
     style.png(figures_bench.mirror(np.zeros(97), fake.layout()), 40)
+
+
+def test_a_mirror_without_a_grid_is_drawn_where_its_actuators_stand(tmp_path):
+    places = layouts.positions("rings-336") * 0.03
+    command = np.zeros(336)
+    command[7] = 0.6
+    figure = figures_bench.mirror_without_grid(command, places)
+    style.png(figure, 40)
+    (spots,) = figure.axes[0].collections
+    colours = spots.get_facecolor()
+    assert len(spots.get_paths()) == 336
+    assert colours[7, 0] > colours[7, 2]  # a push is red
+    assert colours[8, 0] == pytest.approx(colours[8, 2], abs=0.02)
+    centre = spots.get_paths()[7].get_extents()
+    assert (centre.x0 + centre.x1) / 2 == pytest.approx(places[7, 0])
+    assert (centre.y0 + centre.y1) / 2 == pytest.approx(places[7, 1])
+    run = RunContent(tmp_path, {"bench": {"layout": [], "places_m": places.tolist()}})
+    assert run.layout is None
+    assert run.places_m == pytest.approx(places)
+    assert build._mirror(run, command) is not None
+    assert build._mirror(run, np.zeros(5)) is None
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Slopes and integrator against the kernels of pyRTC, on the same arrays."""
+"""Slopes and integrator against the kernels of pyRTC (pyramid slopes against numpy), on the same arrays."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.benchmark import BenchmarkRow, alternate
+from escape_hw.api.pyramid import PyramidPupils, boxes
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.cli.benchmarks.peer import ABSENT, name, pyrtc
 from escape_hw.pipeline.integrator import LeakyIntegrator
+from escape_hw.pipeline.pyramid_slopes import PyramidSlopes, slopes_of_image
 from escape_hw.pipeline.slopes import SlopeExtractor
 
 
@@ -18,6 +20,7 @@ def run() -> list[BenchmarkRow]:
     """All rows of the stage."""
     # RAZOR's grid with whole pixels (the peer knows no others), and a large one.
     rows = [_slopes(n_sub, pitch) for n_sub, pitch in ((10, 8), (24, 16), (40, 8))]
+    rows += [_pyramid(n, mode) for n, mode in ((16, "global"), (64, "global"), (64, "local"))]
     return rows + [_integrator(modes, slopes) for modes, slopes in ((97, 200), (94, 900), (1200, 2512))]
 
 
@@ -51,6 +54,33 @@ def _slopes(n_sub: int, pitch: int) -> BenchmarkRow:
         ours_s * 1e6,
         None if peer_s is None else peer_s * 1e6,
         name("compute_slopes_shwfs_optim_numba"),
+        "us",
+        "lower",
+        note,
+    )
+
+
+def _pyramid(n: int, normalisation: str) -> BenchmarkRow:
+    """Pyramid slopes beside the same sum in numpy, on images of ``n`` pixels."""
+    side = 3 * n
+    frame = np.random.default_rng(0).integers(8, 1000, (side, side)).astype(np.uint16)
+    line = np.arange(n) - (n - 1) / 2
+    valid = np.hypot(line[:, None], line[None, :]) <= n / 2
+    centres = np.array([[0.7, 0.7], [2.3, 0.8], [0.7, 2.2], [2.2, 2.2]]) * n
+    pupils = PyramidPupils(
+        centres, float(n), boxes(centres, n), valid, np.zeros((int(valid.sum()), 2), np.float32),
+        valid.astype(np.float32), normalisation=normalisation,
+    )  # fmt: skip
+    slopes_of = PyramidSlopes(pupils, (side, side))
+    worst = float(np.abs(slopes_of(frame) - slopes_of_image(frame, pupils)).max())
+    note = f"largest difference {worst:.1e}" if worst < 1e-5 else f"DISAGREES by {worst:.1e}"
+    out = np.empty(pupils.n_slopes, np.float32)
+    ours_s, peer_s = alternate(lambda: slopes_of(frame, None, out), lambda: slopes_of_image(frame, pupils))
+    return BenchmarkRow(
+        f"pipeline: pyramid slopes {n} px, {normalisation}",
+        ours_s * 1e6,
+        None if peer_s is None else peer_s * 1e6,
+        "numpy",
         "us",
         "lower",
         note,

@@ -1,0 +1,228 @@
+"""Adaptive secondary mirrors: a thin shell that floats, knows where it is, and may fall asleep."""
+
+from __future__ import annotations
+
+import abc
+import enum
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.mirror import DeformableMirror
+from escape_hw.errors import DeviceError
+from escape_hw.safety.limits import MirrorLimits
+
+
+class ShellState(enum.StrEnum):
+    """Where an adaptive secondary stands, from off to running; a fault is latched."""
+
+    #: Coils without power.
+    OFF = "off"
+    #: Power on, the shell lies on its reference body.
+    RESTED = "rested"
+    #: The shell floats, flat.
+    SET = "set"
+    #: The shell floats and follows commands.
+    RUNNING = "running"
+    #: Stopped by itself; stays so until somebody asks for recovery.
+    FAULT = "fault"
+
+
+#: The states that ``go`` moves through, one after the other.
+LADDER = (ShellState.OFF, ShellState.RESTED, ShellState.SET, ShellState.RUNNING)
+
+
+@dataclass(frozen=True, slots=True)
+class ShellHealth:
+    """What the mirror says of itself.
+
+    Parameters
+    ----------
+    time_ns
+        When, on the device's clock.
+    state
+        Where it stands.
+    gap_m
+        Mean gap between shell and reference body in metres.
+    current_a
+        Largest coil current in amperes.
+    temperature_c
+        Highest temperature in degrees Celsius.
+    skipped
+        Commands that the mirror itself did not execute since it was opened.
+    fault
+        Why it is in ``FAULT``, empty otherwise.
+    """
+
+    time_ns: int
+    state: ShellState
+    gap_m: float
+    current_a: float
+    temperature_c: float
+    skipped: int
+    fault: str = ""
+
+
+class AdaptiveSecondary(DeformableMirror):
+    """A deformable mirror with positions, health and states of its own.
+
+    Commands are followed in the state ``RUNNING`` only. ``open`` leads there unless ``lift`` is
+    false; ``close`` flattens and rests the shell. A fault is latched: nothing but :meth:`recover`
+    ends it, and no command, no closing and no opening does. Drivers fill in ``_state``, ``_step``,
+    ``_recover``, ``_measure`` and ``_health`` beside those of a mirror.
+
+    Parameters
+    ----------
+    name, limits
+        As for every mirror.
+    lift
+        Lead the mirror to ``RUNNING`` when it is opened.
+    """
+
+    def __init__(self, name: str, limits: MirrorLimits, *, lift: bool = True) -> None:
+        super().__init__(name, limits)
+        self._lift = lift
+
+    @property
+    def state(self) -> ShellState:
+        """Where the mirror stands.
+
+        Raises
+        ------
+        NotOpen
+            The mirror is not connected.
+        """
+        self.require_open()
+        return self._state()
+
+    @property
+    def health(self) -> ShellHealth:
+        """What the mirror says of itself, now.
+
+        Raises
+        ------
+        NotOpen, DeviceError
+            The mirror is not connected, or does not answer.
+        """
+        self.require_open()
+        return self._health()
+
+    @final
+    def measured_positions(self) -> NDArray[np.float64]:
+        """Where the actuators really are ``(n_act,)``, fractions of full stroke; NaN where unreadable.
+
+        Raises
+        ------
+        NotOpen, DeviceError
+            The mirror is not connected, or did not deliver a position for each actuator.
+        """
+        self.require_open()
+        places = np.array(self._measure(), dtype=np.float64)
+        if places.shape != (self.info.n_act,):
+            raise DeviceError(
+                self.name, f"reported positions of shape {places.shape} for {self.info.n_act} actuators"
+            )
+        return places
+
+    @final
+    def go(self, state: ShellState) -> None:
+        """Lead the mirror to a state, one step of the ladder after the other.
+
+        Raises
+        ------
+        NotOpen
+            The mirror is not connected.
+        DeviceError
+            A fault is latched, or the mirror did not follow.
+        ValueError
+            ``FAULT`` is asked for.
+        """
+        if state is ShellState.FAULT:
+            raise ValueError("nobody goes to a fault; choose off, rested, set or running")
+        with self._lock:
+            self.require_open()
+            while (now := self._healthy_state()) is not state:
+                if now is ShellState.RUNNING:
+                    self.flatten()
+                up = LADDER.index(state) > LADDER.index(now)
+                wanted = LADDER[LADDER.index(now) + (1 if up else -1)]
+                self._step(wanted)
+                if self._state() is not wanted:
+                    raise DeviceError(
+                        self.name,
+                        f"is {self._state()}, not {wanted}, after a step from {now}; see its health",
+                    )
+                if wanted is ShellState.SET:
+                    # A shell that floats anew is flat, whatever was sent before it was rested.
+                    self._checked().reset(self.flat)
+
+    @final
+    def recover(self) -> None:
+        """End a fault: the shell is at rest afterwards. Does nothing when there is none.
+
+        Raises
+        ------
+        NotOpen, DeviceError
+            The mirror is not connected, or the fault persists.
+        """
+        with self._lock:
+            self.require_open()
+            if self._state() is not ShellState.FAULT:
+                return
+            self._recover()
+            if self._state() is ShellState.FAULT:
+                raise DeviceError(self.name, f"the fault persists: {self._health().fault}")
+
+    def _healthy_state(self) -> ShellState:
+        state = self._state()
+        if state is ShellState.FAULT:
+            raise DeviceError(
+                self.name, f"fault latched: {self._health().fault}; see to the cause, then call recover()"
+            )
+        return state
+
+    def _movable(self) -> bool:
+        return self._state() is ShellState.RUNNING
+
+    def _after_open(self) -> None:
+        super()._after_open()
+        if self._lift:
+            self.go(ShellState.RUNNING)
+
+    def _before_close(self) -> None:
+        super()._before_close()
+        if self._state() in (ShellState.SET, ShellState.RUNNING):
+            self.go(ShellState.RESTED)
+
+    @final
+    def _send(self, command: NDArray[np.float64]) -> None:
+        state = self._healthy_state()
+        if state is not ShellState.RUNNING:
+            raise DeviceError(self.name, f"is {state} and follows no commands; call go(ShellState.RUNNING)")
+        self._drive(command)
+
+    @abc.abstractmethod
+    def _drive(self, command: NDArray[np.float64]) -> None:
+        """Transfer a guarded command ``(n_act,)`` to the running mirror."""
+
+    @abc.abstractmethod
+    def _state(self) -> ShellState:
+        """Where the mirror stands."""
+
+    @abc.abstractmethod
+    def _step(self, state: ShellState) -> None:
+        """Go one step of the ladder, up or down, to ``state``."""
+
+    @abc.abstractmethod
+    def _recover(self) -> None:
+        """End a fault; leads to ``RESTED`` or ``OFF``."""
+
+    @abc.abstractmethod
+    def _measure(self) -> NDArray[np.float64]:
+        """Positions ``(n_act,)``, fractions of full stroke."""
+
+    @abc.abstractmethod
+    def _health(self) -> ShellHealth:
+        """Ask the mirror for its health."""

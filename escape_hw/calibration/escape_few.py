@@ -1,0 +1,98 @@
+"""ESCAPE from fewer frames than an interaction matrix takes: a tenth of a second of loop time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from escape_hw.api.procedure import Procedure
+from escape_hw.api.results import CalibrationResult
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import measured_matrix, some_frames
+from escape_hw.calibration.poke_session import PokeSession
+from escape_hw.calibration.pseudo_synthetic import synthesise
+from escape_hw.calibration.sensor_setup import SETUP_FRAMES, modal_basis, poke_amplitudes
+from escape_hw.calibration.telemetry_sprint import MIN_ROWS, telemetry_sprint, time_line
+from escape_hw.errors import Aborted, TooFewFrames
+
+#: Frames per past frame of the whitening filter: with few frames, each past one costs a good share of them.
+_FRAMES_PER_ORDER = 16
+
+
+def escape_from_few(
+    bench: Bench, *, frames: int, poke: float | None = None, grid: SensorGeometry | None = None
+) -> Procedure[CalibrationResult]:
+    """Registration straight from the telemetry of a few frames, and the pseudo-synthetic matrix.
+
+    Parameters
+    ----------
+    bench
+        An open bench, loop open.
+    frames
+        Frames to take; they are also what the sensor's geometry is found on, unless ``grid`` is given.
+    poke
+        Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
+    grid
+        The sensor's geometry, when it is known already.
+
+    Returns
+    -------
+    CalibrationResult
+        Without a measured matrix, for which there are too few frames.
+
+    Raises
+    ------
+    TooFewFrames
+        Fewer than a noise level can be told from; nothing moved.
+    CalibrationError
+        No spots or pupil images, no light, or no response.
+    Aborted
+        Stopped early; frames this few are worth nothing by halves.
+    """
+    c = bench.config.calibration
+    order = min(c.whiten_order, max(1, some_frames(frames) // _FRAMES_PER_ORDER))
+    if frames < MIN_ROWS + order:
+        raise TooFewFrames(
+            f"{frames} frames are too few for a registration; ask for at least {MIN_ROWS + order} frames"
+        )
+    poke = c.poke if poke is None else poke
+    m2c = modal_basis(bench)
+    amplitude = poke_amplitudes(bench, m2c, poke)
+    session = PokeSession(bench, m2c, grid, min(SETUP_FRAMES, frames), None, keep=True)
+    if (yield from session.poke(frames, amplitude)):
+        raise Aborted(f"aborted after {session.taken} of {frames} frames, too few for a registration")
+    session.ready()
+    record = session.record()
+    if record is None or session.grid is None or session.motion is None:
+        raise RuntimeError("no frame was taken")
+    # The geometry was found on these very frames, so its lattice is where their mean spots stand.
+    found = session.motion.of(session.grid)
+    shape = (found.n_slopes, m2c.shape[1])
+    frame = measured_matrix(bench, found, m2c, np.zeros(shape), np.zeros(shape), "telemetry")
+    fit = yield from telemetry_sprint(
+        time_line(*record, before=2 * c.whiten_order + c.lags), frame, bench.model(found),
+        order=order, lags=c.lags, learning_rate=c.learning_rate,
+    )  # fmt: skip
+    lost = int(record[0][-1] - record[0][0]) + 1 - record[0].size
+    made = synthesise(bench, found, fit.estimate, m2c)
+    metrics = {
+        **made.matrix.metrics, "frames": int(record[0].size), "lost_frames": lost, "poke": float(poke),
+        "shortened": session.shortened, "delay_frames": fit.response.delay, "whitening_order": order,
+    }  # fmt: skip
+    return replace(
+        made,
+        matrix=replace(made.matrix, metrics=metrics),
+        grid=session.finished_grid(),
+        frames=int(record[0].size),
+        lost_frames=lost,
+        sky_seconds=frames / bench.wfs.settings.frame_rate_hz,
+        response=fit.response,
+        mean_frame=session.mean_frame,
+        notes=(
+            *fit.estimate.warnings,
+            "too few frames for a measured matrix: the registration comes straight from the telemetry",
+            *session.notes(),
+        ),
+    )

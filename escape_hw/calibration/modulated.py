@@ -1,0 +1,189 @@
+"""Modulation and demodulation: several modes at once, each on a frequency of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.results import CalibrationResult, TemporalResponse
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import LightWatch, Motion, measured_matrix, next_frame, some_frames
+from escape_hw.calibration.demodulation import Lines, find_delay, find_lines, line_frequencies, matrix_from
+from escape_hw.calibration.sensor_setup import (
+    extractor,
+    find_sensor,
+    modal_basis,
+    poke_amplitudes,
+    prepare_sensor,
+)
+from escape_hw.errors import Aborted, CalibrationError
+
+#: Band of the lines in cycles per frame: above most of the turbulence and of the bench's vibrations,
+#: below where the response of two frames' delay and a frame's hold has faded.
+BAND = (0.1, 0.4)
+#: Frames at the start of a batch that still hold the mirror's way into the motion.
+_RUN_IN = 10
+#: Mean squared ratio of elements to their standard errors; noise alone makes it 1.
+_LEAST_POWER = 2.0
+
+
+def modulated(
+    bench: Bench,
+    *,
+    frames: int | None = None,
+    poke: float | None = None,
+    grid: SensorGeometry | None = None,
+) -> Procedure[CalibrationResult]:
+    """Drive batches of modes as sinusoids and detect them in step (Esposito et al. 2006; Pinna et al. 2012).
+
+    Works on a source and under turbulence alike.
+
+    Parameters
+    ----------
+    bench
+        An open bench, loop open.
+    frames
+        Frames per batch; as configured by default (``calibration.modulated_frames``).
+    poke
+        Amplitude of each mode, rms surface as fraction of full stroke; as configured by default.
+    grid
+        The sensor's geometry; found first when not given.
+
+    Returns
+    -------
+    CalibrationResult
+        With the delay, found from the phases of all lines. Stopped early, ``partial`` is true and the
+        modes of later batches are left out.
+
+    Raises
+    ------
+    ConfigError
+        A number of frames or a poke that means nothing; nothing moved.
+    TooFewFrames
+        Too few frames for a single line.
+    CalibrationError
+        No spots or pupil images, no light, or no response.
+    Aborted
+        Stopped before the first batch was done.
+    """
+    c = bench.config.calibration
+    n_frames = c.modulated_frames if frames is None else some_frames(frames)
+    m2c = modal_basis(bench)
+    amplitude = poke_amplitudes(bench, m2c, c.poke if poke is None else poke)
+    n_modes = m2c.shape[1]
+    at_once = line_frequencies(n_modes, n_frames, BAND).size
+    batches = np.array_split(np.arange(n_modes), -(-n_modes // at_once))
+    try:
+        bench.dm.flatten()
+        prepare_sensor(bench)
+        mean_frame = None
+        if grid is None:
+            setup = yield from find_sensor(bench)
+            grid, mean_frame = setup.grid, setup.mean_frame
+        slopes_of = extractor(bench, grid)
+        motion, light = Motion(grid.n_slopes), LightWatch(bench.wfs.name, grid)
+        start, partial = bench.wfs.status(), False
+        report = Reporter("modulation", len(batches) * (n_frames + _RUN_IN))
+        found: list[Lines] = []
+        try:
+            for modes in batches:
+                found.append(
+                    (
+                        yield from _batch(
+                            bench, slopes_of, m2c[:, modes], amplitude[modes], n_frames, motion, light, report
+                        )
+                    )
+                )
+        except Aborted:
+            if not found:
+                raise
+            partial = True
+        status = bench.wfs.status()
+    finally:
+        bench.dm.flatten()
+    lines = _joined(found)
+    delay, error = find_delay(lines, c.lags - 1)
+    data, sigma = matrix_from(lines, delay)
+    if np.mean(np.square(data / np.maximum(sigma, 1e-300))) < _LEAST_POWER:
+        raise CalibrationError("the sensor does not respond to the mirror; is the light on, does it move?")
+    delivered, lost = status.delivered - start.delivered, status.lost - start.lost
+    matrix = measured_matrix(
+        bench, grid, m2c[:, : data.shape[1]], data, sigma, "modulated",
+        frames=delivered, lost_frames=lost, poke=float(amplitude.max()), batches=len(found),
+        delay_frames=delay, delay_sigma=error,
+    )  # fmt: skip
+    return CalibrationResult(
+        matrix, motion.of(grid), delivered, lost,
+        (delivered + lost) / bench.wfs.settings.frame_rate_hz, _response(delay, error, c.lags),
+        partial=partial, mean_frame=mean_frame,
+    )  # fmt: skip
+
+
+def _batch(
+    bench: Bench,
+    slopes_of: SlopeFunction,
+    m2c: NDArray[np.float64],
+    amplitude: NDArray[np.float64],
+    frames: int,
+    motion: Motion,
+    light: LightWatch,
+    report: Reporter,
+) -> Procedure[Lines]:
+    """Drive some modes for a while and find their lines."""
+    frequency = line_frequencies(amplitude.size, frames, BAND)
+    # Phases that grow with the square of the number keep the sum of many sinusoids low (Schroeder 1970).
+    phase = np.pi * np.arange(amplitude.size) ** 2 / amplitude.size
+    waves = amplitude * np.sin(np.outer(np.arange(frames + _RUN_IN), frequency) + phase)
+    shapes = waves @ m2c.T
+    share = _share(bench, shapes)
+    times: list[int] = []
+    kept: list[NDArray[np.float32]] = []
+    first = None
+    while not times or times[-1] + 1 < len(shapes):
+        frame = next_frame(bench)
+        first = frame.index if first is None else first
+        # Steps go by the camera's count: a lost frame delays one shape and puts none out of step.
+        step = frame.index - first
+        slopes = slopes_of(frame.data)
+        light(slopes_of.flux)
+        motion.add(slopes)
+        times.append(step)
+        kept.append(slopes)
+        bench.dm.send(shapes[min(step, len(shapes) - 1)] * share)
+        if progress := report.step():
+            yield progress
+    bench.dm.flatten()
+    time = np.array(times, np.int64)
+    settled = time >= _RUN_IN
+    lines = find_lines(time[settled], np.stack(kept)[settled], frequency, amplitude * share, frames)
+    turn = np.exp(-1j * phase)
+    return Lines(lines.amplitude * turn, lines.sigma, frequency)
+
+
+def _share(bench: Bench, shapes: NDArray[np.float64]) -> float:
+    """Share of a sequence of shapes that the mirror can take without a limit touching any of them."""
+    dm = bench.dm
+    share = min(1.0, *(float(dm.allowed_share(shape)) for shape in shapes))
+    if dm.limits.max_slew is not None:
+        fastest = np.abs(np.diff(shapes, axis=0, prepend=0.0)).max()
+        share = min(share, dm.limits.max_slew / max(float(fastest), 1e-300))
+    return share
+
+
+def _joined(found: list[Lines]) -> Lines:
+    return Lines(
+        np.concatenate([lines.amplitude for lines in found], axis=1),
+        np.concatenate([lines.sigma for lines in found], axis=1),
+        np.concatenate([lines.frequency for lines in found]),
+    )
+
+
+def _response(delay: float, error: float, lags: int) -> TemporalResponse:
+    """The delay as the temporal response of the other methods: weights of whole frames."""
+    whole = min(int(delay), lags - 2)
+    weights, sigma = np.zeros(lags), np.zeros(lags)
+    weights[whole : whole + 2] = 1 - (delay - whole), delay - whole
+    sigma[whole : whole + 2] = error
+    return TemporalResponse(weights, sigma)

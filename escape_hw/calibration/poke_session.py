@@ -1,0 +1,173 @@
+"""Random pokes on every mode, one per frame, and the slopes that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.frames import Frame
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction, SubApertureGrid
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import LightWatch, Motion, next_frame, reachable
+from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.mean_focus import MeanFocus
+from escape_hw.calibration.sensor_kinds import kind_of
+from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, refined, setup_from_frames
+from escape_hw.errors import Aborted
+
+#: Seconds of turbulence over which what it leaves in the geometry averages out well enough.
+_REFERENCE_S = 10.0
+
+Record = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
+
+
+@dataclass(slots=True, eq=False)
+class PokeSession:
+    """State of a run: frames wait until the geometry is known, then become slopes at once.
+
+    Parameters
+    ----------
+    bench
+        An open bench, loop open.
+    m2c
+        Mode-to-command matrix ``(n_act, n_modes)``.
+    grid
+        The sensor's geometry, when it is known already; found on the first frames otherwise.
+    setup_frames
+        How many first frames to find it on.
+    estimator
+        Makes the estimator that takes the slopes, from their number; ``None``: there is none.
+    keep
+        Whether to keep slopes and pokes.
+    """
+
+    bench: Bench
+    m2c: NDArray[np.float64]
+    grid: SensorGeometry | None
+    setup_frames: int
+    make_estimator: Callable[[int], DocrimeEstimator] | None
+    keep: bool = False
+    mean_frame: NDArray[np.float32] | None = None
+    slopes_of: SlopeFunction | None = None
+    estimator: DocrimeEstimator | None = None
+    motion: Motion | None = None
+    focus: MeanFocus | None = None
+    light: LightWatch | None = None
+    waiting: list[tuple[Frame, NDArray[np.float64]]] = field(default_factory=list)
+    taken: int = 0
+    shortened: int = 0
+    looked: NDArray[np.floating] | None = None
+    looks: int = 0
+    kept: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] = field(default_factory=list)
+
+    def poke(self, frames: int, amplitude: NDArray[np.float64]) -> Procedure[bool]:
+        """Send random pokes, one per frame, and take the frames; the mirror ends flat.
+
+        Parameters
+        ----------
+        frames
+            How many.
+        amplitude
+            Pokes of each mode are uniform within plus and minus this ``(n_modes,)``.
+
+        Returns
+        -------
+        bool
+            Whether it was stopped early.
+        """
+        bench, to_modes = self.bench, np.linalg.pinv(self.m2c)
+        report = Reporter("DO-CRIME", frames)
+        try:
+            bench.dm.flatten()
+            prepare_sensor(bench)
+            try:
+                for done in range(frames):
+                    frame = next_frame(bench)
+                    wanted = self.m2c @ (amplitude * bench.rng.uniform(-1.0, 1.0, amplitude.size))
+                    allowed = reachable(bench.dm, wanted)
+                    self.shortened += not np.array_equal(wanted, allowed)
+                    # What was really sent, not what was asked for: a shortened poke is still a known poke.
+                    self._take(frame, to_modes @ bench.dm.send(allowed).sent)
+                    if report.due():
+                        yield report(done + 1, shortened=float(self.shortened))
+            except Aborted:
+                return True
+        finally:
+            bench.dm.flatten()
+        return False
+
+    def _take(self, frame: Frame, poke: NDArray[np.float64]) -> None:
+        self.taken += 1
+        if self.slopes_of is None:
+            self.waiting.append((frame, poke))
+            if self.grid is not None or len(self.waiting) >= self.setup_frames:
+                self.ready()
+        else:
+            self._feed(frame, poke)
+
+    def ready(self) -> None:
+        """Set up the sensor, on the frames that wait if no grid was given, and work them off."""
+        if self.slopes_of is not None or not self.waiting:
+            return
+        if self.grid is None:
+            total = np.zeros(self.waiting[0][0].data.shape)
+            for frame, _ in self.waiting:
+                total += frame.data
+            mean = (total / len(self.waiting)).astype(np.float32)
+            setup = setup_from_frames(self.bench, mean)
+            self.grid, self.mean_frame = setup.grid, setup.mean_frame
+        self.slopes_of = extractor(self.bench, self.grid)
+        self.motion, self.light = Motion(self.grid.n_slopes), LightWatch(self.bench.wfs.name, self.grid)
+        if self.mean_frame is not None and isinstance(self.grid, SubApertureGrid):
+            self.focus = MeanFocus(self.grid, self.bench.wfs.settings.frame_rate_hz)
+        if self.make_estimator is not None:
+            self.estimator = self.make_estimator(self.grid.n_slopes)
+        for frame, poke in self.waiting:
+            self._feed(frame, poke)
+        self.waiting = []
+
+    def finished_grid(self) -> SensorGeometry:
+        """The grid with all that the run taught about it; given references stay as they were."""
+        if self.grid is None or self.motion is None:
+            raise RuntimeError("the sensor was never set up")
+        grid = self.motion.of(self.grid)
+        if self.mean_frame is None:
+            return grid
+        if self.looked is not None:
+            grid = refined(self.bench, grid, (self.looked / self.looks).astype(np.float32))
+        return self.motion.references(grid, self.focus)
+
+    def notes(self) -> tuple[str, ...]:
+        """What to know of the references before closing a loop on them."""
+        seconds = self.taken / self.bench.wfs.settings.frame_rate_hz
+        stands_still = self.focus is not None and self.focus.still() is not None
+        if self.grid is None or self.mean_frame is None or seconds >= _REFERENCE_S or stands_still:
+            return ()
+        return (self.grid.short_look.format(seconds=seconds),)
+
+    def _feed(self, frame: Frame, poke: NDArray[np.float64]) -> None:
+        if self.slopes_of is None or self.motion is None or self.light is None:
+            raise RuntimeError("frames were fed before the sensor was set up")
+        slopes = self.slopes_of(frame.data)
+        self.light(self.slopes_of.flux)
+        self.motion.add(slopes)
+        if self.focus is not None:
+            self.focus.add(slopes)
+        if kind_of(self.bench).long_look:
+            self.looked = frame.data + (0.0 if self.looked is None else self.looked)
+            self.looks += 1
+        if self.estimator is not None:
+            self.estimator.partial_fit(frame.index, slopes, poke)
+        if self.keep:
+            self.kept.append((frame.index, slopes, poke))
+
+    def record(self) -> Record | None:
+        """Frame indices ``(n,)``, slopes ``(n, n_slopes)`` and pokes ``(n, n_modes)``, if they were kept."""
+        if not self.kept:
+            return None
+        index, slopes, pokes = zip(*self.kept, strict=True)
+        return np.array(index, np.int64), np.stack(slopes), np.stack(pokes).astype(np.float32)

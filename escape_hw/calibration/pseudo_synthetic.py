@@ -1,0 +1,61 @@
+"""The pseudo-synthetic interaction matrix: the model's, at a measured registration (the paper)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.results import CalibrationResult, RegistrationEstimate
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import measured_matrix
+from escape_hw.calibration.derivatives import modal_jacobian
+
+
+def pseudo_synthetic(
+    model: SyntheticModel, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The model's matrix at an estimated registration, and its standard errors.
+
+    Parameters
+    ----------
+    model
+        The synthetic model.
+    estimate
+        Result of SPRINT.
+    m2c
+        Modal basis ``(n_act, n_modes)``.
+
+    Returns
+    -------
+    matrix, sigma : ndarray, ``(n_slopes, n_modes)``
+        The errors are those of registration and gain, propagated to first order.
+    """
+    width, gain = estimate.width.value, estimate.gain.value
+    unit, derivatives = modal_jacobian(model, estimate.registration, m2c, width)
+    jacobian = gain * derivatives[:5]
+    variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
+    variance += np.square(unit * estimate.gain.sigma)
+    return gain * unit, np.sqrt(np.maximum(variance, 0))
+
+
+def synthesise(
+    bench: Bench, grid: SensorGeometry, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+) -> CalibrationResult:
+    """A calibration made of a registration alone, with nothing moved.
+
+    Parameters
+    ----------
+    bench
+        Gives the model.
+    grid
+        The sensor's grid.
+    estimate
+        The registration.
+    m2c
+        Modal basis ``(n_act, n_modes)``.
+    """
+    data, sigma = pseudo_synthetic(bench.model(grid), estimate, m2c)
+    matrix = measured_matrix(bench, grid, m2c, data, sigma, "escape", gain=estimate.gain.value)
+    return CalibrationResult(matrix, grid, 0, 0, 0.0, registration=estimate)

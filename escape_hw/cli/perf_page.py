@@ -1,0 +1,100 @@
+"""The measured part of ``docs/performance.md``, written by ``escape perf --markdown``."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from escape_hw.errors import ConfigError
+
+if TYPE_CHECKING:
+    from escape_hw.api.benchmark import BenchmarkRow
+
+#: What is measured stands between these lines; what stands around them is prose and stays.
+BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+_PACKAGES = ("escape-hw", "numpy", "scipy", "numba", "OOPAO", "pyrtcao", "specula", "synim")
+
+
+def conditions() -> dict[str, Any]:
+    """Machine, load and versions, plain for JSON."""
+    versions: dict[str, str | None] = {}
+    for name in _PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = None
+    return {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load": round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None,
+        "threads": 1,
+        "versions": versions,
+    }
+
+
+def _processor() -> str:
+    """The processor's name, where Linux tells it."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return platform.processor()
+    names = [line.split(":", 1)[1].strip() for line in text.splitlines() if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def check_page(page: Path) -> None:
+    """Refuse a page that the table cannot be put into, before anything is measured.
+
+    Raises
+    ------
+    ConfigError
+        The page exists without the two marks.
+    """
+    if page.exists():
+        text = page.read_text(encoding="utf-8")
+        if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
+            raise ConfigError(f"{page} has no place for the table; put the lines {BEGIN} and {END} into it")
+    elif not page.parent.is_dir():
+        raise ConfigError(f"{page.parent} is no folder; name a page in one that exists")
+
+
+def write_page(page: Path, rows: Sequence[BenchmarkRow], at: dict[str, Any]) -> None:
+    """Put conditions and table between the marks of a page, or into a new one."""
+    text = page.read_text(encoding="utf-8") if page.exists() else f"# Performance\n\n{BEGIN}\n{END}\n"
+    before, rest = text.split(BEGIN)
+    after = rest.split(END)[1]
+    page.write_text(f"{before}{BEGIN}\n\n{render(rows, at)}\n{END}{after}", encoding="utf-8")
+
+
+def render(rows: Sequence[BenchmarkRow], at: dict[str, Any]) -> str:
+    """Conditions and table as Markdown."""
+    versions = ", ".join(f"{name} {number}" for name, number in at["versions"].items() if number)
+    missing = [name for name, number in at["versions"].items() if not number]
+    lines = [
+        f"{at['date']}, {at['processor']}, {at['cores']} cores, load average {at['load']} at the end; "
+        f"Python {at['python']}, {versions}." + (f" Not installed: {', '.join(missing)}." if missing else ""),
+        "",
+        "| stage | ours | peer | unit | times better | of floor | peer is | note |",
+        "|---|---:|---:|---|---:|---:|---|---|",
+    ]
+    for row in rows:
+        cells = (
+            row.stage,
+            f"{row.ours:.4g}",
+            "-" if row.peer is None else f"{row.peer:.4g}",
+            row.unit,
+            "-" if row.ratio is None else f"{row.ratio:.2f}",
+            "-" if row.reached is None else f"{row.reached:.0%}",
+            row.peer_name,
+            row.note,
+        )
+        lines.append("| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |")
+    return "\n".join(lines) + "\n"

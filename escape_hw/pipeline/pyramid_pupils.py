@@ -1,0 +1,305 @@
+"""Finding the four pupil images of a pyramid, the valid pixels and the references from frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal, special
+
+from escape_hw.api.pyramid import IMAGES, PyramidPupils, boxes, without_low_orders
+from escape_hw.errors import CalibrationError
+from escape_hw.pipeline.pyramid_slopes import slopes_of_image
+
+#: How far an image may lie from its nominal place, as a share of its diameter.
+_REACH = 0.25
+#: How far the real diameter may lie from the nominal one: a share of it, and pixels, for diffraction
+#: spreads a rim.
+_DIAMETER_RANGE, _DIAMETER_PX = 0.03, 2.0
+#: An image with less than this share of the others' light is not there.
+_FAINT = 0.1
+#: Softness of a rim in pixels (rms): a pixel's own width and a little diffraction.
+_SOFT = 0.45
+#: Half width in pixels of the ring in which a rim is fitted, and harmonics of its brightness.
+_RING, _HARMONICS = 4.0, 6
+_ITERATIONS, _NARROW = 12, 8
+#: Light that is pressed down to one half before rims are fitted, as a share of the usual one.
+_PRESSED = 1.0
+#: Pixels that come so near to another image (in pixels from its rim) are left out.
+_NEIGHBOUR = 2.0
+
+
+def find_pupils(
+    mean_frame: NDArray[np.float32],
+    *,
+    n_sub: int,
+    nominal_px: NDArray[np.float64],
+    min_flux: float,
+    normalisation: str = "global",
+    modulation: float = 0.0,
+    references: str = "mean",
+) -> PyramidPupils:
+    """Find centres, diameter, valid pixels and references from a mean frame.
+
+    The mean of many frames will do, turbulent ones too: turbulence changes how bright an image is
+    and where, but light ends at its rim all the same. So the rims are fitted, each with a brightness
+    that may vary along it.
+
+    Parameters
+    ----------
+    mean_frame
+        Mean of frames in counts ``(rows, columns)``, background subtracted.
+    n_sub
+        Nominal diameter of an image in pixels; the real one may differ by 3 % and two pixels.
+    nominal_px
+        Nominal centres ``(4, 2)`` as (x, y), in the order of :data:`~escape_hw.api.pyramid.IMAGES`;
+        the real ones may lie a quarter of a diameter away.
+    min_flux
+        Pixels with less than this share of a bright one's light are left out.
+    normalisation, modulation
+        See :class:`~escape_hw.api.pyramid.PyramidPupils`.
+    references
+        ``"mean"``: the mean slopes (the choice with a source); ``"design"``: the mean slopes without
+        their smooth part (the choice without one, see
+        :func:`~escape_hw.api.pyramid.without_low_orders`).
+
+    Returns
+    -------
+    PyramidPupils
+
+    Raises
+    ------
+    CalibrationError
+        Fewer than four images, an image that the region cuts, another size than the design's, or too
+        few lit pixels.
+    """
+    if references not in ("mean", "design"):
+        raise ValueError(f"references is {references!r}; choose 'mean' or 'design'")
+    image = np.asarray(mean_frame, dtype=np.float64)
+    rough = _search(image, n_sub, np.asarray(nominal_px, float))
+    centres, diameter = _places(image, rough, n_sub)
+    _check_fit(centres, rough, diameter, n_sub, image.shape)
+    corners = boxes(centres, n_sub)
+    light = np.sum([image[y : y + n_sub, x : x + n_sub] for x, y in corners], axis=0)
+    counts = float(np.percentile(light[light > 0.02 * np.percentile(light, 99)], 95))
+    flux = np.maximum(light / counts, 0.0)
+    # How far the images lie beside their boxes, on average: the pupil's centre in a box.
+    middle = (n_sub - 1) / 2 + (centres - corners - (n_sub - 1) / 2).mean(axis=0)
+    line = np.arange(n_sub)
+    inside = np.hypot(line[None, :] - middle[0], line[:, None] - middle[1]) <= min(diameter, n_sub) / 2
+    valid = inside & (flux >= min_flux)
+    if valid.sum() < 12:
+        raise CalibrationError(
+            f"only {int(valid.sum())} pixels of the pupil images are lit above {min_flux:.0%} of the "
+            "brightest; check the beam, the camera region and sensor.min_flux"
+        )
+    pupils = PyramidPupils(
+        centres, diameter, corners, valid, np.zeros((int(valid.sum()), 2), np.float32),
+        flux.astype(np.float32), counts, normalisation=normalisation, modulation=modulation,
+    )  # fmt: skip
+    mean = slopes_of_image(image, pupils).reshape(2, -1).T
+    if references == "design":
+        mean = without_low_orders(mean, valid, pupils.flux)
+    return replace(pupils, references=mean.astype(np.float32))
+
+
+def refine_pupils(mean_frame: NDArray[np.float32], pupils: PyramidPupils) -> PyramidPupils:
+    """The pupils with centres and diameter from a longer look.
+
+    Under turbulence the rims fitted on a second of frames may be some tenths of a pixel off. Boxes
+    and mask stay as they are, so slopes keep their meaning; a model wants the centres.
+
+    Parameters
+    ----------
+    mean_frame
+        Mean of frames in counts ``(rows, columns)``, background subtracted.
+    pupils
+        As found before.
+    """
+    image = np.asarray(mean_frame, dtype=np.float64)
+    centres, diameter = _places(image, pupils.centres_px, pupils.valid.shape[0])
+    return replace(pupils, centres_px=centres, diameter_px=diameter)
+
+
+def _places(
+    image: NDArray[np.float64], rough: NDArray[np.float64], n_sub: int
+) -> tuple[NDArray[np.float64], float]:
+    """Centres ``(4, 2)`` and common diameter of the images, from their rims."""
+    centres, radius = _fit_rims(_evened(image), rough, n_sub / 2, n_sub / 2)
+    # Pressed light ends a little late; where it really ends on average, the light itself tells.
+    _, radius = _fit_rims(image, centres, radius, n_sub / 2, _ITERATIONS // 3)
+    return centres, 2 * radius
+
+
+def _evened(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The image with its bright parts pressed down: a rim is to be as steep in bright light as in dim."""
+    lit = image > 0.1 * np.percentile(image, 99)
+    level = _PRESSED * float(np.median(image[lit])) if lit.any() else 1.0
+    light = np.maximum(image, 0.0)
+    return np.asarray(light / (light + level))
+
+
+def _search(image: NDArray[np.float64], n_sub: int, nominal_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rough centres ``(4, 2)``: where a disk is bright and the ring around it is dark."""
+    pad = n_sub
+    radius, half = n_sub / 2, n_sub // 2 + 4
+    line = np.arange(-half, half + 1)
+    distance = np.hypot(line[:, None], line[None, :])
+    disk, ring = (distance <= radius - 1).astype(float), (distance > radius + 1) & (distance < radius + 4)
+    kernel = disk / disk.sum() - ring / ring.sum()
+    # The square root evens out what is bright and what is dim within an image.
+    light = np.pad(np.sqrt(np.maximum(image, 0.0)), pad, mode="edge")
+    score = signal.fftconvolve(light, kernel, mode="same")
+    centres, contrast = [], []
+    reach = max(2, round(_REACH * n_sub))
+    for x, y in nominal_px:
+        left, top = round(x) + pad - reach, round(y) + pad - reach
+        part = score[max(top, 0) : top + 2 * reach + 1, max(left, 0) : left + 2 * reach + 1]
+        row, column = np.unravel_index(int(np.argmax(part)), part.shape)
+        centres.append((column + max(left, 0) - pad, row + max(top, 0) - pad))
+        contrast.append(float(part.max()))
+    _check_light(image, n_sub, nominal_px, np.array(contrast))
+    return np.array(centres, dtype=float)
+
+
+def _check_light(
+    image: NDArray[np.float64], n_sub: int, nominal_px: NDArray[np.float64], contrast: NDArray[np.float64]
+) -> None:
+    """Raise unless there is an image at each of the four places."""
+    rows, columns = np.indices(image.shape)
+    apart = np.min([np.hypot(columns - x, rows - y) for x, y in nominal_px], axis=0) > 0.75 * n_sub
+    rest = np.sqrt(np.maximum(image[apart] if apart.any() else image, 0.0))
+    # A disk of noise alone differs from its ring by a small share of the noise of a pixel.
+    noise = 6 * float(rest.std()) / np.sqrt(2 * n_sub) + 1e-3 * float(rest.mean())
+    if not contrast.max() > noise:
+        raise CalibrationError(
+            "no pupil images on the wavefront sensor, nothing but noise or an even glow; "
+            "check source, beam stop, exposure and sensor.pupils_px"
+        )
+    share = np.square(np.maximum(contrast, 0.0))
+    missing = share < np.maximum(_FAINT * np.median(share), noise**2)
+    if missing.any():
+        names = " and ".join(
+            f"{IMAGES[k]} (near x {nominal_px[k, 0]:g}, y {nominal_px[k, 1]:g})"
+            for k in np.flatnonzero(missing)
+        )
+        raise CalibrationError(
+            f"only {4 - int(missing.sum())} of four pupil images on the wavefront sensor; missing: {names}; "
+            "check the beam on the pyramid's tip, the camera region and sensor.pupils_px"
+        )
+
+
+def _fit_rims(
+    image: NDArray[np.float64],
+    rough: NDArray[np.float64],
+    radius: float,
+    nominal: float,
+    iterations: int = _ITERATIONS,
+) -> tuple[NDArray[np.float64], float]:
+    """Centres ``(4, 2)`` and the common radius of the images, from their rims alone."""
+    centres = rough.copy()
+    for left in reversed(range(iterations)):
+        # A wide ring captures, a narrow one is precise.
+        width = min(_RING * (1 if left < _NARROW else 2), nominal / 2)
+        moves = np.array(
+            [_rim_step(image, centres, k, radius, width, nominal + _NEIGHBOUR) for k in range(4)]
+        )
+        limited = np.clip(moves, -1.5, 1.5)
+        centres += limited[:, :2]
+        radius = max(radius + float(np.median(limited[:, 2])), nominal / 2)
+    return centres, radius
+
+
+def _rim_step(
+    image: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    number: int,
+    radius: float,
+    width: float,
+    apart: float,
+) -> NDArray[np.float64]:
+    """Gauss-Newton step ``(3,)`` of one image's centre (x, y) and radius.
+
+    In a ring around the rim the light is taken for ``outside(angle) + inside(angle, depth) * edge``,
+    all of which is linear but for the edge's place. Pixels ``apart`` or less from another image's
+    centre are left out.
+    """
+    x, y = centres[number]
+    pixels, light = _ring(image, x, y, radius, width)
+    others = np.delete(centres, number, axis=0)
+    alone = np.hypot(*(pixels[:, None] - others.T[:, :, None])).min(axis=0) > apart
+    (dx, dy), light = pixels[:, alone] - centres[number][:, None], light[alone]
+    r = np.hypot(dx, dy)
+    # A rim of few pixels tells few harmonics.
+    waves = _harmonics(np.arctan2(dy, dx), min(_HARMONICS, int(radius // 3)))
+    depth = (radius - r) / _SOFT
+    edge = special.ndtr(depth)
+    steepness = np.exp(-(depth**2) / 2) / (np.sqrt(2 * np.pi) * _SOFT)
+    slant = (depth * edge)[:, None] * waves[:, :5]
+    known = np.concatenate([waves, waves * edge[:, None], slant], axis=1)
+    shares = _fit(known, light)
+    n = waves.shape[1]
+    bright = (waves @ shares[n : 2 * n]) * steepness
+    moving = np.stack([bright * dx / r, bright * dy / r, bright], axis=1)
+    return _fit(np.concatenate([known, moving], axis=1), light)[-3:]
+
+
+def _fit(terms: NDArray[np.float64], light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares of the terms in the light, by the normal equations: few terms, many pixels."""
+    scale = np.sqrt(np.maximum(np.square(terms).sum(axis=0), 1e-30))
+    unit = terms / scale
+    return np.asarray(np.linalg.lstsq(unit.T @ unit, unit.T @ light, rcond=1e-12)[0] / scale)
+
+
+def _harmonics(angle: NDArray[np.float64], order: int) -> NDArray[np.float64]:
+    """1, cos a, sin a, cos 2a, ... as columns."""
+    turns = angle[:, None] * np.arange(1, order + 1)
+    both = np.stack([np.cos(turns), np.sin(turns)], axis=2).reshape(angle.size, -1)
+    return np.concatenate([np.ones((angle.size, 1)), both], axis=1)
+
+
+def _ring(
+    image: NDArray[np.float64], x: float, y: float, radius: float, width: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places ``(2, n)`` as (x, y) and light ``(n,)`` of the pixels around a rim; outside it is dark."""
+    reach = int(np.ceil(radius + width)) + 1
+    columns, rows = np.meshgrid(
+        round(x) + np.arange(-reach, reach + 1), round(y) + np.arange(-reach, reach + 1)
+    )
+    near = np.abs(np.hypot(columns - x, rows - y) - radius) <= width
+    columns, rows = columns[near], rows[near]
+    seen = (columns >= 0) & (columns < image.shape[1]) & (rows >= 0) & (rows < image.shape[0])
+    light = np.zeros(columns.size)
+    light[seen] = image[rows[seen], columns[seen]]
+    return np.stack([columns, rows]).astype(float), light
+
+
+def _check_fit(
+    centres: NDArray[np.float64],
+    rough: NDArray[np.float64],
+    diameter: float,
+    n_sub: int,
+    shape: tuple[int, ...],
+) -> None:
+    """Raise unless the images are whole, round, and of the design's size."""
+    low, high = centres - diameter / 2, centres + diameter / 2
+    # Half a pixel lies between a pixel's centre and its edge; diffraction takes another half.
+    cut = (low < -1.0).any(axis=1) | (high > np.array(shape[::-1])).any(axis=1)
+    if cut.any():
+        names = " and ".join(IMAGES[k] for k in np.flatnonzero(cut))
+        raise CalibrationError(
+            f"the camera's region of {shape[1]} x {shape[0]} pixels cuts the {names} pupil image; "
+            "move the region (devices.wfs.region)"
+        )
+    if not abs(diameter - n_sub) <= _DIAMETER_RANGE * n_sub + _DIAMETER_PX:
+        raise CalibrationError(
+            f"the pupil images are {diameter:.1f} pixels across, sensor.n_sub says {n_sub}; "
+            "check sensor.n_sub and the binning"
+        )
+    lost = np.hypot(*(centres - rough).T) > max(4.0, 0.1 * n_sub)
+    if lost.any():
+        names = " and ".join(IMAGES[k] for k in np.flatnonzero(lost))
+        raise CalibrationError(
+            f"the {names} pupil image has no clear rim; use more frames, or check the light on it"
+        )

@@ -1,0 +1,127 @@
+"""OOPAO's own SPRINT on OOPAO's own sensor, as a peer."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import version
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.oopao_bridge import make_light, mis_registration, oopao, quiet
+
+if TYPE_CHECKING:
+    from escape_hw.config.models import SystemConfig
+
+#: OOPAO thinks in telescopes and rounds shifts: the same bench a thousand times larger.
+_SCALE = 1000.0
+#: OOPAO's numbers of the parameters, in the order of ``PARAMETERS``.
+_PARAMETERS = (0, 1, 2, 4, 5)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a solver says: the registration, and whether it vouches for it."""
+
+    registration: Registration
+    valid: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mirror:
+    """A mirror that may differ from its model: gains of the actuators, and coupling."""
+
+    gains: NDArray[np.float64]
+    coupling: float
+
+
+class OopaoPeer:
+    """OOPAO's SPRINT on matrices of its own sensor.
+
+    It gets what it needs to do well: no threshold, and a precision that does not round the answer away.
+
+    Parameters
+    ----------
+    config
+        The system.
+    m2c
+        The modes to use ``(n_act, n_modes)``.
+    """
+
+    def __init__(self, config: SystemConfig, m2c: NDArray[np.float64]) -> None:
+        self._pupil, self.m2c = pupil_geometry(config), m2c
+        diameter = config.system.pupil_m * _SCALE
+        light = make_light(self._pupil.amplitude, diameter, config.system.wavelength_m)
+        # OOPAO's mirror lays its n samples from edge to edge, its wavefront has them at pixel centres.
+        n = self._pupil.n_sub * self._pupil.n_pix
+        scale = _SCALE * n / (n - 1)
+        self._sub_aperture = self._pupil.sub_aperture_m * scale
+        self._place = {
+            "telescope": light.telescope,
+            "nSubap": self._pupil.n_sub,
+            "coordinates": actuator_positions(config) * scale,
+            "pitch": pitch_on_pupil(config) * scale,
+            "print_dm_properties": False,
+        }
+        with quiet():
+            sensor = oopao().ShackHartmann(
+                nSubap=self._pupil.n_sub,
+                telescope=light.telescope,
+                lightRatio=config.sensor.min_flux,
+                threshold_cog=0,
+            )
+            mirror = oopao().DeformableMirror(mechCoupling=config.devices.dm.coupling, **self._place)
+        self._parts = SimpleNamespace(
+            tel=light.telescope, ngs=light.source, dm=mirror, wfs=sensor, atm=None, param=None
+        )
+        self._solver = None
+
+    name = f"OOPAO {version('OOPAO')}: SPRINT"
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Its valid sub-apertures ``(n_sub, n_sub)``."""
+        return np.asarray(self._parts.wfs.valid_subapertures, dtype=bool)
+
+    def matrix(self, registration: Registration, real: Mirror) -> NDArray[np.float64]:
+        """The matrix of a mirror under a registration ``(n_slopes, n_modes)`` on OOPAO's own sensor."""
+        p = self._parts
+        moved = mis_registration(registration, self._sub_aperture)
+        with quiet():
+            measure = import_module("OOPAO.calibration.InteractionMatrix").InteractionMatrix
+            mirror = oopao().DeformableMirror(mechCoupling=real.coupling, misReg=moved, **self._place)
+            acting = real.gains[:, None] * self.m2c
+            return np.asarray(
+                measure(p.ngs, p.tel, mirror, p.wfs, acting, stroke=1e-9, invert=False, nMeasurements=1).D
+            )
+
+    def set_up(self) -> None:
+        """Calculate the sensitivities about zero."""
+        with quiet():
+            self._solver = import_module("OOPAO.SPRINT").SPRINT(
+                self._parts,
+                SimpleNamespace(modes=self.m2c, extra="KL"),
+                n_mis_reg=len(PARAMETERS),
+                ind_mis_reg=list(_PARAMETERS),
+                mis_registration_zero_point=oopao().MisRegistration(),
+            )
+
+    def solve(self, data: NDArray[np.float64], iterations: int = 6) -> Answer:
+        """The registration of a matrix, from zero."""
+        solver = self._solver
+        if solver is None:
+            raise RuntimeError("set_up() comes first")
+        # Where it diverges it divides by zero; what comes of that is counted, not printed.
+        with quiet(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            solver.estimate(self._parts, data, n_iteration=iterations, precision=6, display=False, plot=False)
+        x, y, rotation, radial, tangential = solver.mis_registration_buffer[-1]
+        per_cent = 100 / self._sub_aperture
+        found = Registration(-per_cent * x, -per_cent * y, rotation, 100 * radial, 100 * tangential)
+        return Answer(found, bool(solver.validity_flag))

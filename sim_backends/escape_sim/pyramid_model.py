@@ -1,0 +1,215 @@
+"""SPRINT's nominal synthetic model of a pyramid system, fast and analytic."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.pyramid import PyramidPupils, boxes
+from escape_hw.api.registration import Registration
+from escape_hw.config.sensor_models import PyramidSection
+from escape_hw.errors import CalibrationError
+from escape_sim.fourier_filter import good_length
+from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.influence import InfluenceFunctions
+from escape_sim.mode_surfaces import (
+    N_DERIVATIVES,
+    GaussianFactors,
+    gaussian_factors,
+    mode_derivatives,
+    mode_surfaces,
+)
+from escape_sim.modulation import Modulation
+from escape_sim.prism import Prism
+from escape_sim.pyramid import PyramidOptics, Window
+from escape_sim.pyramid_response import slope_response
+from escape_sim.pyramid_turbulence import distances, strength
+from escape_sim.surface_nodes import surface_nodes
+from escape_sim.turbulence_statistics import structure_function
+
+if TYPE_CHECKING:
+    from escape_hw.config.models import SystemConfig
+
+#: Outer scale of the turbulence in pupil diameters: a few pupils, as the modal basis has it.
+_OUTER_SCALE = 4.0
+#: Turbulence weaker than this many r0 across the pupil leaves the response what it is at rest.
+_CALM = 0.5
+#: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
+_STRENGTH_DOUBT, _ELLIPSE = 0.4, 0.05
+
+
+def nominal_pupils(config: SystemConfig) -> PyramidPupils:
+    """The design's pupil images, valid where the design beam is bright enough."""
+    sensor, pupil = config.sensor_as(PyramidSection), pupil_geometry(config)
+    n, p = pupil.n_sub, pupil.n_pix
+    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
+    flux /= np.percentile(flux[flux > 0], 95)
+    valid = flux >= sensor.min_flux
+    centres = np.array(sensor.pupils_px)
+    return PyramidPupils(
+        centres, float(n), boxes(centres, n), valid,
+        np.zeros((int(valid.sum()), 2), np.float32), flux.astype(np.float32),
+        normalisation=sensor.normalisation, modulation=sensor.modulation,
+    )  # fmt: skip
+
+
+class PyramidModel:
+    """Small-signal slopes of a modulated pyramid behind a Gaussian-actuator mirror.
+
+    The slopes' derivatives by the phase at every sample of the pupil are worked out once, at a flat
+    wavefront or in the mean over turbulence as strong as the slopes' motion tells. They are kept on
+    the few nodes that carry a mirror surface; a matrix under any registration is then one product.
+    The mean matters: open-loop turbulence of 22 r0 across the pupil lowers the response to modes of
+    low order to 0.38, of middle order to 0.31 and of high order to 0.53 of what it is at rest.
+
+    Parameters
+    ----------
+    config
+        The design: sensor, mirror and beam. Its ``twin`` section is not read.
+    pupils
+        The pupil images found on the camera.
+    modulation
+        Path of the image over the pyramid; by default a circle of the pupils' radius.
+    turbulence
+        Pupil diameters over r0 to average over; by default what the pupils' motion tells.
+
+    Raises
+    ------
+    CalibrationError
+        The pupils do not fit the design.
+    """
+
+    name = "fast"
+
+    def __init__(
+        self,
+        config: SystemConfig,
+        pupils: PyramidPupils,
+        *,
+        modulation: Modulation | None = None,
+        turbulence: float | None = None,
+    ) -> None:
+        pupil = pupil_geometry(config)
+        if pupils.valid.shape != (pupil.n_sub, pupil.n_sub):
+            raise CalibrationError(
+                f"the pupil images have {pupils.valid.shape} pixels; sensor.n_sub is {pupil.n_sub}"
+            )
+        self._config, self._pupils, self._pupil = config, pupils, pupil
+        self._positions = actuator_positions(config)
+        self._pitch = pitch_on_pupil(config)
+        self._coupling = config.devices.dm.coupling
+        self._modulation = modulation or Modulation.circle(pupils.modulation)
+        if turbulence is None:
+            turbulence = strength(self.optics(), pupils, _OUTER_SCALE)
+        self.turbulence = turbulence if turbulence >= _CALM else 0.0
+        sigma = self._pitch / np.sqrt(2 * np.log(1 / self._coupling))
+        self._nodes, self._carry = surface_nodes(pupil.coordinates_m, sigma)
+        # A surface changes the path by twice as much.
+        scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
+        self._response = self._by_phase()
+        self._response *= np.float32(scale)
+        self._variants: list[PyramidModel] | None = None
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        return len(self._positions)
+
+    @property
+    def sub_aperture_m(self) -> float:
+        """Size of a pixel of the pupil image in metres."""
+        return self._pupil.sub_aperture_m
+
+    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+        """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
+        x = self._pupil.coordinates_m
+        surfaces = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
+        return surfaces, self._pupil.lit, self._pupil.pixel_m
+
+    def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
+        """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`; single precision."""
+        factors = self._factors(registration, width)
+        return self._slopes(np.einsum("ya,xa->yxa", factors.along_y[0], factors.along_x[0]))
+
+    def modal_matrix(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> NDArray[np.float64]:
+        """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
+        return self._slopes(mode_surfaces(self._factors(registration, width), m2c))
+
+    def modal_jacobian(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Modal matrix and its derivatives, see :class:`DifferentiableModel`."""
+        surfaces = mode_derivatives(self._factors(registration, width), m2c)
+        parts = self._slopes(surfaces.reshape(*surfaces.shape[:2], -1))
+        parts = parts.reshape(-1, 1 + N_DERIVATIVES, m2c.shape[1]).transpose(1, 0, 2)
+        return parts[0], parts[1:]
+
+    def zonal_jacobian(
+        self, registration: Registration, width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Zonal matrix and its derivatives, see :class:`DifferentiableModel`."""
+        factors = self._factors(registration, width)
+        x, y = factors.along_x, factors.along_y
+        pairs = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
+        parts = [self._slopes(np.einsum("ya,xa->yxa", y[j], x[i])) for i, j in pairs]
+        # By the place along x and y, and by the logarithm of the width along either.
+        by = np.concatenate([factors.place, np.repeat(factors.spread[:, :, None], self.n_act, 2)], axis=1)
+        return parts[0], np.einsum("pka,ksa->psa", by, np.stack(parts[1:]), optimize=True)
+
+    def variants(self) -> list[PyramidModel]:
+        """The same sensor under stronger turbulence, and with a modulation that is not quite round."""
+        if self._variants is None:
+            radius = self._pupils.modulation
+            self._variants = []
+            if self.turbulence:
+                stronger = self.turbulence * (1 + _STRENGTH_DOUBT)
+                self._variants.append(PyramidModel(self._config, self._pupils, turbulence=stronger))
+            for angle in (0.0, np.pi / 4) if radius else ():
+                oval = Modulation.circle(radius, ellipse=_ELLIPSE, ellipse_angle=angle)
+                self._variants.append(
+                    PyramidModel(self._config, self._pupils, modulation=oval, turbulence=self.turbulence)
+                )
+        return list(self._variants)
+
+    # ------------------------------------------------------------------ construction
+    def _by_phase(self) -> NDArray[np.float32]:
+        """The slopes' derivatives by the phase at the nodes ``(n_slopes, m * m)``."""
+        pupils, pupil = self._pupils, self._pupil
+        n, samples = len(pupil.coordinates_m), pupil.n_pix
+        shape = self._config.devices.wfs.region[:1:-1]
+        grid = good_length(max(shape), samples)
+        window = Window(pupils.centres_px, shape, grid, samples)
+        structure = None
+        if self.turbulence:
+            apart = distances(n, pupil.pixel_m) / self._config.system.pupil_m
+            structure = structure_function(apart, 1 / self.turbulence, _OUTER_SCALE)
+        return slope_response(
+            pupil.amplitude, Prism(window.shifts(n), pupil.n_sub * samples), grid * samples,
+            pupils.corners_px - window.first, pupils.valid, self._modulation, structure,
+            carry=self._carry, samples=samples, local=pupils.normalisation == "local",
+        ).by_phase  # fmt: skip
+
+    def optics(self) -> PyramidOptics:
+        """The sensor of the design, with the images where they were found."""
+        return PyramidOptics(
+            self._pupil.amplitude, float(self._pupil.n_sub), self._config.system.wavelength_m,
+            self._pupils.centres_px, self._config.devices.wfs.region[:1:-1], self._modulation,
+            samples=self._pupil.n_pix,
+        )  # fmt: skip
+
+    # ------------------------------------------------------------------ mirror
+    def _slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Slopes ``(n_slopes, k)`` of surfaces ``(m, m, k)`` on the nodes, in fractions of full stroke."""
+        return (self._response @ surfaces.reshape(-1, surfaces.shape[2])).astype(np.float64)
+
+    def _factors(self, registration: Registration, width: float) -> GaussianFactors:
+        return gaussian_factors(
+            self._influence(width), registration, self.sub_aperture_m, self._nodes, self._nodes
+        )
+
+    def _influence(self, width: float) -> InfluenceFunctions:
+        return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)

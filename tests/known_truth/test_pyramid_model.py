@@ -1,0 +1,342 @@
+"""The pyramid's analytic matrices are those of push and pull, of OOPAO, and of frames under turbulence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import j0
+from small_pyramid import configuration
+
+from escape_hw.api.model import DifferentiableModel
+from escape_hw.api.pyramid import PyramidPupils, boxes
+from escape_hw.api.registration import Registration
+from escape_hw.config.load import load_system
+from escape_hw.errors import CalibrationError
+from escape_hw.pipeline.pyramid_slopes import slopes_of_image
+from escape_sim import oopao_model
+from escape_sim.model import make_model
+from escape_sim.modulation import Modulation
+from escape_sim.prism import Prism, frequencies
+from escape_sim.pyramid import PyramidOptics
+from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+from escape_sim.pyramid_response import slope_response
+from escape_sim.pyramid_turbulence import distances, strength
+from escape_sim.surface_nodes import surface_nodes
+from escape_sim.turbulence_statistics import structure_function
+
+WAVELENGTH = 635e-9
+PLANTED = Registration(62.0, -138.0, 0.9, -1.7, 0.8)
+
+
+# ------------------------------------------------------------------ derivatives by the phase
+class Bare:
+    """A small pyramid with odd images, in double precision and with nothing but numpy."""
+
+    def __init__(self, samples=1, normalisation="global", radius=3.0):
+        n_px, self.grid, self.samples = 12, 40, samples
+        n = n_px * samples
+        y, x = (np.indices((n, n)) - (n - 1) / 2) / (n / 2)
+        r2 = x**2 + y**2
+        self.light = np.where(r2 <= 1, np.exp(-r2 / 2.25), 0)
+        self.x, self.y = x, y
+        centres = np.array([[8.3, 9.0], [29.1, 10.2], [9.0, 30.4], [28.0, 27.7]])
+        valid = (self.light**2).reshape(n_px, samples, n_px, samples).sum((1, 3)) > 0.3 * samples**2
+        self.pupils = PyramidPupils(
+            centres, float(n_px), boxes(centres, n_px), valid,
+            np.zeros((int(valid.sum()), 2), np.float32), valid.astype(np.float32),
+            normalisation=normalisation, modulation=radius,
+        )  # fmt: skip
+        self.prism = Prism((centres + 0.5) * samples - 0.5 - (n - 1) / 2, n)
+        self.modulation = Modulation.circle(radius, ellipse=0.1, centre=(0.1, 0.05))
+        self.normalisation = normalisation
+
+    def slopes(self, phase):
+        return slopes_of_image(self.image(phase), self.pupils)
+
+    def differences(self, phase):
+        """Light of the right less the left, of the lower less the upper images, and of all four."""
+        n, image = len(self.pupils.valid), self.image(phase)
+        ul, ur, ll, lr = (image[y : y + n, x : x + n][self.pupils.valid] for x, y in self.pupils.corners_px)
+        return np.stack([ur + lr - ul - ll, ll + lr - ul - ur, ul + ur + ll + lr])
+
+    def image(self, phase):
+        size = self.grid * self.samples
+        n = len(self.light)
+        between = np.exp(-2j * np.pi * frequencies(size)[0] * np.arange(n))
+        power = np.zeros((size, size))
+        for (tx, ty), weight in zip(self.modulation.points, self.modulation.weights, strict=True):
+            field = self.light * np.exp(1j * (phase + np.pi * (tx * self.x + ty * self.y)))
+            wide = np.fft.fft2(field * between * between[:, None], (size, size)) * self.prism.mask(size)
+            power += weight * np.abs(np.fft.ifft2(wide)) ** 2
+        return power.reshape(self.grid, self.samples, self.grid, self.samples).sum(axis=(1, 3))
+
+    def response(self, structure=None, carry=None):
+        return slope_response(
+            self.light, self.prism, self.grid * self.samples, self.pupils.corners_px, self.pupils.valid,
+            self.modulation, structure, carry=carry, samples=self.samples,
+            local=self.normalisation == "local",
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("calm", [None, 0.0])
+@pytest.mark.parametrize("normalisation", ["global", "local"])
+@pytest.mark.parametrize(("samples", "radius"), [(1, 3.0), (1, 0.0), (2, 2.0)])
+def test_derivatives_equal_push_and_pull(samples, radius, normalisation, calm):
+    # By points of the modulation, and by their coherence with turbulence that is not there.
+    bare = Bare(samples, normalisation, radius)
+    n = len(bare.light)
+    response = bare.response(None if calm is None else np.zeros((2 * n - 1, 2 * n - 1)))
+    assert response.flat == pytest.approx(bare.slopes(0.0), abs=1e-6)
+    rng = np.random.default_rng(0)
+    for phase in (bare.x, bare.x * bare.y, rng.standard_normal((n, n))):
+        step = 1e-4
+        want = (bare.slopes(step * phase) - bare.slopes(-step * phase)) / (2 * step)
+        ours = response.by_phase @ phase.ravel()
+        assert np.linalg.norm(ours - want) < 3e-6 * np.linalg.norm(want)
+
+
+def test_derivatives_by_nodes_are_those_of_what_the_nodes_carry():
+    bare = Bare()
+    carry = np.random.default_rng(1).standard_normal((12, 7)).astype(np.float32)
+    ours = bare.response(carry=carry).by_phase
+    want = np.einsum(
+        "kyx,yi,xj->kij", bare.response().by_phase.reshape(-1, 12, 12), carry, carry, optimize=True
+    )
+    assert np.abs(ours - want.reshape(len(ours), -1)).max() < 1e-5 * np.abs(want).max()
+
+
+class Screens:
+    """Von Kármán phases over a pupil of one unit, ``ratio`` r0 across, on ``n`` samples."""
+
+    def __init__(self, n, ratio, outer=4.0):
+        self.n, self.size = n, 16 * n
+        f = np.hypot(*np.meshgrid(np.fft.fftfreq(self.size, 1 / n), np.fft.fftfreq(self.size, 1 / n)))
+        self.power = 0.0229 * ratio ** (5 / 3) * (f**2 + outer**-2) ** (-11 / 6) / 16**2
+
+    def __call__(self, number, seed=5):
+        rng, n = np.random.default_rng(seed), self.n
+        for _ in range(number // 2):
+            noise = rng.standard_normal((2, self.size, self.size))
+            both = np.fft.fft2((noise[0] + 1j * noise[1]) * np.sqrt(self.power))[:n, :n]
+            yield from (both.real, both.imag)
+
+    def structure(self):
+        """Their own structure function: they lack what is finer than a sample."""
+        covariance = np.fft.fft2(self.power).real
+        steps = np.arange(1 - self.n, self.n)
+        return 2 * (covariance[0, 0] - covariance[np.ix_(steps, steps)])
+
+
+def test_screens_have_the_structure_function_of_turbulence():
+    ours = Screens(32, 3.0).structure()
+    want = structure_function(distances(32, 1 / 32), 1 / 3.0, 4.0)
+    assert ours[31, 40:] == pytest.approx(want[31, 40:], rel=0.06)
+
+
+@pytest.mark.parametrize("ratio", [3.0, 8.0])
+def test_mean_derivatives_are_those_of_frames_under_turbulence(ratio):
+    bare = Bare(radius=1.0)
+    screens, number, step = Screens(12, ratio), 200, 1e-2
+    mean, calm = bare.response(screens.structure()).by_phase, bare.response().by_phase
+    modes = np.stack([bare.x, bare.x**2 + bare.y**2, np.cos(6 * bare.x + 4 * bare.y)])
+    light, by = 0.0, 0.0
+    for phase in screens(number):
+        sides = [[bare.differences(phase + s * step * m) for m in modes] for s in (1, -1)]
+        light = light + np.mean(sides, axis=(0, 1)) / number
+        by = by + np.subtract(*sides) / (2 * step * number)
+    # The quotient of the means, term by term.
+    norm = light[2].mean()
+    seen = (by[:, :2] - light[:2] * by[:, 2:].mean(axis=2, keepdims=True) / norm) / norm
+    for k, mode in enumerate(modes):
+        ours, rest, measured = mean @ mode.ravel(), calm @ mode.ravel(), seen[k].ravel()
+        # 200 phases leave 4 %, 1600 leave 0.3 %; without the average the gain would be off by far more.
+        assert (measured @ ours) / (ours @ ours) == pytest.approx(1, abs=0.1)
+        assert np.linalg.norm(measured - ours) < 0.25 * np.linalg.norm(ours)
+        assert (measured @ rest) / (rest @ rest) < (0.85 if ratio > 5 else 1.0)
+
+
+def test_the_structure_function_is_that_of_the_spectrum():
+    # 2 integral of the power spectrum times (1 - cos), over rings.
+    r0, outer = 0.1, 2.0
+    for r in (0.01, 0.1, 1.0, 10.0):
+        f = np.geomspace(1e-4, 1e4 / r, 400_000)
+        spectrum = 0.0229 * r0 ** (-5 / 3) * (f**2 + outer**-2) ** (-11 / 6)
+        want = np.trapezoid(2 * spectrum * (1 - j0(2 * np.pi * f * r)) * 2 * np.pi * f, f)
+        assert structure_function(np.array(r), r0, outer) == pytest.approx(want, rel=5e-3)
+    assert structure_function(np.array([0.0]), r0, outer)[0] == 0
+    assert structure_function(np.array(0.1), r0) == pytest.approx(6.88, rel=1e-3)
+
+
+# ------------------------------------------------------------------ matrices
+VARIETIES = {
+    "modulated": (),
+    "still": ("sensor.modulation=0",),
+    "local": ("sensor.normalisation=local", "sensor.modulation=5"),
+}
+
+
+@pytest.mark.parametrize("variety", VARIETIES)
+def test_matrices_equal_those_of_oopao(variety):
+    config = configuration(*VARIETIES[variety])
+    for registration, width in ((Registration(), 1.0), (PLANTED, 1.1)):
+        ours, theirs = (
+            module(config, None).zonal_matrix(registration, width)
+            for module in (make_model, oopao_model.make_model)
+        )
+        assert ours.shape == theirs.shape
+        assert np.linalg.norm(ours - theirs) < 2e-5 * np.linalg.norm(theirs)
+
+
+def test_matrices_equal_push_and_pull_of_the_bench():
+    # The bench's own pyramid, 64 pixels across, through the frames that the twin makes.
+    config = load_system("razor-pywfs")
+    pupils = nominal_pupils(config)
+    model = PyramidModel(config, pupils)
+    pokes = np.random.default_rng(0).uniform(-1, 1, (model.n_act, 3))
+    surfaces, lit, _ = model.influence_functions()
+    optics = PyramidOptics(
+        np.where(lit, 1.0, 0.0).astype(np.float32) * _beam(config, lit), 64, WAVELENGTH,
+        pupils.centres_px, (192, 192), Modulation.circle(3.0),
+    )  # fmt: skip
+    ours = model.modal_matrix(Registration(), pokes)
+    for k, poke in enumerate(pokes.T):
+        path = np.tensordot(poke, surfaces, 1) * 2 * config.devices.dm.stroke_m
+        step = 2e-9 / np.abs(path[lit]).max()
+        push, pull = (
+            slopes_of_image(optics.frame((s * step * path).astype(np.float32)), pupils) for s in (1, -1)
+        )
+        want = (push - pull) / (2 * step)
+        # What single precision leaves of a step of 2 nm.
+        assert np.linalg.norm(ours[:, k] - want) < 4e-4 * np.linalg.norm(want)
+
+
+def _beam(config, lit):
+    y, x = (np.indices(lit.shape) - (len(lit) - 1) / 2) * config.system.pupil_m / len(lit)
+    return np.exp(-(x**2 + y**2) / config.sensor.beam_radius_m**2).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return PyramidModel(configuration(), nominal_pupils(configuration()), turbulence=4.0)
+
+
+def test_modes_and_derivatives_are_those_of_the_zonal_matrix(model):
+    assert isinstance(model, DifferentiableModel)
+    m2c = np.random.default_rng(2).standard_normal((model.n_act, 6))
+    zonal = model.zonal_matrix(PLANTED, 1.05)
+    modal, by = model.modal_jacobian(PLANTED, m2c, 1.05)
+    assert np.abs(model.modal_matrix(PLANTED, m2c, 1.05) - zonal @ m2c).max() < 1e-5 * np.abs(modal).max()
+    assert np.abs(modal - zonal @ m2c).max() < 1e-5 * np.abs(modal).max()
+    zonal_too, zonal_by = model.zonal_jacobian(PLANTED, 1.05)
+    assert np.abs(zonal_too - zonal).max() < 1e-5 * np.abs(zonal).max()
+    for k, step in enumerate((1.0, 1.0, 0.1, 0.3, 0.3)):
+        d = np.eye(5)[k] * step
+        sides = [
+            model.zonal_matrix(Registration.from_array(PLANTED.to_array() + s * d), 1.05) for s in (1, -1)
+        ]
+        want = (sides[0] - sides[1]) / (2 * step)
+        assert np.abs(zonal_by[k] - want).max() < 2e-3 * np.abs(want).max()
+        assert np.abs(by[k] - want @ m2c).max() < 2e-3 * np.abs(want @ m2c).max()
+    want = (model.zonal_matrix(PLANTED, 1.06) - model.zonal_matrix(PLANTED, 1.04)) / 0.02
+    assert np.abs(zonal_by[5] - want).max() < 2e-3 * np.abs(want).max()
+    assert np.abs(by[5] - want @ m2c).max() < 2e-3 * np.abs(want @ m2c).max()
+
+
+def test_turbulence_takes_response_away_and_not_evenly():
+    config = configuration()
+    pupils = nominal_pupils(config)
+    m2c = np.linalg.qr(np.random.default_rng(3).standard_normal((37, 37)))[0]
+    power = [
+        np.linalg.svd(PyramidModel(config, pupils, turbulence=t).zonal_matrix(Registration()) @ m2c)[1]
+        for t in (0.0, 8.0)
+    ]
+    ratio = power[1] / power[0]
+    assert (ratio < 0.95).all()
+    assert np.ptp(ratio) > 0.05
+
+
+@pytest.mark.parametrize("ratio", [1.0, 4.0, 8.0])
+def test_the_motion_of_the_slopes_tells_the_strength(ratio):
+    config = configuration()
+    model = PyramidModel(config, nominal_pupils(config))
+    pupils, optics = nominal_pupils(config), model.optics()
+    paths = [p * WAVELENGTH / (2 * np.pi) for p in Screens(16, ratio)(100)]
+    slopes = [slopes_of_image(optics.frame(p.astype(np.float32)), pupils) for p in paths]
+    motion = float(np.sqrt(np.var(slopes, axis=0).mean()))
+    assert strength(optics, replace(pupils, motion=motion), 4.0) == pytest.approx(ratio, rel=0.25)
+    assert PyramidModel(config, replace(pupils, motion=motion)).turbulence == pytest.approx(ratio, rel=0.25)
+
+
+def test_without_motion_there_is_no_turbulence():
+    config = configuration()
+    assert PyramidModel(config, nominal_pupils(config)).turbulence == 0
+    # Noise moves slopes too.
+    assert PyramidModel(config, replace(nominal_pupils(config), motion=0.01)).turbulence == 0
+
+
+def test_motion_beyond_the_most_is_as_strong_as_the_most():
+    config = configuration()
+    pupils = nominal_pupils(config)
+    optics = PyramidModel(config, pupils).optics()
+    most = strength(optics, replace(pupils, motion=10.0), 4.0)
+    assert 7 < most < 40
+    assert strength(optics, replace(pupils, motion=20.0), 4.0) == most
+
+
+def test_variants_differ_in_turbulence_and_in_the_modulation(model):
+    here = model.zonal_matrix(PLANTED)
+    matrices = [v.zonal_matrix(PLANTED) for v in model.variants()]
+    assert len(matrices) == 3
+    for one in matrices:
+        assert 1e-3 < np.linalg.norm(one - here) / np.linalg.norm(here) < 0.5
+    # An ellipse along the axes changes x slopes one way and y slopes the other.
+    n = len(here) // 2
+    x, y = (np.linalg.norm(matrices[1][s]) / np.linalg.norm(here[s]) for s in (np.s_[:n], np.s_[n:]))
+    assert (x - 1) * (y - 1) < 0
+
+
+def test_a_sensor_at_rest_has_no_variants_of_its_modulation():
+    config = configuration("sensor.modulation=0")
+    assert PyramidModel(config, nominal_pupils(config)).variants() == []
+
+
+def test_found_images_count_and_not_the_design():
+    config = configuration()
+    pupils = nominal_pupils(config)
+    moved = replace(pupils, centres_px=pupils.centres_px + np.array([[0.4, -0.3], [0, 0], [0, 0.2], [0, 0]]))
+    one, two = (PyramidModel(config, p).zonal_matrix(PLANTED) for p in (pupils, moved))
+    assert np.linalg.norm(one - two) > 1e-3 * np.linalg.norm(one)
+
+
+@pytest.mark.parametrize("make", [make_model, oopao_model.make_model])
+def test_pupils_of_another_size_are_refused(make):
+    config = configuration()
+    pupils = nominal_pupils(config)
+    with pytest.raises(CalibrationError, match="n_sub is 16"):
+        make(config, replace(pupils, valid=pupils.valid[:-2, :-2]))
+
+
+def test_boxes_outside_the_grid_are_refused():
+    bare = Bare()
+    corners = bare.pupils.corners_px + np.array([[0, 0], [20, 0], [0, 0], [0, 0]])
+    with pytest.raises(ValueError, match="leave the grid"):
+        slope_response(bare.light, bare.prism, 40, corners, bare.pupils.valid, bare.modulation)
+
+
+@pytest.mark.parametrize(("sigma", "error"), [(0.35, 1e-6), (0.28, 3e-5), (1.0, 1e-6)])
+def test_nodes_carry_surfaces_as_smooth_as_influence_functions(sigma, error):
+    x = np.linspace(-2, 2, 64)
+    nodes, carry = surface_nodes(x, 0.35)
+    assert nodes.size < 40
+    for centre in np.linspace(-3, 3, 13):
+        want = np.exp(-0.5 * ((x - centre) / sigma) ** 2)
+        assert carry @ np.exp(-0.5 * ((nodes - centre) / sigma) ** 2) == pytest.approx(want, abs=error)
+
+
+def test_narrow_influence_functions_need_all_samples():
+    x = np.linspace(-2, 2, 64)
+    nodes, carry = surface_nodes(x, 0.1)
+    assert nodes is x
+    assert carry is None

@@ -1,0 +1,78 @@
+"""The SPRINT benchmark: what is compared, and what happens where a peer is missing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.modes import karhunen_loeve
+from escape_hw.config.load import load_system
+from escape_sim.benchmarks import specula_sprint, sprint
+from escape_sim.benchmarks.oopao_sprint import Answer, OopaoPeer
+from escape_sim.model import make_model
+
+
+@pytest.fixture(scope="module")
+def alike():
+    return load_system("razor-shwfs", overrides=sprint._OOPAO_SENSOR)
+
+
+@pytest.fixture(scope="module")
+def modes(alike):
+    surfaces = make_model(alike, None).influence_functions()
+    return karhunen_loeve(*surfaces, 5, 4 * alike.system.pupil_m)
+
+
+def test_ours_and_oopaos_sensor_give_the_same_matrix_and_ours_solves_it(alike, modes):
+    peer = OopaoPeer(alike, modes)
+    theirs = peer.matrix(sprint.PLANTED, sprint.mirror(False))
+    ours = make_model(alike, None).modal_matrix(sprint.PLANTED, modes)
+    scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
+    assert np.linalg.norm(scale * ours - theirs) < 5e-6 * np.linalg.norm(theirs)
+    answer = sprint.Ours(alike, modes).solver(misfit=False, noise=False)(theirs)
+    assert answer.valid
+    error = np.abs(answer.registration.to_array() - sprint.PLANTED.to_array())
+    assert (error < [0.01, 0.01, 1e-4, 1e-3, 1e-3]).all()
+
+
+def test_a_real_mirror_differs_from_the_ideal_one():
+    ideal, real = sprint.mirror(False), sprint.mirror(True)
+    assert (ideal.gains == 1).all()
+    assert real.gains.std() == pytest.approx(sprint.GAIN_SCATTER, rel=0.3)
+    assert real.coupling != ideal.coupling
+
+
+def test_without_specula_there_is_a_row_that_says_so(monkeypatch, alike, modes):
+    monkeypatch.setattr(sprint, "specula_peer", lambda *given: None)
+    monkeypatch.setattr(sprint, "alternate", lambda ours, peer, **given: (ours() and 1.0, None))
+    (row,) = sprint._beside_specula(alike, modes)
+    assert row.peer is None
+    assert row.ratio is None
+    assert row.note == specula_sprint.MISSING
+    assert math.isfinite(row.ours)
+
+
+def test_far_answers_count_as_found_only_when_right_and_vouched_for(monkeypatch, alike, modes):
+    class Lost:
+        """Always says zero; vouches for it every other time."""
+
+        name, m2c, calls = "lost", modes, 0
+
+        def matrix(self, registration, real):
+            self.planted = registration
+            return registration.to_array()
+
+        def solve(self, data, iterations):
+            self.calls += 1
+            return Answer(Registration(), self.calls % 2 == 0)
+
+    monkeypatch.setattr(
+        sprint.Ours, "solver", lambda self, **given: lambda data: Answer(Registration.from_array(data), True)
+    )
+    found, wrong = sprint._from_afar(alike, Lost(), 5)
+    n = len(sprint.PITCHES) * len(sprint.DIRECTIONS)
+    assert (found.ours, found.peer) == (n, 0)
+    assert (wrong.ours, wrong.peer) == (0, n // 2)
