@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 import threading
@@ -55,14 +54,20 @@ class Running:
             self._ended = True
             self._arrived.notify_all()
 
-    def wait_for(self, beginning: str, done: int = 0, timeout_s: float = 90.0) -> None:
-        """Wait until a line begins like this and, if it counts (``stage: 7 of 30``), has come to ``done``."""
+    def wait_for(self, beginning: str, timeout_s: float = 90.0) -> None:
+        """Wait until a line begins like this."""
         with self._arrived:
-            self._arrived.wait_for(lambda: self._ended or self._has(beginning, done), timeout_s)
-            assert self._has(beginning, done), "\n".join(self.lines)
+            self._arrived.wait_for(lambda: self._ended or self._has(beginning), timeout_s)
+            assert self._has(beginning), "\n".join(self.lines)
 
-    def _has(self, beginning: str, done: int) -> bool:
-        return any(line.startswith(beginning) and _count(line) >= done for line in self.lines)
+    def _has(self, beginning: str) -> bool:
+        return any(line.startswith(beginning) for line in self.lines)
+
+    def let_work(self, seconds: float) -> None:
+        """Let it use so much processor time, however busy the machine is; not for ever, for it may wait."""
+        enough, deadline = self._cpu_s() + seconds, time.monotonic() + 10 * seconds
+        while self._cpu_s() < enough and time.monotonic() < deadline:
+            time.sleep(0.02)
 
     def stop(self, *signals: int, pause_s: float = 0.05) -> Ended:
         """Send signals, wait for the end."""
@@ -99,8 +104,3 @@ class Running:
         """Processor time that the process has used so far."""
         fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def _count(line: str) -> int:
-    found = re.match(r".*?: (\d+) of \d+", line)
-    return int(found.group(1)) if found else 0
