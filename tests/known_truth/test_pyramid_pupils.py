@@ -83,11 +83,23 @@ def test_a_longer_look_moves_centres_and_nothing_else() -> None:
     centres = moved(rng)
     first = find(frame(centres, rng, strength=0.5, noise=5.0))
     long = np.mean([frame(centres, rng, strength=0.5, noise=1.0) for _ in range(12)], axis=0)
-    better = refine_pupils(long, first)
+    better = refine_pupils([long], first)
     assert np.abs(better.centres_px - centres).max() < 0.1
     assert better.corners_px is first.corners_px
     assert better.valid is first.valid
     assert better.references is first.references
+
+
+def test_parts_of_a_run_tell_the_error_of_the_images_place() -> None:
+    pulls = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        centres = moved(rng)
+        parts = [frame(centres, rng, strength=0.5, noise=20.0).astype(np.float32) for _ in range(6)]
+        found = refine_pupils(parts, find(parts[0]))
+        assert 0 < found.centre_sigma_px < 0.1
+        pulls.append((found.centres_px - centres).mean(axis=0) / found.centre_sigma_px)
+    assert 0.2 < np.mean(np.square(pulls)) < 6
 
 
 def test_references_are_the_mean_slopes_or_what_is_not_smooth_in_them() -> None:
