@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,6 +67,7 @@ class SimBench:
         self._sensor: SensorOptics | None = None
         self.beam_circle = BeamCircle(config, truth.uniform(0, 2 * np.pi, 2))
         self._circle_in_force: object = self
+        self._drifts = bool(twin.pyramid.drift)
         self.wfs_detector = Detector(
             (config.devices.wfs.region[3], config.devices.wfs.region[2]), config.devices.wfs.bit_depth,
             twin.wfs.full_well_e, twin.wfs.read_noise_e, twin.wfs.dark_e, twin.wfs.background,
@@ -123,11 +123,15 @@ class SimBench:
         sensor = self.sensor()
         steps = self.config.twin.substeps
         image = np.zeros((self.config.devices.wfs.region[3], self.config.devices.wfs.region[2]), np.float32)
-        edges = np.linspace(start_s, end_s, steps + 1)
-        opd = np.zeros(self.pupil.amplitude.shape, np.float32)
-        for a, b in pairwise(edges):
-            opd = self.optical_path(float(a), float(b))
-            sensor.frame(opd + self._ncpa + self._drift(float(a)), image)
+        step = (end_s - start_s) / steps
+        opd = np.zeros(0, np.float32)
+        for k in range(steps):
+            at = start_s + k * step
+            opd = self.optical_path(at, at + step)
+            seen = opd + self._ncpa
+            if self._drifts:
+                seen += self._drift(at)
+            sensor.frame(seen, image)
         return (image / np.float32(steps) if steps > 1 else image), opd
 
     def wfs_light(self, exposure_s: float) -> tuple[float, float]:
@@ -145,14 +149,14 @@ class SimBench:
         if self._sensor is None:
             self._sensor = make_sensor_optics(self.config, self.pupil)
         circle = self.beam_circle.modulation
-        if isinstance(self._sensor, ModulatedOptics) and circle is not self._circle_in_force:
-            self._sensor.modulation, self._circle_in_force = self.beam_circle.points(), circle
+        if circle is not self._circle_in_force:
+            self._circle_in_force = circle
+            if isinstance(self._sensor, ModulatedOptics):
+                self._sensor.modulation = self.beam_circle.points()
         return self._sensor
 
-    def _drift(self, time_s: float) -> NDArray[np.float32] | np.float32:
+    def _drift(self, time_s: float) -> NDArray[np.float32]:
         """Tilt ``(n, n)`` in metres of the beam on a pyramid, whose modulation's centre wanders."""
-        if not self.config.twin.pyramid.drift:
-            return np.float32(0)
         x, y = self.beam_circle.drift(time_s) * self.config.system.wavelength_m / self.config.system.pupil_m
         at = self.pupil.coordinates_m
         return np.asarray(x * at[None, :] + y * at[:, None], np.float32)
