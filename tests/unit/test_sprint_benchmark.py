@@ -72,7 +72,7 @@ def test_far_answers_count_as_found_only_when_right_and_vouched_for(monkeypatch,
     monkeypatch.setattr(
         sprint.Ours, "solver", lambda self, **given: lambda data: Answer(Registration.from_array(data), True)
     )
-    found, wrong = sprint._from_afar(alike, Lost(), 5)
+    found, wrong = sprint._from_afar(alike, Lost(), "sprint")
     n = len(sprint.PITCHES) * len(sprint.DIRECTIONS)
     assert (found.ours, found.peer) == (n, 0)
     assert (wrong.ours, wrong.peer) == (0, n // 2)
