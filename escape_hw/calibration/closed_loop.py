@@ -34,6 +34,8 @@ _SATURATED = 0.2
 _SATURATED_FRAMES = 50
 #: Shares of the stable limit that the search for the best gain tries.
 GAIN_SHARES = (0.25, 0.35, 0.45, 0.55, 0.65, 0.75)
+#: Gains tried beyond those while the loop gets better and better, each this much above the last.
+_MORE_GAINS, _MORE_STEP = 4, 1.2
 #: Delay assumed for the gain's limit when the matrix does not carry a measured one.
 _USUAL_DELAY = 2.0
 
@@ -315,9 +317,11 @@ def best_gain(
         No gain gives a stable loop.
     """
     delay = float(matrix.metrics.get("delay_frames", _USUAL_DELAY))
-    tried = gains or tuple(share * gain_limit(delay) for share in GAIN_SHARES)
+    waiting = list(gains or (share * gain_limit(delay) for share in GAIN_SHARES))
+    more = 0 if gains else _MORE_GAINS
     runs: list[LoopResult] = []
-    for gain in tried:
+    while waiting:
+        gain = waiting.pop(0)
         run = yield from closed_loop(
             bench,
             matrix,
@@ -330,15 +334,23 @@ def best_gain(
         runs.append(run)
         if run.partial:
             return gain, runs
-        if not run.stable and len([r for r in runs if not r.stable]) > 1:
+        if sum(not r.stable for r in runs) > 1:
             break
+        if not waiting and more and _rises_to_its_end(runs):
+            # The top is not passed yet: a best gain at the edge of the scan is none.
+            waiting, more = [gain * _MORE_STEP], more - 1
     stable = [run for run in runs if run.stable]
     if not stable:
         raise CalibrationError(
-            f"the loop closes at none of the gains {', '.join(f'{g:.2f}' for g in tried)}; "
+            f"the loop closes at none of the gains {', '.join(f'{r.gain:.2f}' for r in runs)}; "
             "drop more modes or measure the matrix again"
         )
     return _peak(stable), runs
+
+
+def _rises_to_its_end(runs: list[LoopResult]) -> bool:
+    """Whether every loop was stable and the last gain is the best so far."""
+    return all(run.stable for run in runs) and int(np.argmax(_merits(runs))) == len(runs) - 1
 
 
 def _peak(runs: list[LoopResult]) -> float:

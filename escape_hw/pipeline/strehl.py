@@ -18,16 +18,19 @@ _BORDER = 4
 
 def without_background(image: NDArray[np.floating]) -> NDArray[np.float64]:
     """Image minus the median of its border."""
-    border = np.ones(image.shape, dtype=bool)
+    return np.asarray(image - np.median(image[_rim(image.shape)]), dtype=np.float64)
+
+
+def _rim(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The border of an image."""
+    border = np.ones(shape, dtype=bool)
     border[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
-    return np.asarray(image - np.median(image[border]), dtype=np.float64)
+    return border
 
 
 def has_light(image: NDArray[np.floating]) -> bool:
     """True when something stands clearly above the scatter of the image's border."""
-    border = np.ones(image.shape, dtype=bool)
-    border[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
-    rim = image[border]
+    rim = image[_rim(image.shape)]
     # Of the 16,384 pixels of a dark image the brightest stands out by about four times the scatter.
     return bool(np.max(image) - np.median(rim) > 10 * np.std(rim))
 
@@ -145,8 +148,12 @@ def strehl(frames: NDArray[np.floating], model: NDArray[np.floating]) -> StrehlE
     back = -_to_middle(without_background(mean))
     weights = np.stack([_moved(w.reshape(mean.shape), back).ravel() for w in _weights(centred(model))])
     weights = np.concatenate([weights, np.ones((1, mean.size))])
-    dark = float(mean.sum() - without_background(mean).sum()) / mean.size
-    sums = frames.reshape(len(frames), -1) @ weights.T.astype(np.float32) - dark * weights.sum(axis=1)
+    rim = _rim(mean.shape)
+    rims = frames[:, rim].mean(axis=1, dtype=np.float64)
+    # Every frame has its own share in the background's error, too, which the whole image's light takes up.
+    dark = float(np.median(mean[rim])) + rims - rims.mean()
+    sums = frames.reshape(len(frames), -1) @ weights.T.astype(np.float32)
+    sums = sums - np.outer(dark, weights.sum(axis=1))
     light = sums[:, 3:].mean()
     shares = (sums[:, :3] - values * sums[:, 3:]) / light
     errors = [standard_error(share) for share in shares.T]

@@ -216,9 +216,13 @@ def test_a_dead_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path):
 
 
 def test_too_few_frames_no_light_and_no_response_exit_1(run, system, tmp_path):
-    code, document, _ = run("calibrate", system, "--frames", 50, "--out", tmp_path / "a")
+    few = ("--frames", 50, "--method", "docrime")
+    code, document, _ = run("calibrate", system, *few, "--out", tmp_path / "a")
     assert (code, document["error"]["type"]) == (1, "TooFewFrames")
     assert "at least 82 frames" in document["error"]["message"]
+    code, document, _ = run("calibrate", system, "--frames", 12, "--out", tmp_path / "few")
+    assert (code, document["error"]["type"]) == (1, "TooFewFrames")
+    assert "at least 13 frames" in document["error"]["message"]
     dark = ("--set", "twin.wfs.photons_per_frame=1")
     code, document, _ = run("calibrate", system, "--frames", 300, *dark, "--out", tmp_path / "b")
     assert (code, document["error"]["type"]) == (1, "CalibrationError")

@@ -137,11 +137,12 @@ def test_errors_are_honest(model):
     found, small = [], model[40:88, 40:88]
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        noisy = 1000 * small / small.max() + rng.normal(0, 5.0, (16, *small.shape))
+        noisy = 1000 * small / small.max() + rng.normal(0, 5.0, (50, *small.shape))
         value = strehl(noisy, small).peak
         found.append((value.value - 1) / value.sigma)
-    # Student's t with 7 degrees of freedom has variance 1.4.
-    assert 0.8 < np.var(found) < 2.4
+    # The noise here is mostly that of the background, whose median is noisier than its mean by pi / 2 in
+    # variance; sixty values know their variance to 18 %.
+    assert 0.7 < np.var(found) < 2.4
 
 
 def test_one_frame_has_no_error(model):

@@ -96,9 +96,9 @@ def test_the_stages_are_declared(request):
 
 def test_a_missing_peer_is_a_row_without_a_figure(monkeypatch):
     monkeypatch.setattr(pipeline, "pyrtc", lambda module: None)
-    monkeypatch.setattr(pipeline, "alternate", lambda ours, theirs: (1e-6, None) if theirs is None else 1 / 0)
-    rows = pipeline.run()
-    assert rows
+    monkeypatch.setattr(pipeline, "alternate", lambda ours, theirs: (1e-6, None if theirs is None else 2e-6))
+    rows = [one for one in pipeline.run() if "pyrtcao" in one.peer_name]
+    assert len(rows) >= 4
     for one in rows:
         assert one.peer is None
         assert one.ratio is None
