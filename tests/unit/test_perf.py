@@ -9,18 +9,23 @@ import subprocess
 import sys
 import time
 from importlib.metadata import EntryPoint
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from escape_hw.api.benchmark import BenchmarkRow, alternate
 from escape_hw.cli import perf
-from escape_hw.cli.benchmarks import docrime, peer, pipeline
+from escape_hw.cli.benchmarks import docrime, docrime_frames, peer, pipeline
 from escape_hw.errors import ConfigError
 
 
 def row(ours=2.0, peer_figure=6.0, better="lower"):
     return BenchmarkRow("stage: what", ours, peer_figure, "peer 1.0", "us", better, "note")
+
+
+#: What a run of 600 frames with two lost says of itself.
+TAKEN = SimpleNamespace(solution=SimpleNamespace(frames=598, lost_frames=2))
 
 
 def fake_stage() -> list[BenchmarkRow]:
@@ -119,6 +124,17 @@ def test_the_frames_of_the_docrime_stage_answer_one_frame_later(monkeypatch):
     assert data.error(np.linalg.solve(x.T @ x, x.T @ y).T) < 0.2
     assert data.error(docrime.whole(data)) < 0.2
     assert np.allclose(docrime.whole(data), docrime.streaming(data), rtol=0, atol=1e-4)
+
+
+def test_the_docrime_run_counts_real_frames_against_the_benchs_rate(monkeypatch):
+    ticks = iter([10.0, 12.0])
+    monkeypatch.setattr(docrime_frames, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
+    monkeypatch.setattr(docrime_frames, "drive", lambda run: (run.close(), TAKEN)[1])
+    row = docrime_frames.frames_row()
+    assert row.ours == pytest.approx(600 / 2.0)
+    assert row.peer == 500.0
+    assert row.ratio == pytest.approx(0.6)
+    assert "100000 take 333 s" in row.note
 
 
 def test_turbulence_of_the_docrime_stage_has_unit_rms_and_falls_steeply():

@@ -38,6 +38,35 @@ def test_ours_and_oopaos_sensor_give_the_same_matrix_and_ours_solves_it(alike, m
     assert (error < [0.01, 0.01, 1e-4, 1e-3, 1e-3]).all()
 
 
+def test_on_the_pyramid_both_solve_oopaos_matrix_and_ours_is_nearer():
+    config = load_system("razor-pywfs", overrides=sprint._OOPAO_PYRAMID)
+    model = make_model(config, None)
+    low = karhunen_loeve(*model.influence_functions(), 5, 4 * config.system.pupil_m)
+    peer, at = OopaoPeer(config, low), sprint.planted(config)
+    theirs = peer.matrix(at, sprint.mirror(False))
+    ours = model.modal_matrix(at, low)
+    scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
+    assert scale > 0
+    assert np.linalg.norm(scale * ours - theirs) < 1e-4 * np.linalg.norm(theirs)
+    peer.set_up()
+    mine, other = (
+        np.abs(solve(theirs).registration.to_array() - at.to_array())
+        for solve in (sprint.Ours(config, low).solver(misfit=False, noise=False), peer.solve)
+    )
+    assert (mine < [0.02, 0.02, 1e-4, 1e-3, 1e-3]).all()
+    assert (other < [0.2, 0.2, 1e-3, 0.05, 0.05]).all()
+    # What is planted is the same share of the pupil on both sensors.
+    assert at.shift_x / config.sensor.n_sub == pytest.approx(sprint.PLANTED.shift_x / sprint.PLANTED_SUB)
+
+
+def test_products_of_a_pyramid_matrix_are_counted_on_its_nodes():
+    config = load_system("razor-pywfs", overrides=sprint._OOPAO_PYRAMID)
+    one, whole = sprint._operations(config, 97, 5)
+    twice, _ = sprint._operations(config, 97, 10)
+    assert twice == 2 * one
+    assert whole > 5 * one
+
+
 def test_a_real_mirror_differs_from_the_ideal_one():
     ideal, real = sprint.mirror(False), sprint.mirror(True)
     assert (ideal.gains == 1).all()
@@ -72,7 +101,7 @@ def test_far_answers_count_as_found_only_when_right_and_vouched_for(monkeypatch,
     monkeypatch.setattr(
         sprint.Ours, "solver", lambda self, **given: lambda data: Answer(Registration.from_array(data), True)
     )
-    found, wrong = sprint._from_afar(alike, Lost(), 5)
+    found, wrong = sprint._from_afar(alike, Lost(), "sprint")
     n = len(sprint.PITCHES) * len(sprint.DIRECTIONS)
     assert (found.ours, found.peer) == (n, 0)
     assert (wrong.ours, wrong.peer) == (0, n // 2)

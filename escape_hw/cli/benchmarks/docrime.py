@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.benchmark import BenchmarkRow, alternate
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.cli.benchmarks.docrime_frames import frames_row
 from escape_hw.cli.benchmarks.peer import ABSENT, name, pyrtc
 
 _N_MODES, _N_SLOPES, _N_FRAMES = 97, 200, 10_000
@@ -79,7 +80,7 @@ def run() -> list[BenchmarkRow]:
                         ABSENT if absent else f"{size}, solution included",
                     )
                 )
-    return rows
+    return [*rows, frames_row()]
 
 
 def first_order(rng: np.random.Generator) -> NDArray[np.float64]:

@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from escape_hw.api.modulator import Modulation
+from escape_hw.bench import Bench
 from escape_hw.config.sensor_models import PyramidSection
-from escape_sim.devices import make_mirror, make_wfs_camera
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.oopao_bridge import Light, make_light, make_pyramid, oopao, quiet
-from escape_sim.sim_modulator import make_modulator
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
 
-#: OOPAO's atmosphere thinks in telescopes: the same bench a thousand times larger.
+#: OOPAO's atmosphere thinks in telescopes: a bench is made a thousand times larger.
 _SCALE = 1000.0
 #: Few enough to be cheap, enough that no call repeats the one before.
 _N_COMMANDS = 8
@@ -26,19 +25,17 @@ _N_COMMANDS = 8
 
 def twin_frame(config: SystemConfig) -> Callable[[], object]:
     """A call that sends a command and takes a frame, from device to device."""
-    shared: dict[str, object] = {}
-    mirror = make_mirror("dm", config, shared).open()
-    camera = make_wfs_camera("wfs", config, shared).open()
-    if isinstance(config.sensor, PyramidSection) and config.devices.modulator is not None:
+    bench = Bench.from_config(config).open()
+    if isinstance(config.sensor, PyramidSection) and bench.modulator and config.devices.modulator:
         section = config.devices.modulator
         radius = config.sensor.modulation * section.rad_per_lambda_d
-        make_modulator("modulator", config, shared).open().modulate(Modulation(radius, section.frequency_hz))
-    commands = 0.02 * np.random.default_rng(0).uniform(-1, 1, (_N_COMMANDS, mirror.info.n_act))
+        bench.modulator.modulate(Modulation(radius, section.frequency_hz))
+    commands = 0.02 * np.random.default_rng(0).uniform(-1, 1, (_N_COMMANDS, bench.dm.info.n_act))
     turn = iter(range(1 << 62))
 
     def call() -> object:
-        mirror.send(commands[next(turn) % _N_COMMANDS])
-        return camera.next_frame(1.0).data
+        bench.dm.send(commands[next(turn) % _N_COMMANDS])
+        return bench.wfs.next_frame(1.0).data
 
     return call
 
@@ -50,40 +47,30 @@ def oopao_frame(config: SystemConfig) -> Callable[[], object]:
     region's size, with the images on a square.
     """
     lib, pupil = oopao(), pupil_geometry(config)
-    diameter = config.system.pupil_m * _SCALE
+    twin, scale = config.twin, 1.0 if config.twin.atmosphere else _SCALE
+    diameter = config.system.pupil_m * scale
     light = make_light(pupil.amplitude, diameter, config.system.wavelength_m)
     power = float(np.square(pupil.amplitude, dtype=float).sum()) * light.unit
     telescope, source = light.telescope, light.source
     with quiet():
         # As many photons per frame as the twin has.
         rate = config.devices.wfs.frame_rate_hz
+        photons = twin.star.electrons(1 / rate) if twin.star else twin.wfs.photons_per_frame
         telescope.samplingTime = 1 / rate
-        telescope.pupilReflectivity = telescope.pupilReflectivity * (
-            config.twin.wfs.photons_per_frame * rate / power
-        )
-        screen = config.devices.screen
-        r0 = screen.screens_r0_m[screen.screen] if screen else 1.0
-        atmosphere = import_module("OOPAO.Atmosphere").Atmosphere(
-            telescope,
-            r0=r0 * _SCALE * (500e-9 / config.system.wavelength_m) ** 1.2,
-            L0=4 * diameter,
-            windSpeed=[(screen.speed_m_s if screen else 0.0) * _SCALE],
-            fractionalR0=[1.0],
-            windDirection=[20],
-            altitude=[0.0],
-        )
+        telescope.pupilReflectivity = telescope.pupilReflectivity * (photons * rate / power)
+        atmosphere = import_module("OOPAO.Atmosphere").Atmosphere(telescope, **_air(config, diameter))
         atmosphere.initializeAtmosphere(telescope)
         mirror = lib.DeformableMirror(
             telescope=telescope,
             nSubap=pupil.n_sub,
             mechCoupling=config.devices.dm.coupling,
-            coordinates=actuator_positions(config) * _SCALE,
-            pitch=pitch_on_pupil(config) * _SCALE,
+            coordinates=actuator_positions(config) * scale,
+            pitch=pitch_on_pupil(config) * scale,
             print_dm_properties=False,
         )
         sensor = _sensor(config, light, pupil.n_sub)
         sensor.cam.photonNoise = True
-        sensor.cam.readoutNoise = config.twin.wfs.read_noise_e
+        sensor.cam.readoutNoise = twin.wfs.read_noise_e
     rng = np.random.default_rng(0)
     paths = 0.02 * 2 * config.devices.dm.stroke_m * rng.uniform(-1, 1, (_N_COMMANDS, mirror.nValidAct))
     turn = iter(range(1 << 62))
@@ -97,6 +84,28 @@ def oopao_frame(config: SystemConfig) -> Callable[[], object]:
             return sensor.signal
 
     return call
+
+
+def _air(config: SystemConfig, diameter: float) -> dict[str, Any]:
+    """OOPAO's words for the layers of the open air, or for the screen on the bench."""
+    air, screen = config.twin.atmosphere, config.devices.screen
+    if air is not None:
+        r0, outer, speeds = air.r0_m, air.outer_scale_m, list(air.speed_m_s)
+        fractions, directions = list(air.fraction), list(air.direction_deg)
+    else:
+        r0 = screen.screens_r0_m[screen.screen] if screen else 1.0
+        # OOPAO's is that at 500 nm.
+        r0 *= _SCALE * (500e-9 / config.system.wavelength_m) ** 1.2
+        outer, speeds = 4 * diameter, [(screen.speed_m_s if screen else 0.0) * _SCALE]
+        fractions, directions = [1.0], [20.0]
+    return {
+        "r0": r0,
+        "L0": outer,
+        "windSpeed": speeds,
+        "fractionalR0": fractions,
+        "windDirection": directions,
+        "altitude": [0.0] * len(speeds),
+    }
 
 
 def _sensor(config: SystemConfig, light: Light, n_sub: int) -> Any:

@@ -26,7 +26,7 @@ from escape_sim.pyramid import WORKERS, PyramidOptics
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
 
-_SYSTEM = "razor-pywfs"
+_SYSTEM, _TELESCOPE = "razor-pywfs", "maps-nir"
 _WAVELENGTH = 635e-9
 _RADIUS = 3.0
 _CORNERS = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
@@ -64,11 +64,18 @@ def pyramid_rows(peer: str) -> list[BenchmarkRow]:
         _square("square of 30 px images, 4 samples each", 30, 4, 64),
     )
     rows = [_kernel(case, peer) for case in cases]
-    ours_s, peer_s = alternate(twin_frame(config), oopao_frame(config), seconds=3.0)
-    peer_does = f"{peer}: atmosphere, mirror, sensor, noise"
-    note = "64 px images on 192 x 192 camera pixels, 3 lambda/D, 20 points"
-    rows.append(_rate("optics: pyramid twin frames", ours_s, peer_s, peer_does, note))
+    bench = "64 px images on 192 x 192 camera pixels, 3 lambda/D, 20 points"
+    rows.append(_frames("optics: pyramid twin frames", config, peer, bench))
+    telescope = load_system(_TELESCOPE, overrides=["twin.loss_probability=0"])
+    note = "336 actuators, 3 layers, 30 px images on 80 x 80 camera pixels, 60 samples, 3 lambda/D, 20 points"
+    rows.append(_frames(f"optics: {_TELESCOPE} twin frames", telescope, peer, note))
     return [*rows, _matrix(config, peer)]
+
+
+def _frames(stage: str, config: SystemConfig, peer: str, note: str) -> BenchmarkRow:
+    """Whole frames, from the command to the quantised image."""
+    ours_s, peer_s = alternate(twin_frame(config), oopao_frame(config), seconds=3.0)
+    return _rate(stage, ours_s, peer_s, f"{peer}: atmosphere, mirror, sensor, noise", note)
 
 
 def _matrix(config: SystemConfig, peer: str) -> BenchmarkRow:

@@ -2,13 +2,14 @@
 
 Ours and OOPAO's solve the very same matrices, of OOPAO's own sensor, which our model of a sensor of
 that shape reproduces to 1e-6; and ours also those of its own model of the bench. SPECULA's solves
-those of its own model.
+those of its own model. On the pyramid only OOPAO's stands beside ours, without noise: SPECULA's takes
+half a minute per solution there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,15 +24,22 @@ from escape_hw.calibration.sprint import sprint
 from escape_hw.config.load import load_system
 from escape_sim.benchmarks.oopao_sprint import Answer, Mirror, OopaoPeer
 from escape_sim.benchmarks.specula_sprint import MISSING, specula_peer
+from escape_sim.geometry import pitch_on_pupil, pupil_geometry
+from escape_sim.mode_surfaces import N_DERIVATIVES
 from escape_sim.model import make_model, nominal_grid
+from escape_sim.pyramid_model import nominal_pupils
 from escape_sim.slope_operator import NODES
+from escape_sim.surface_nodes import surface_nodes
 
 if TYPE_CHECKING:
+    from escape_hw.api.sensor import SensorGeometry
     from escape_hw.config.models import SystemConfig
 
 #: The paper's laboratory case, Table 1; and one whose scalings are equal, for who knows only one.
 PLANTED = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
 PLANTED_EVEN = Registration(-16.0, -71.0, -0.77, 1.45, 1.45)
+#: Sub-apertures across the pupil in which those shifts are given.
+PLANTED_SUB = 24
 #: Numbers of modes, as the paper takes and as the bench does.
 MODES = (5, 40)
 #: White noise on the matrix, relative to the median column, and how often it is drawn.
@@ -44,6 +52,11 @@ ELSE = (1.0, 2.0, 0.0)
 #: What counts as found from afar, in the units of the parameters; there is no noise in these.
 NEAR = np.array([5.0, 5.0, 0.1, 0.5, 0.5])
 _OOPAO_SENSOR = ("sensor.pitch_px=16", "sensor.spot_px=2")
+#: OOPAO's pupil images stand on a square around the middle of its grid.
+_OOPAO_PYRAMID = (
+    "devices.wfs.region=[248, 184, 144, 144]",
+    "sensor.pupils_px=[[35.5, 35.5], [107.5, 35.5], [35.5, 107.5], [107.5, 107.5]]",
+)
 _QUANTITIES = (
     ("shift", slice(0, 2), "% of a sub-aperture"),
     ("rotation", slice(2, 3), "deg"),
@@ -57,18 +70,48 @@ def run() -> list[BenchmarkRow]:
     """All rows of the stage."""
     bench = load_system("razor-shwfs")
     alike = load_system("razor-shwfs", overrides=_OOPAO_SENSOR)
-    surfaces = make_model(bench, None).influence_functions()
-    m2c = karhunen_loeve(*surfaces, max(MODES), 4 * bench.system.pupil_m)
     rows = []
-    for n_modes in MODES:
-        modes = m2c[:, :n_modes]
+    for modes in _low_modes(bench):
+        what = f"sprint, {modes.shape[1]} modes"
         oopao = OopaoPeer(alike, modes)
-        rows += _matrices(alike, oopao, n_modes)
-        rows += _times(alike, oopao, n_modes)
-        rows += _accuracy(alike, bench, oopao, n_modes)
-        rows += _from_afar(alike, oopao, n_modes)
+        rows += _matrices(alike, oopao, what)
+        rows += _times(alike, oopao, what, NOISE)
+        rows += _exact(alike, oopao, what, (("no noise, light", False),))
+        rows += _accuracy(alike, bench, oopao, what)
+        rows += _from_afar(alike, oopao, what)
         rows += _beside_specula(bench, modes)
+    return rows + pyramid_rows()
+
+
+def pyramid_rows() -> list[BenchmarkRow]:
+    """Rows of the pyramid, calm and without noise."""
+    alike = load_system("razor-pywfs", overrides=_OOPAO_PYRAMID)
+    rows = []
+    for modes in _low_modes(alike):
+        what = f"sprint, pyramid, {modes.shape[1]} modes"
+        oopao = OopaoPeer(alike, modes)
+        rows += _matrices(alike, oopao, what)
+        rows += _times(alike, oopao, what, 0.0)
+        rows += _exact(alike, oopao, what, (("no noise, light", False), ("no noise, with misfit", True)))
+        rows += _from_afar(alike, oopao, what)
     return rows
+
+
+def planted(config: SystemConfig) -> Registration:
+    """:data:`PLANTED` on the pupil of a design, in its own sub-apertures."""
+    finer = config.sensor.n_sub / PLANTED_SUB
+    return replace(PLANTED, shift_x=finer * PLANTED.shift_x, shift_y=finer * PLANTED.shift_y)
+
+
+def _low_modes(config: SystemConfig) -> list[NDArray[np.float64]]:
+    surfaces = make_model(config, None).influence_functions()
+    m2c = karhunen_loeve(*surfaces, max(MODES), 4 * config.system.pupil_m)
+    return [m2c[:, :n] for n in MODES]
+
+
+def _sensor(config: SystemConfig) -> SensorGeometry:
+    """The design's sensor, as a calibration would find it."""
+    return nominal_pupils(config) if config.sensor.kind == "pyramid" else nominal_grid(config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,13 +123,19 @@ class Ours:
 
     def solver(self, *, misfit: bool, noise: bool = True) -> Solve:
         """The model built, and the solver on it, told of the noise or of none."""
-        grid = nominal_grid(self.config)
+        grid = _sensor(self.config)
         model = make_model(self.config, grid)
 
         def solve(data: NDArray[np.float64]) -> Answer:
             sigma = np.full(data.shape, _sigma(data) if noise else 0.0, np.float32)
             matrix = InteractionMatrix(
-                data.astype(np.float32), sigma, self.m2c, grid.valid, "razor-shwfs", "push-pull", True
+                data.astype(np.float32),
+                sigma,
+                self.m2c,
+                grid.valid,
+                self.config.system.name,
+                "push-pull",
+                True,
             )
             found = sprint(matrix, model, misfit=misfit)
             return Answer(found.registration, found.converged)
@@ -104,18 +153,21 @@ def mirror(real: bool) -> Mirror:
     return Mirror(1 + gains, COUPLING if real else 0.4)
 
 
-def _matrices(config: SystemConfig, oopao: OopaoPeer, n_modes: int) -> list[BenchmarkRow]:
+def _matrices(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
     """The synthetic matrix, alone and with what a step of the descent needs."""
-    model, m2c = make_model(config, None), oopao.m2c
-    ours, theirs = modal_matrix(model, PLANTED, m2c), oopao.matrix(PLANTED, mirror(False))
+    model, m2c, at = make_model(config, None), oopao.m2c, planted(config)
+    ours, theirs = modal_matrix(model, at, m2c), oopao.matrix(at, mirror(False))
     scale = float(np.vdot(ours, theirs) / np.vdot(ours, ours))
     note = f"relative difference {np.linalg.norm(scale * ours - theirs) / np.linalg.norm(theirs):.1e}"
-    rate, what = product_rate(), f"sprint, {n_modes} modes"
     times = alternate(
-        lambda: modal_matrix(model, PLANTED, m2c), lambda: oopao.matrix(PLANTED, mirror(False)), rounds=3
+        lambda: modal_matrix(model, at, m2c),
+        # As its SPRINT makes them.
+        lambda: oopao.matrix(at, mirror(False), both_ways=False),
+        rounds=3,
     )
-    alone, whole = (1e3 * count / rate for count in _operations(config, model.n_act, n_modes))
-    with_derivatives = alternate(lambda: modal_jacobian(model, PLANTED, m2c), None, rounds=3)[0]
+    rate = product_rate()
+    alone, whole = (1e3 * count / rate for count in _operations(config, model.n_act, m2c.shape[1]))
+    with_derivatives = alternate(lambda: modal_jacobian(model, at, m2c), None, rounds=3)[0]
     matrices = 1 + 2 * len(PARAMETERS)
     rows = (
         ("synthetic matrix", times[0], times[1], alone, note),
@@ -136,6 +188,8 @@ def _matrices(config: SystemConfig, oopao: OopaoPeer, n_modes: int) -> list[Benc
 
 def _operations(config: SystemConfig, n_act: int, n_modes: int) -> tuple[int, int]:
     """Floating-point operations of a modal matrix, and of one with derivatives, as they are made."""
+    if config.sensor.kind == "pyramid":
+        return _pyramid_operations(config, n_act, n_modes)
     windows, across = nominal_grid(config).n_valid, config.sensor.n_sub + 2
     seen = (3 * NODES) ** 2
     surfaces = 2 * (across * NODES) ** 2 * n_act * n_modes + 4 * windows * seen * n_modes
@@ -145,23 +199,36 @@ def _operations(config: SystemConfig, n_act: int, n_modes: int) -> tuple[int, in
     return min(surfaces, zonal), whole
 
 
+def _pyramid_operations(config: SystemConfig, n_act: int, n_modes: int) -> tuple[int, int]:
+    """The same on a pyramid: surfaces on the nodes, then the response by the phase there."""
+    sigma = pitch_on_pupil(config) / np.sqrt(2 * np.log(1 / config.devices.dm.coupling))
+    nodes = surface_nodes(pupil_geometry(config).coordinates_m, float(sigma))[0].size ** 2
+    one = 2 * nodes * n_modes * (n_act + nominal_pupils(config).n_slopes)
+    return one, (1 + N_DERIVATIVES) * one
+
+
 def _times_of(seconds: float | None, factor: float) -> float | None:
     return None if seconds is None else factor * seconds
 
 
-def _times(config: SystemConfig, oopao: OopaoPeer, n_modes: int) -> list[BenchmarkRow]:
-    ours, what = Ours(config, oopao.m2c), f"sprint, {n_modes} modes"
-    data = _draws(oopao.matrix(PLANTED, mirror(False)))[0]
-    who, note = f"{oopao.name}, 6 iterations", f"OOPAO's matrix, {NOISE:.0%} noise"
+def _times(config: SystemConfig, oopao: OopaoPeer, what: str, noise: float) -> list[BenchmarkRow]:
+    ours, noisy = Ours(config, oopao.m2c), noise > 0
+    data = oopao.matrix(planted(config), mirror(False))
+    if noisy:
+        data = _draws(data)[0]
+    who, note = f"{oopao.name}, 6 iterations", f"OOPAO's matrix, {noise:.0%} noise"
     set_up = alternate(lambda: make_model(config, None), oopao.set_up, rounds=2)
-    light, full = ours.solver(misfit=False), ours.solver(misfit=True)
+    wide_up = alternate(lambda: list(make_model(config, None).variants()), None, rounds=2)[0]
+    light, full = (ours.solver(misfit=misfit, noise=noisy) for misfit in (False, True))
     solve = alternate(lambda: light(data), lambda: oopao.solve(data), rounds=3)
     wide = alternate(lambda: full(data), None, rounds=3)[0]
+    theirs = _sum(set_up[1], solve[1])
     timed = (
         ("set-up", *set_up, "mirror, sensor and telescope exist already"),
         ("one solution, light", *solve, note),
         ("one solution, with misfit", wide, solve[1], note),
-        ("set-up and solution, light", set_up[0] + solve[0], _sum(set_up[1], solve[1]), note),
+        ("set-up and solution, light", set_up[0] + solve[0], theirs, note),
+        ("set-up and solution, with misfit", wide_up + wide, theirs, note),
     )
     return [BenchmarkRow(f"{what}: {label}", a, b, who, "s", "lower", text) for label, a, b, text in timed]
 
@@ -170,49 +237,59 @@ def _sum(a: float | None, b: float | None) -> float | None:
     return None if a is None or b is None else a + b
 
 
-def _accuracy(alike: SystemConfig, bench: SystemConfig, oopao: OopaoPeer, n_modes: int) -> list[BenchmarkRow]:
-    """Errors on OOPAO's matrices, and each on its own."""
+def _exact(
+    config: SystemConfig, oopao: OopaoPeer, what: str, cases: Sequence[tuple[str, bool]]
+) -> list[BenchmarkRow]:
+    """Errors on a matrix of OOPAO's without noise, for solvers with a label and with misfit or not."""
     oopao.set_up()
-    light, full = (Ours(alike, oopao.m2c).solver(misfit=misfit) for misfit in (False, True))
-    exact = Ours(alike, oopao.m2c).solver(misfit=False, noise=False)
-    own = Ours(bench, oopao.m2c)
-    who, rows = f"{oopao.name}, 6 iterations", []
-    ideal, real = (oopao.matrix(PLANTED, mirror(kind)) for kind in (False, True))
-    for matrices, cases in (
-        ([ideal], (("no noise, light", exact),)),
-        (_draws(ideal), (("ideal mirror, light", light), ("ideal mirror, with misfit", full))),
-        (_draws(real), (("real mirror, light", light), ("real mirror, with misfit", full))),
-    ):
-        theirs = _errors(oopao.solve, matrices, PLANTED)
-        for label, solve in cases:
-            rows += _error_rows(n_modes, label, _errors(solve, matrices, PLANTED), theirs, who)
-        if matrices[0] is not ideal and "ideal" in cases[0][0]:
-            mine = _errors(own.solver(misfit=False), _draws(own.matrix(PLANTED)), PLANTED)
-            rows += _error_rows(n_modes, "ideal mirror, each its own sensor", mine, theirs, who)
+    at, ours = planted(config), Ours(config, oopao.m2c)
+    matrix = [oopao.matrix(at, mirror(False))]
+    theirs, rows = _errors(oopao.solve, matrix, at), []
+    for label, misfit in cases:
+        mine = _errors(ours.solver(misfit=misfit, noise=False), matrix, at)
+        rows += _error_rows(what, label, mine, theirs, f"{oopao.name}, 6 iterations")
     return rows
 
 
-def _from_afar(config: SystemConfig, oopao: OopaoPeer, n_modes: int) -> list[BenchmarkRow]:
+def _accuracy(alike: SystemConfig, bench: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
+    """Errors on OOPAO's noisy matrices, and each on its own."""
+    light, full = (Ours(alike, oopao.m2c).solver(misfit=misfit) for misfit in (False, True))
+    own = Ours(bench, oopao.m2c)
+    who, rows = f"{oopao.name}, 6 iterations", []
+    for kind in ("ideal", "real"):
+        matrices = _draws(oopao.matrix(PLANTED, mirror(kind == "real")))
+        theirs = _errors(oopao.solve, matrices, PLANTED)
+        for label, solve in (("light", light), ("with misfit", full)):
+            mine = _errors(solve, matrices, PLANTED)
+            rows += _error_rows(what, f"{kind} mirror, {label}", mine, theirs, who)
+        if kind == "ideal":
+            mine = _errors(own.solver(misfit=False), _draws(own.matrix(PLANTED)), PLANTED)
+            rows += _error_rows(what, "ideal mirror, each its own sensor", mine, theirs, who)
+    return rows
+
+
+def _from_afar(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
     """How many far registrations are found, and how many wrong ones are vouched for."""
     light = Ours(config, oopao.m2c).solver(misfit=False, noise=False)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
-    planted = [
+    # The same share of the pupil on every sensor.
+    near = NEAR * ([config.sensor.n_sub / PLANTED_SUB] * 2 + [1] * 3)
+    places = [
         Registration(pitch * p * np.cos(np.deg2rad(way)), pitch * p * np.sin(np.deg2rad(way)), *ELSE)
         for p in PITCHES
         for way in DIRECTIONS
     ]
     found, wrong = np.zeros(2, int), np.zeros(2, int)
-    for registration in planted:
+    for registration in places:
         data = oopao.matrix(registration, mirror(False))
         for k, answer in enumerate((light(data), oopao.solve(data, 10))):
             error = np.abs(answer.registration.to_array() - registration.to_array())
-            right = bool((error < NEAR).all())
+            right = bool((error < near).all())
             found[k] += right and answer.valid
             wrong[k] += answer.valid and not right
     who = f"{oopao.name}, 10 iterations"
     note = f"shifts of {PITCHES[0]} to {PITCHES[-1]} actuator pitches, turned and scaled; no noise"
-    unit = f"of {len(planted)}"
-    what = f"sprint, {n_modes} modes"
+    unit = f"of {len(places)}"
     return [
         BenchmarkRow(f"{what}: found from afar", int(found[0]), int(found[1]), who, unit, "higher", note),
         BenchmarkRow(
@@ -223,23 +300,22 @@ def _from_afar(config: SystemConfig, oopao: OopaoPeer, n_modes: int) -> list[Ben
 
 def _beside_specula(config: SystemConfig, modes: NDArray[np.float64]) -> list[BenchmarkRow]:
     ours = Ours(config, modes)
-    light, n_modes = ours.solver(misfit=False), modes.shape[1]
+    light, what = ours.solver(misfit=False), f"sprint, {modes.shape[1]} modes"
     mine = _draws(ours.matrix(PLANTED_EVEN))
     peer = specula_peer(config, modes, make_model(config, None))
     label, note = "each its own sensor, light", "one scaling planted; SPECULA knows no more"
     if peer is None:
         seconds = alternate(lambda: light(mine[0]), None, rounds=2)[0]
-        what = f"sprint, {n_modes} modes: {label}"
-        return [BenchmarkRow(what, seconds, None, "SPECULA", "s", "lower", MISSING)]
+        return [BenchmarkRow(f"{what}: {label}", seconds, None, "SPECULA", "s", "lower", MISSING)]
     theirs = _draws(peer.matrix(PLANTED_EVEN))
     times = alternate(lambda: light(mine[0]), lambda: peer.solve(theirs[0]), rounds=2)
     who = f"{peer.name}, 6 iterations"
-    rows = [BenchmarkRow(f"sprint, {n_modes} modes: {label}", *times, who, "s", "lower", note)]
+    rows = [BenchmarkRow(f"{what}: {label}", *times, who, "s", "lower", note)]
     errors = [_errors(solve, data, PLANTED_EVEN) for solve, data in ((light, mine), (peer.solve, theirs))]
     for e in errors:
         # Two scalings against one: their mean is what compares.
         e[:, 3:] = e[:, 3:].mean(axis=1, keepdims=True)
-    return rows + _error_rows(n_modes, label, errors[0], errors[1], who)
+    return rows + _error_rows(what, label, errors[0], errors[1], who)
 
 
 def _draws(matrix: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -259,12 +335,12 @@ def _errors(
 
 
 def _error_rows(
-    n_modes: int, label: str, ours: NDArray[np.float64], theirs: NDArray[np.float64], who: str
+    what: str, label: str, ours: NDArray[np.float64], theirs: NDArray[np.float64], who: str
 ) -> list[BenchmarkRow]:
     note = f"rms over {len(ours)} draws of {NOISE:.0%} noise" if len(ours) > 1 else "the paper's registration"
     rows = []
-    for what, which, unit in _QUANTITIES:
+    for quantity, which, unit in _QUANTITIES:
         rms = [float(np.sqrt(np.mean(np.square(e[:, which])))) for e in (ours, theirs)]
-        stage = f"sprint, {n_modes} modes: error of {what}, {label}"
+        stage = f"{what}: error of {quantity}, {label}"
         rows.append(BenchmarkRow(stage, rms[0], rms[1], who, unit, "lower", note))
     return rows
