@@ -31,14 +31,27 @@ class Linearised(Protocol):
         ...
 
 
-def nearness(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """How near valid sub-apertures are to each other ``(n_valid, n_valid)``.
+def _windows(valid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How near rows and columns are to each other: 1, falling to 0 at half the larger side of ``valid``."""
+    reach = max(valid.shape) / 2
+    rows, columns = (np.arange(n, dtype=float) for n in valid.shape)
+    down, right = (np.maximum(1 - np.abs(at[:, None] - at) / reach, 0.0) for at in (rows, columns))
+    return down, right
 
-    1 in one place, falling linearly along rows and along columns to 0 at half the larger side of ``valid``.
-    """
+
+def _gathered(valid: NDArray[np.bool_], scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums of scores ``(n, n_valid)`` over sub-apertures by nearness; along rows, then along columns."""
+    down, right = _windows(valid)
+    maps = np.zeros((len(scores), *valid.shape))
+    maps[:, valid] = scores
+    return np.asarray((down @ maps @ right)[:, valid])
+
+
+def _nearness(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """How near valid sub-apertures are to each other ``(n_valid, n_valid)``, 1 in one place."""
+    down, right = _windows(valid)
     rows, columns = np.nonzero(valid)
-    down, right = (np.abs(at[:, None] - at[None, :]) / (max(valid.shape) / 2) for at in (rows, columns))
-    return np.asarray(np.maximum(1 - down, 0.0) * np.maximum(1 - right, 0.0))
+    return np.asarray(down[np.ix_(rows, rows)] * right[np.ix_(columns, columns)])
 
 
 def sandwich(
@@ -64,17 +77,21 @@ def sandwich(
         Covariance of the slopes' noise ``(n_slopes, n_slopes)`` up to a factor, where it is known.
     """
     bread = np.linalg.inv(system.information())
-    scores, near = system.efficient(), nearness(weighted.valid)
+    scores, valid = system.efficient(), weighted.valid
     each = scores * system.residual
     # Slopes along x and along y of one sub-aperture stand in one place.
     by_place = each.sum(axis=2).reshape(len(each), 2, -1).sum(axis=1)
-    meat = by_place @ near @ by_place.T
+    meat = by_place @ _gathered(valid, by_place).T
     if noise is None:
         by_mode = each.sum(axis=1)
         meat += by_mode @ by_mode.T
     else:
         # What is near is in the scatter already.
-        whole = (1 - np.tile(near, (2, 2))) * noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
+        whole = (
+            (1 - np.tile(_nearness(valid), (2, 2)))
+            * noise
+            / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
+        )
         spread = np.matmul(whole, scores).reshape(len(scores), -1)
         # Only what adds to the errors counts: negative correlations are too uncertain to trade on.
         shares, directions = np.linalg.eigh(scores.reshape(len(scores), -1) @ spread.T)
