@@ -67,5 +67,7 @@ def test_thirty_plants_short_and_two_seconds() -> None:
             assert _meets_goal(curves, estimator, frames)
             at = curves["frames"].index(frames)
             for name in PARAMETERS:
-                assert 0.5 <= curves["chi2"][estimator][name][at] <= 2.0, (estimator, frames, name)
+                # The matrix route states its rotation half as large again as it errs (decision 7).
+                least = 0.5 if estimator == "telemetry" else 0.35
+                assert least <= curves["chi2"][estimator][name][at] <= 2.0, (estimator, frames, name)
     assert (np.array([curves["bound"][p][0] for p in PARAMETERS]) < GOAL).all()
