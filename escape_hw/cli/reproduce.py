@@ -90,8 +90,6 @@ def sky_time(
             system, plants=plants, frames=counts, overrides=set or [], workers=workers
         )
         curves, stop = one.attempt(procedure)
-        if stop is not None:
-            raise stop
         head = documents.head("reproduce sky-time", config.system.name, True, config.system.seed)
         one.show(_curves_table(campaign.rows(curves)))
         least = ", ".join(f"{name}: {n or 'none of these'}" for name, n in curves["fewest_frames"].items())
@@ -100,6 +98,8 @@ def sky_time(
             one.tell(curves["note"])
         met = "note" not in curves and curves["fewest_frames"]["telemetry"] is not None
         one.result({**head, **curves}, met=met)
+        if stop is not None:
+            raise stop
 
 
 def _curves_table(rows: Any) -> Any:

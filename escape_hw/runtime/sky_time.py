@@ -24,7 +24,7 @@ from escape_hw.calibration.sprint import sprint
 from escape_hw.config.device_models import DeviceConfig
 from escape_hw.config.load import load_system, load_text
 from escape_hw.config.models import SystemConfig
-from escape_hw.errors import CalibrationError, TooFewFrames
+from escape_hw.errors import Aborted, CalibrationError, TooFewFrames
 from escape_hw.runtime.system import System
 
 #: Half ranges of the random plants, in the units of the registration.
@@ -149,13 +149,15 @@ def sky_time(
     Returns
     -------
     dict
-        See :func:`summary`. When a process died, it is about the plants that were finished by then,
-        and ``note`` says so.
+        See :func:`summary`. When a process died, or the campaign was stopped, it is about the plants
+        that were finished by then, and ``note`` says so.
 
     Raises
     ------
     CalibrationError
         A process died before any plant was finished.
+    Aborted
+        Stopped before any plant was finished.
     """
     report = Reporter("sky time", plants, "plant")
     done: list[PlantErrors] = []
@@ -176,6 +178,10 @@ def sky_time(
             if died:
                 # What ended at the same time has been taken already; the others never will.
                 break
+    except Aborted:
+        if not done:
+            raise
+        return {**summary(done, frames), "note": f"stopped after {len(done)} of {plants} plants"}
     finally:
         _end(pool)
     curves = summary(done, frames) if done else None

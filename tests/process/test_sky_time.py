@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import pytest
 
 from escape_hw.api.procedure import run
 from escape_hw.config.load import load_system
-from escape_hw.errors import CalibrationError
+from escape_hw.errors import Aborted, CalibrationError
 from escape_hw.runtime import sky_time as campaign
 from escape_hw.runtime.sky_time import PlantErrors, sky_time, twins_of
 
@@ -26,6 +28,8 @@ def plant(system: str, number: int, frames: Any, overrides: Any) -> PlantErrors:
         while len(list(Path(overrides[0]).iterdir())) < int(system):
             pass
         os.kill(os.getpid(), signal.SIGKILL)
+    if int(system) == 100:
+        time.sleep(0.1)
     (Path(overrides[0]) / str(number)).touch()
     small = np.full((len(campaign.ESTIMATORS), len(frames), 5), 0.001)
     return PlantErrors(small, small, small[0, 0])
@@ -56,6 +60,21 @@ def test_a_campaign_without_accidents_has_no_note(tmp_path):
     curves = run(sky_time("5", plants=5, frames=FRAMES, overrides=[str(tmp_path)]))
     assert curves["plants"] == 5
     assert "note" not in curves
+
+
+def test_stopped_it_keeps_the_finished_plants(tmp_path):
+    stop = threading.Event()
+
+    def watch(progress: Any) -> None:
+        if progress.done >= 2:
+            stop.set()
+
+    slow = sky_time("100", plants=60, frames=FRAMES, overrides=[str(tmp_path)], workers=1)
+    with pytest.raises(Aborted) as caught:
+        run(slow, observers=(watch,), abort=stop)
+    curves = caught.value.partial
+    assert 2 <= curves["plants"] < 60
+    assert curves["note"] == f"stopped after {curves['plants']} of 60 plants"
 
 
 def test_an_error_in_a_plant_is_told(monkeypatch, tmp_path):
