@@ -32,7 +32,7 @@ def _rows(layout: str) -> list[list[bool]]:
 
 
 def _parse(layout: str) -> tuple[str, int]:
-    if not re.match(PATTERN, layout):
+    if not re.fullmatch(PATTERN, layout):
         known = ", ".join(f"'rings-{n}'" for n in RINGS)
         raise ValueError(f"layout {layout!r} is none of 'circle-N', 'square-N', {known}")
     kind, size = layout.split("-")

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-_BARE_KEY = re.compile(r"^[A-Za-z0-9_-]+$")
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _SHORT = {"\b": "\\b", "\t": "\\t", "\n": "\\n", "\f": "\\f", "\r": "\\r", '"': '\\"', "\\": "\\\\"}
 
 
@@ -36,7 +36,7 @@ def _lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
 
 def format_key(key: str) -> str:
     """A key, quoted when it must be."""
-    return key if _BARE_KEY.match(key) else _quote(key)
+    return key if _BARE_KEY.fullmatch(key) else _quote(key)
 
 
 def format_value(value: Any) -> str:

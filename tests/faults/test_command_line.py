@@ -10,6 +10,7 @@ import pytest
 from small_bench import SMALL, configuration
 
 from escape_hw import register_device
+from escape_hw.config import registry
 from escape_hw.cli import main
 from escape_hw.io.fits import load_matrix, save_matrix
 from escape_hw.io.provenance import Provenance
@@ -178,7 +179,8 @@ def test_truncated_and_flipped_products(run, system, im, command, tmp_path):
         refused(bytes(flipped))
 
 
-def test_a_dead_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path):
+def test_a_dead_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "_OWN", {})
     opened = []
 
     def dying_camera(name, config, shared):

@@ -339,6 +339,13 @@ def changed(draw: st.DrawFn) -> SystemConfig:
     return SystemConfig.model_validate(config)
 
 
+def test_a_key_that_ends_with_a_line_end_is_quoted() -> None:
+    document = load_system("razor-shwfs").model_dump(by_alias=True)
+    document["devices"]["wfs"]["options"] = {"0\n": "", "a b": 1, "c": "d"}
+    config = SystemConfig.model_validate(document)
+    assert load_text(config.to_toml()) == config
+
+
 @given(changed())
 def test_text_of_any_configuration_round_trips(config: SystemConfig) -> None:
     text = config.to_toml()
