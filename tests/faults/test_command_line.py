@@ -10,8 +10,8 @@ import pytest
 from small_bench import SMALL, configuration
 
 from escape_hw import register_device
-from escape_hw.config import registry
 from escape_hw.cli import main
+from escape_hw.config import registry
 from escape_hw.io.fits import load_matrix, save_matrix
 from escape_hw.io.provenance import Provenance
 from escape_hw.testing import FaultyCamera, FaultyMirror
