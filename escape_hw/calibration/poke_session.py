@@ -65,7 +65,8 @@ class PokeSession:
     fed: int = 0
     shortened: int = 0
     planned: int = 0
-    looked: dict[int, tuple[NDArray[np.floating], int]] = field(default_factory=dict)
+    long_look: bool = False
+    looked: dict[int, tuple[NDArray[np.float64], int]] = field(default_factory=dict)
     kept: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] = field(default_factory=list)
 
     def poke(self, frames: int, amplitude: NDArray[np.float64]) -> Procedure[bool]:
@@ -125,7 +126,7 @@ class PokeSession:
             mean = (total / len(self.waiting)).astype(np.float32)
             setup = setup_from_frames(self.bench, mean)
             self.grid, self.mean_frame = setup.grid, setup.mean_frame
-        self.slopes_of = extractor(self.bench, self.grid)
+        self.slopes_of, self.long_look = extractor(self.bench, self.grid), kind_of(self.bench).long_look
         self.motion, self.light = Motion(self.grid.n_slopes), LightWatch(self.bench.wfs.name, self.grid)
         if self.mean_frame is not None and isinstance(self.grid, SubApertureGrid):
             self.focus = MeanFocus(self.grid, self.bench.wfs.settings.frame_rate_hz)
@@ -163,15 +164,23 @@ class PokeSession:
         self.motion.add(slopes)
         if self.focus is not None:
             self.focus.add(slopes)
-        if kind_of(self.bench).long_look:
-            part = min(self.fed * _LOOKS // max(self.planned, 1), _LOOKS - 1)
-            total, count = self.looked.get(part, (np.zeros(frame.data.shape), 0))
-            self.looked[part] = total + frame.data, count + 1
+        if self.long_look:
+            self._look(frame)
         self.fed += 1
         if self.estimator is not None:
             self.estimator.partial_fit(frame.index, slopes, poke)
         if self.keep:
             self.kept.append((frame.index, slopes, poke))
+
+    def _look(self, frame: Frame) -> None:
+        """Add a frame to the sum of its part of the run."""
+        part = min(self.fed * _LOOKS // max(self.planned, 1), _LOOKS - 1)
+        if part not in self.looked:
+            self.looked[part] = frame.data.astype(np.float64), 1
+            return
+        total, count = self.looked[part]
+        total += frame.data
+        self.looked[part] = total, count + 1
 
     def record(self) -> Record | None:
         """Frame indices ``(n,)``, slopes ``(n, n_slopes)`` and pokes ``(n, n_modes)``, if they were kept."""

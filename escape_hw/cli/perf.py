@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from escape_hw.cli.perf_page import check_page, conditions, write_page
+from escape_hw.cli.perf_page import COLUMNS, cells, check_page, conditions, write_page
 from escape_hw.cli.session import session
 from escape_hw.errors import ConfigError
 
@@ -89,19 +89,10 @@ def perf(
 def _table(rows: Sequence[BenchmarkRow]) -> Table:
     from rich.table import Table
 
-    table = Table("stage", "ours", "peer", "unit", "times better", "of floor", "peer is", "note")
+    table = Table(*COLUMNS)
     for column in table.columns[1:3]:
         column.justify = "right"
     table.columns[4].justify = table.columns[5].justify = "right"
     for row in rows:
-        table.add_row(
-            row.stage,
-            f"{row.ours:.4g}",
-            "-" if row.peer is None else f"{row.peer:.4g}",
-            row.unit,
-            "-" if row.ratio is None else f"{row.ratio:.2f}",
-            "-" if row.reached is None else f"{row.reached:.0%}",
-            row.peer_name,
-            row.note,
-        )
+        table.add_row(*cells(row))
     return table

@@ -15,6 +15,8 @@ from escape_hw.errors import ConfigError
 if TYPE_CHECKING:
     from escape_hw.api.benchmark import BenchmarkRow
 
+#: Headings of a table of measurements; :func:`cells` fills a row.
+COLUMNS = ("stage", "ours", "peer", "unit", "times better", "of floor", "peer is", "note")
 #: What is measured stands between these lines; what stands around them is prose and stays.
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 _PACKAGES = ("escape-hw", "numpy", "scipy", "numba", "OOPAO", "pyrtcao", "specula", "synim")
@@ -74,6 +76,20 @@ def write_page(page: Path, rows: Sequence[BenchmarkRow], at: dict[str, Any]) -> 
     page.write_text(f"{before}{BEGIN}\n\n{render(rows, at)}\n{END}{after}", encoding="utf-8")
 
 
+def cells(row: BenchmarkRow) -> tuple[str, ...]:
+    """A measurement in words, by :data:`COLUMNS`."""
+    return (
+        row.stage,
+        f"{row.ours:.4g}",
+        "-" if row.peer is None else f"{row.peer:.4g}",
+        row.unit,
+        "-" if row.ratio is None else f"{row.ratio:.2f}",
+        "-" if row.reached is None else f"{row.reached:.0%}",
+        row.peer_name,
+        row.note,
+    )
+
+
 def render(rows: Sequence[BenchmarkRow], at: dict[str, Any]) -> str:
     """Conditions and table as Markdown."""
     versions = ", ".join(f"{name} {number}" for name, number in at["versions"].items() if number)
@@ -82,19 +98,9 @@ def render(rows: Sequence[BenchmarkRow], at: dict[str, Any]) -> str:
         f"{at['date']}, {at['processor']}, {at['cores']} cores, load average {at['load']} at the end; "
         f"Python {at['python']}, {versions}." + (f" Not installed: {', '.join(missing)}." if missing else ""),
         "",
-        "| stage | ours | peer | unit | times better | of floor | peer is | note |",
+        "| " + " | ".join(COLUMNS) + " |",
         "|---|---:|---:|---|---:|---:|---|---|",
     ]
     for row in rows:
-        cells = (
-            row.stage,
-            f"{row.ours:.4g}",
-            "-" if row.peer is None else f"{row.peer:.4g}",
-            row.unit,
-            "-" if row.ratio is None else f"{row.ratio:.2f}",
-            "-" if row.reached is None else f"{row.reached:.0%}",
-            row.peer_name,
-            row.note,
-        )
-        lines.append("| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |")
+        lines.append("| " + " | ".join(cell.replace("|", "/") for cell in cells(row)) + " |")
     return "\n".join(lines) + "\n"

@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.pipeline.frame_slopes import FrameSlopes
 
 
 def slopes_of_image(image: NDArray[Any], pupils: PyramidPupils) -> NDArray[np.float64]:
@@ -76,7 +77,7 @@ def quad_cells(frame, gain, offset, corners, runs, zero_points, local, slopes, f
         slopes[n + k] = slopes[n + k] * inverse - lit * zero_points[n + k]
 
 
-class PyramidSlopes:
+class PyramidSlopes(FrameSlopes[PyramidPupils]):
     """Slopes of one set of pupil images on one camera region.
 
     Parameters
@@ -104,50 +105,22 @@ class PyramidSlopes:
         dark: NDArray[np.float32] | None = None,
         flat: NDArray[np.float32] | None = None,
     ) -> None:
+        super().__init__(grid, shape, dark, flat)
         n = grid.valid.shape[0]
-        self.grid, self.shape = grid, shape
-        self.dark = np.zeros(shape, np.float32) if dark is None else np.ascontiguousarray(dark, np.float32)
-        response = np.ones(shape, np.float32) if flat is None else np.asarray(flat, np.float32)
-        if self.dark.shape != shape or response.shape != shape:
-            raise ValueError(
-                f"dark {self.dark.shape} and flat {response.shape} must have the region's {shape}"
-            )
-        if not (response > 0).all():
-            raise ValueError("the flat has pixels that are not positive")
         if (grid.corners_px < 0).any() or (grid.corners_px + n > np.array(shape[::-1])).any():
             raise ValueError(f"the pupil images of {n} pixels leave the region {shape}")
-        self._gain = np.ascontiguousarray(1 / response)
-        self._offset = np.ascontiguousarray(self.dark * self._gain)
         self._corners = (grid.corners_px[:, 1] * shape[1] + grid.corners_px[:, 0]).astype(np.uint64)
         self._runs = _runs(grid.valid, shape[1])
         self._zero_points = np.ascontiguousarray(grid.references.T, np.float32).ravel()
         self._local = grid.normalisation == "local"
-        self._light = np.empty(grid.n_valid, np.float32)
 
-    @property
-    def flux(self) -> NDArray[np.float32]:
-        """Light of each valid pixel in the last frame, summed over the images ``(n_valid,)``, in counts.
-
-        Overwritten by the next frame, unless that one was given a flux array of its own.
-        """
-        return self._light
-
-    def __call__(
-        self,
-        frame: NDArray[np.uint16],
-        flux: NDArray[np.float32] | None = None,
-        out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        """Slopes ``(n_slopes,)``, in ``out`` if given; ``flux (n_valid,)`` is filled when given."""
-        if frame.shape != self.shape:
-            raise ValueError(f"frame has shape {frame.shape}; the slopes were set up for {self.shape}")
-        slopes = np.empty(self.grid.n_slopes, np.float32) if out is None else out
-        light = self._light if flux is None else flux
+    def _measure(
+        self, frame: NDArray[np.uint16], slopes: NDArray[np.float32], light: NDArray[np.float32]
+    ) -> None:
         quad_cells(
             frame, self._gain, self._offset, self._corners, self._runs, self._zero_points, self._local,
             slopes, light,
         )  # fmt: skip
-        return slopes
 
 
 def _runs(valid: NDArray[np.bool_], stride: int) -> NDArray[np.int64]:

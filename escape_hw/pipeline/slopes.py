@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.pipeline.frame_slopes import FrameSlopes
 
 #: Single-precision numbers in one vector register of common processors.
 _VECTOR = 8
@@ -118,7 +119,7 @@ def centres_of_gravity(frame, gain, offset, places, weights, zero_points, slopes
             slopes[n + k] = zero
 
 
-class SlopeExtractor:
+class SlopeExtractor(FrameSlopes[SubApertureGrid]):
     """Slopes of one grid on one camera region.
 
     Parameters
@@ -149,28 +150,8 @@ class SlopeExtractor:
         flat: NDArray[np.float32] | None = None,
         threshold: float = 0.0,
     ) -> None:
-        self.grid, self.shape = grid, shape
-        self.dark = np.zeros(shape, np.float32) if dark is None else np.ascontiguousarray(dark, np.float32)
-        response = np.ones(shape, np.float32) if flat is None else np.asarray(flat, np.float32)
-        if self.dark.shape != shape or response.shape != shape:
-            raise ValueError(
-                f"dark {self.dark.shape} and flat {response.shape} must have the region's {shape}"
-            )
-        if not (response > 0).all():
-            raise ValueError("the flat has pixels that are not positive")
-        self._gain = np.ascontiguousarray(1 / response)
-        self.threshold = float(threshold)
-        self._offset = np.ascontiguousarray(self.dark * self._gain + np.float32(threshold))
-        self._light = np.empty(grid.n_valid, np.float32)
+        super().__init__(grid, shape, dark, flat, threshold)
         self._place_windows()
-
-    @property
-    def flux(self) -> NDArray[np.float32]:
-        """Light above the threshold in each window of the last frame ``(n_valid,)``, in counts.
-
-        Overwritten by the next frame, unless that one was given a flux array of its own.
-        """
-        return self._light
 
     def _place_windows(self) -> None:
         """Windows in the form that :func:`centres_of_gravity` wants."""
@@ -188,18 +169,9 @@ class SlopeExtractor:
         x, y = self.grid.references_px.T.astype(float)
         self._zero_points = np.concatenate([x, y + centres[:, 1] - top]).astype(np.float32)
 
-    def __call__(
-        self,
-        frame: NDArray[np.uint16],
-        flux: NDArray[np.float32] | None = None,
-        out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        """Slopes ``(n_slopes,)`` in pixels, in ``out`` if given; ``flux (n_valid,)`` is filled when given."""
-        if frame.shape != self.shape:
-            raise ValueError(f"frame has shape {frame.shape}; the slopes were set up for {self.shape}")
-        slopes = np.empty(self.grid.n_slopes, np.float32) if out is None else out
-        light = self._light if flux is None else flux
+    def _measure(
+        self, frame: NDArray[np.uint16], slopes: NDArray[np.float32], light: NDArray[np.float32]
+    ) -> None:
         centres_of_gravity(
             frame, self._gain, self._offset, self._places, self._weights, self._zero_points, slopes, light
         )
-        return slopes

@@ -85,15 +85,6 @@ def replaced(device: Device, hook: str, stand_in: Callable[..., Any]) -> Iterato
         delattr(device, hook)
 
 
-def closed_quietly(device: Device) -> None:
-    """Close, whatever state a failed check left the device in."""
-    try:
-        device.close()
-    except DeviceError:
-        # The check's own failure is the news; it propagates from where this is called.
-        return
-
-
 @contextmanager
 def opened(factory: Factory) -> Iterator[Any]:
     """Give a fresh device, open; close it afterwards without hiding a failure of the check."""
@@ -101,7 +92,11 @@ def opened(factory: Factory) -> Iterator[Any]:
     device.open()
     try:
         yield device
-    except BaseException:
-        closed_quietly(device)
+    except BaseException as failure:
+        # The check's own failure is the news; that the device did not close either stands beside it.
+        try:
+            device.close()
+        except DeviceError as second:
+            failure.add_note(f"and then it did not close: {type(second).__name__}: {second}")
         raise
     device.close()
