@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from escape_hw.api.frames import CameraSettings, Region
 from escape_hw.api.mirror import DMInfo
 from escape_hw.config import layouts
+from escape_hw.config.modulator_models import StageConfig, WireConfig
 from escape_hw.config.section import Breach, Listed, Section, enforce
 from escape_hw.safety.limits import MirrorLimits
 
@@ -188,6 +189,8 @@ class ModulatorConfig(DeviceConfig):
     max_tilt_rad: float = Field(
         gt=0, le=0.1, description="largest tilt of the mirror from its centre, radians"
     )
+    wire: WireConfig = Field(default_factory=WireConfig, description="connection of the real controller")
+    stage: StageConfig = Field(default_factory=StageConfig, description="axes of the real stage")
 
 
 class ScreenConfig(DeviceConfig):
