@@ -1,4 +1,4 @@
 """Drivers of real hardware, found by the core through the ``escape.devices`` entry points.
 
-No driver is part of this version: bundled systems run on their twins (``mode = "sim"``).
+No driver loads its vendor's library before its device is opened.
 """
