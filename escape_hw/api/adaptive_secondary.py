@@ -222,9 +222,21 @@ class AdaptiveSecondary(DeformableMirror):
             self.go(ShellState.RUNNING)
 
     def _before_close(self) -> None:
-        super()._before_close()
+        end = ShellState.SET if self.leave_set else ShellState.RESTED
+        try:
+            super()._before_close()
+        except DeviceError as error:
+            # A shell that cannot be flattened is better at rest than afloat with nobody there.
+            self._tidy(lambda: self._lower(end), error)
+            raise
         if self._state() in (ShellState.SET, ShellState.RUNNING):
-            self.go(ShellState.SET if self.leave_set else ShellState.RESTED)
+            self.go(end)
+
+    def _lower(self, end: ShellState) -> None:
+        """Step down to a state without asking for a shape."""
+        for state in reversed(LADDER[LADDER.index(end) : -1]):
+            if self._state() in LADDER[LADDER.index(state) + 1 :]:
+                self._step(state)
 
     @final
     def _send(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -66,6 +66,8 @@ class AsmBody:
         self.contaminated, self.disabled = set(contaminated), set[int]()
         self.parameters = {"telemetry_hz": 10.0, "gap_alarm_m": GAP_ALARMS_M[1]}
         self.applied = self.skipped = self.skips_in_a_row = 0
+        #: So many commands to come are skipped whatever they are.
+        self.to_skip = 0
         self.holding = False
         #: Why the mirror rested or opened the loop by itself, for who sends it commands afterwards.
         self.note = ""
@@ -138,15 +140,16 @@ class AsmBody:
         wanted[idle] = 0.0
         too_far = np.abs(wanted).max() > self.limits.max_command_m * (1 + _ROUNDING)
         too_fast = np.abs(wanted - self.present_m).max() > self.limits.max_step_m * (1 + _ROUNDING)
-        if too_far or too_fast:
-            return self.skip(), 0
+        if too_far or too_fast or self.to_skip:
+            self.to_skip = max(0, self.to_skip - 1)
+            return self._skip(), 0
         self.skips_in_a_row = 0
         self.applied += 1
         self.present_m = wanted
         self.shell.drive((self.flat_m + wanted) / self.shell.stroke_m)
         return (w.CLIPPED if idle else w.APPLIED), len(idle)
 
-    def skip(self) -> int:
+    def _skip(self) -> int:
         """Count a skipped command; the last shape stays."""
         self.skipped += 1
         self.skips_in_a_row += 1

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _CONTROL, _TELEMETRY = 0, 1
 _ABSOLUTE = 0
-_OF_THE_MIRROR = ("skip", "dust", "stuck", "overcurrent", "watchdog", "trip")
+_OF_THE_MIRROR = ("skip", "dust", "stuck", "overcurrent", "watchdog", "trip", "calm")
 
 
 class Connection(asyncio.Protocol):
@@ -132,15 +132,13 @@ class Connection(asyncio.Protocol):
         if fault is not None and fault.kind in _OF_THE_MIRROR:
             self._server.afflict(fault)
         try:
-            kind, payload = self._answer(request, superseded, received_ns, fault)
+            kind, payload = self._answer(request, superseded, received_ns)
         except (ValueError, struct.error, IndexError) as error:
             kind, payload = self._refuse(request, w.BAD_LENGTH, f"{request.name} makes no sense ({error})")
         self.heard_s = time.monotonic()
         self._deliver(kind, payload, fault)
 
-    def _answer(
-        self, request: w.Request, superseded: bool, received_ns: int, fault: Fault | None
-    ) -> tuple[int, bytes]:
+    def _answer(self, request: w.Request, superseded: bool, received_ns: int) -> tuple[int, bytes]:
         low, high = self._server.versions
         if request.kind != w.HELLO and not low <= request.version <= high:
             return self._refuse(request, w.UNSUPPORTED, f"version {request.version} is not spoken here")
@@ -163,7 +161,7 @@ class Connection(asyncio.Protocol):
             return self._refuse(request, w.NOT_OWNER, f"{request.name} from who only watches")
         if superseded:
             return self._refuse(request, w.STALE, "a newer command came with it")
-        return self._obey(request, received_ns, fault)
+        return self._obey(request, received_ns)
 
     def _greet(self, request: w.Request) -> tuple[int, bytes]:
         server = self._server
@@ -186,11 +184,11 @@ class Connection(asyncio.Protocol):
         self.role = role
         return w.WELCOME, server.answers.welcome(request.sequence, version, role, token)
 
-    def _obey(self, request: w.Request, received_ns: int, fault: Fault | None) -> tuple[int, bytes]:
+    def _obey(self, request: w.Request, received_ns: int) -> tuple[int, bytes]:
         """What only the owner may ask for."""
         body, answers, echo = self._body, self._server.answers, request.sequence
         if request.kind == w.COMMAND:
-            return self._command(request, received_ns, fault)
+            return self._command(request, received_ns)
         if request.kind == w.HEARTBEAT:
             self._note(request, None)
             return w.ACK, answers.ack(echo, w.APPLIED, 0, received_ns)
@@ -230,7 +228,7 @@ class Connection(asyncio.Protocol):
             return self._refuse(request, w.BAD_LENGTH, wrong)
         return w.PARAM, self._server.answers.parameter(request.sequence, key)
 
-    def _command(self, request: w.Request, received_ns: int, fault: Fault | None) -> tuple[int, bytes]:
+    def _command(self, request: w.Request, received_ns: int) -> tuple[int, bytes]:
         body, server = self._body, self._server
         found = w.read_command(request.payload, body.shell.n_act)
         if found is None:
@@ -247,10 +245,7 @@ class Connection(asyncio.Protocol):
         if body.shell.state is not ShellState.RUNNING:
             note = body.note or f"it is {body.shell.state}"
             return self._refuse(request, w.WRONG_STATE, note, complain=not body.note)
-        if fault is not None and fault.kind == "skip":
-            result, clipped = body.skip(), 0
-        else:
-            result, clipped = body.command(metres, absolute=mode == _ABSOLUTE)
+        result, clipped = body.command(metres, absolute=mode == _ABSOLUTE)
         return w.ACK, server.answers.ack(request.sequence, result, clipped, received_ns)
 
     def _note(self, request: w.Request, what: object) -> None:

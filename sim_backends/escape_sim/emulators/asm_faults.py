@@ -12,8 +12,9 @@ KINDS = {
     "close": False, "reset": False, "silent": False,
     # To the answer of a request that was carried out.
     "delay": True, "half": False, "crc": False, "stale": False, "double": False, "garbage": False,
-    # To the mirror.
+    # To the mirror; calm ends over-currents and blindness.
     "skip": False, "dust": True, "stuck": True, "overcurrent": True, "watchdog": False, "trip": False,
+    "calm": False,
 }  # fmt: skip
 
 

@@ -115,12 +115,17 @@ class AsmServer:
     def afflict(self, fault: Fault) -> None:
         """Have a fault of the mirror itself happen."""
         body, actuator = self.body, int(fault.value)
-        if fault.kind == "dust":
+        if fault.kind == "skip":
+            body.to_skip += 1
+        elif fault.kind == "dust":
             body.contaminated.add(actuator)
         elif fault.kind == "stuck":
             body.shell.blind.add(actuator)
         elif fault.kind == "overcurrent":
             body.shell.excess_a[actuator] = 1.2
+        elif fault.kind == "calm":
+            body.shell.excess_a.clear()
+            body.shell.blind.clear()
         elif fault.kind == "watchdog":
             body.rest_by_itself("the watchdog rested it, as arranged")
         elif fault.kind == "trip":
