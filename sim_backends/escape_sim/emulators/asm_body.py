@@ -80,6 +80,11 @@ class AsmBody:
         """Contaminated or disabled actuators."""
         return self.contaminated | self.disabled
 
+    @property
+    def stepping(self) -> bool:
+        """True while a step of the ladder is on its way."""
+        return self._step is not None
+
     def ask_state(self, wanted: ShellState, now: float) -> tuple[int, str]:
         """Start a step; a result and what there is to say."""
         state = self.shell.state
