@@ -195,7 +195,7 @@ class AsmMirror(AdaptiveSecondary):
         try:
             if self._link.is_up:
                 self._ask_state()
-            elif self.is_open and time.monotonic() - self._tried_s > self._options.retry_s:
+            elif self.is_open and time.monotonic() > self._retry_at_s():
                 self._reconnect()
         except DeviceError as error:
             # Nobody is there to raise it to; the next call meets it, too.
@@ -205,6 +205,10 @@ class AsmMirror(AdaptiveSecondary):
                 log.warning(
                     "%s: went from %s to %s by itself %s", self.name, before, self._known, self._fault
                 )
+
+    def _retry_at_s(self) -> float:
+        """When a lost connection is tried again, on this computer's monotonic clock."""
+        return max(self._tried_s, self._link.heard_s) + self._options.retry_s
 
     def _reconnect(self) -> None:
         """Get a lost connection back; the mirror stays as it is, nothing is sent again."""
