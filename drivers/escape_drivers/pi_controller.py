@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from itertools import product
 from typing import TypeVar
@@ -14,11 +15,14 @@ from escape_drivers.pi_circle import Sine, Turn
 from escape_drivers.pi_errors import Refused
 from escape_drivers.pi_gcs import Garbled
 from escape_drivers.pi_link import Link
+from escape_hw.errors import DeviceError
 
 V = TypeVar("V")
 
 #: Parameter that holds the servo's period.
 _SERVO_PERIOD = 0x0E000200
+#: How often a stage on its way is asked whether it has arrived, in seconds.
+_POLL_S = 0.01
 #: Values of a line of points: the other five arguments are table, how, kind, first and number.
 _BUNCH = pi_gcs.MAX_ARGUMENTS - 5
 #: Recorder: target and current position of an axis.
@@ -115,6 +119,26 @@ class E727:
     def move(self, places: Sequence[float]) -> None:
         """Targets of both axes."""
         self._set_each("MOV", [float(place) for place in places])
+
+    def go(self, places: NDArray[np.float64], longest_s: float, sleep: Callable[[float], None]) -> None:
+        """Move both axes and wait until they are there.
+
+        Raises
+        ------
+        DeviceError
+            They are not after ``longest_s`` seconds.
+        """
+        self.move([float(place) for place in places])
+        deadline = time.monotonic() + longest_s
+        while not self.on_target():
+            if time.monotonic() > deadline:
+                here, there = (", ".join(f"{x:.2f}" for x in each) for each in (self.places(), places))
+                raise DeviceError(
+                    self.link.name,
+                    f"has not settled at {there} within {longest_s:g} s, it is at {here} (its units); "
+                    "is the platform free to move? The longest wait is devices.modulator.stage.settle_s",
+                )
+            sleep(_POLL_S)
 
     def places(self) -> list[float]:
         """Where both axes are."""
