@@ -142,13 +142,9 @@ class PiModulator(TipTiltModulator):
             here.controller.link.close()
 
     def _switch_off(self, controller: E727) -> None:
-        """Servos off and no volts, if anybody is still there to be told."""
-        if not controller.link.alive:
-            return
-        try:
+        """Servos off and no volts, unless the link has been lost before, which was told then."""
+        if controller.link.alive:
             shut_down(controller)
-        except DeviceLost as gone:
-            log.warning("%s: lost while it was switched off: %s", self.name, gone)
 
     # ------------------------------------------------------------------ the hooks
     def _check(self, want: Modulation) -> Modulation:
