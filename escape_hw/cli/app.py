@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli import calibrate, emulate, loop, perf, products, reproduce, systems
+from escape_hw.cli import calibrate, emulate, loop, modulator, perf, products, reproduce, systems
 
 app = typer.Typer(
     name="escape",
@@ -30,6 +30,7 @@ app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)
 app.command("perf")(perf.perf)
+app.add_typer(modulator.app, name="modulator")
 app.command("emulate")(emulate.emulate)
 
 

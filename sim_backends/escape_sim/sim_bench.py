@@ -163,7 +163,7 @@ class SimBench:
         """The sensor's optics, built when first used."""
         if self._sensor is None:
             self._sensor = make_sensor_optics(self.config, self.pupil)
-        circle = self.beam_circle.modulation
+        circle = self.beam_circle.state
         if circle is not self._circle_in_force:
             self._circle_in_force = circle
             if isinstance(self._sensor, ModulatedOptics):

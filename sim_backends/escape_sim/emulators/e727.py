@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.errors import ConfigError
@@ -72,11 +73,10 @@ class E727(Emulator):
         section = config.devices.modulator
         gains = np.array(section.stage.axis_gain)
 
-        def turn(samples: int) -> tuple[float, Any] | None:
-            turned = self.controller.turn(samples)
-            return None if turned is None else (turned[0], (turned[1] - centre) * urad * gains)
+        def track(places: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray((places - centre) * urad * gains)
 
-        shared_bench(config, shared).beam_circle.follow(turn)
+        shared_bench(config, shared).beam_circle.follow(self.controller.turn, track)
 
     def start(self) -> str:
         """Begin to listen; returns where."""

@@ -11,14 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_sim.emulators.e727_motion import Motion
-from escape_sim.emulators.e727_stage import SERVO_S
+from escape_sim.emulators.e727_stage import MEMORY, SERVO_S, Source, Wave
 from escape_sim.emulators.e727_state import Make, State
 from escape_sim.emulators.e727_waves import Waves
-from escape_sim.emulators.gcs_syntax import MAX_ARGUMENTS, Framer, Refusal, items, lines, number, value_text, whole
+from escape_sim.emulators.gcs_syntax import (
+    MAX_ARGUMENTS,
+    Framer,
+    Refusal,
+    items,
+    lines,
+    number,
+    value_text,
+    whole,
+)
 
 IDENTITY = "(c)2015-2018 Physik Instrumente (PI) GmbH & Co. KG, E-727.3SDA, {serial}, 14.11.01.05 emulated"
 Handler = Callable[[Sequence[str]], str | None]
-_RECORDING_STARTS = ("STE", "IMP", "WGR")
+#: Points of a turn that optics are told.
+_SAMPLES = 256
 
 
 class Controller:
@@ -40,6 +50,7 @@ class Controller:
         self.seen: list[str] = []
         self._framer = Framer()
         self._unasked = ""
+        self._turned: tuple[int, list[Source], tuple[float, NDArray[np.float64]] | None] | None = None
         self._connect()
 
     def _connect(self) -> None:
@@ -50,7 +61,8 @@ class Controller:
         self._handlers: dict[str, Handler] = {
             "*IDN?": self._identity, "CSV?": lambda _: "2.0\n", "SAI?": self._axes, "HLP?": self._help,
             "HPA?": self._parameter_list, "VER?": lambda _: "FW_DSP: 14.11.01.05\n", "CST?": self._stages,
-            "IFC?": lambda _: "RSBAUD=115200\n", "CCL": self._set_level, "CCL?": lambda _: f"{self.state.level}\n",
+            "IFC?": lambda _: "RSBAUD=115200\n",
+            "CCL": self._set_level, "CCL?": lambda _: f"{self.state.level}\n",
             "SPA": self._set_parameter, "SPA?": self._parameters, "WPA": self._save, "RBT": self._reboot,
             "SVO": motion.servo, "SVO?": motion.servos, "SVA": motion.volts, "SVA?": motion.voltages,
             "VOL?": motion.voltages, "ATZ": motion.auto_zero, "ATZ?": motion.is_zeroed, "MOV": motion.move,
@@ -63,7 +75,8 @@ class Controller:
             "WGO": waves.go, "WGO?": waves.modes, "WGR": self._record, "STE": self._step_response,
             "IMP": self._step_response, "TWC": waves.clear_trigger, "TWS": waves.set_trigger,
             "CTO": waves.set_output, "CTO?": waves.output, "DRC": recorder.configure,
-            "DRC?": recorder.configuration, "DRT": recorder.set_trigger, "DRT?": lambda _: f"0={recorder.trigger} 0\n",
+            "DRC?": recorder.configuration, "DRT": recorder.set_trigger,
+            "DRT?": lambda _: f"0={recorder.trigger} 0\n",
             "RTR": recorder.set_rate, "RTR?": lambda _: f"{recorder.rate}\n",
             "TNR?": lambda _: f"{len(recorder.sources)}\n", "DRL?": recorder.lengths, "DRR?": recorder.read,
         }  # fmt: skip
@@ -75,7 +88,7 @@ class Controller:
             return list(self._framer.feed(data))
 
     def answer(self, line: str | None) -> bytes:
-        """Carry out a command (``None``: a line that was too long); returns its reply, empty if none is due."""
+        """Carry out a command (``None``: a line that was too long); returns its reply, empty if none."""
         with self.lock:
             return self._answer(line)
 
@@ -96,7 +109,7 @@ class Controller:
             return self._refuse(line, refusal)
 
     def _refuse(self, line: str, refusal: Refusal) -> bytes:
-        """Remember the error; every refusal is one that a careful driver would have foreseen, a stop is not."""
+        """Remember the error. A careful driver foresees every refusal; a stop is none."""
         self.state.error = refusal.number
         if refusal.number != 10:
             self.state.complain(f"{line}: {refusal}")
@@ -145,10 +158,14 @@ class Controller:
         return lines(["1", "2", "3"])
 
     def _help(self, args: Sequence[str]) -> str:
-        return lines(["The following commands are valid:", *sorted([*self._handlers, "ERR?", "#5", "#7", "#9", "#24"])])
+        return lines(
+            ["The following commands are valid:", *sorted([*self._handlers, "ERR?", "#5", "#7", "#9", "#24"])]
+        )
 
     def _parameter_list(self, args: Sequence[str]) -> str:
-        return lines([f"0x{key:X}=0 1 FLOAT parameter" for key in sorted({key for _, key in self.state.parameters})])
+        return lines(
+            [f"0x{key:X}=0 1 FLOAT parameter" for key in sorted({key for _, key in self.state.parameters})]
+        )
 
     def _stages(self, args: Sequence[str]) -> str:
         names = {"1": "S-330.2SL", "2": "S-330.2SL", "3": "NOSTAGE"}
@@ -179,11 +196,15 @@ class Controller:
         self.state.parameters[item, parameter] = value
 
     def _parameters(self, args: Sequence[str]) -> str:
-        keys = [(args[k], whole(args[k + 1])) for k in range(0, len(args) - 1, 2)] or list(self.state.parameters)
+        keys = [(args[k], whole(args[k + 1])) for k in range(0, len(args) - 1, 2)] or list(
+            self.state.parameters
+        )
         if any(key not in self.state.parameters for key in keys):
             raise Refusal(54)
         # The identifier comes back without its leading zeros.
-        return lines([f"{item} 0x{key:X}={value_text(self.state.parameters[item, key])}" for item, key in keys])
+        return lines(
+            [f"{item} 0x{key:X}={value_text(self.state.parameters[item, key])}" for item, key in keys]
+        )
 
     def _save(self, args: Sequence[str]) -> None:
         if list(args) != ["100"]:
@@ -210,23 +231,33 @@ class Controller:
             self._connect()
 
     # ------------------------------------------------------------------ optics
-    def turn(self, samples: int) -> tuple[float, NDArray[np.float64]] | None:
-        """One turn of the stage once it has settled: duration in seconds, true places ``(samples, 2)``.
+    def turn(self) -> tuple[float, NDArray[np.float64]] | None:
+        """One turn of the stage once it has settled: duration in seconds, true places ``(_SAMPLES, 2)``.
 
-        In microradians; ``None`` while not both axes are driven by waves of one period.
+        In microradians; ``None`` while not both axes are driven by waves of one period. The same object
+        as long as nothing changes.
         """
         with self.lock:
-            found = []
-            for name in ("1", "2"):
-                source = self.state.stage.axes[name].source
-                if not self.state.moved_by_wave(name):
-                    return None
-                steps = len(source.table) * source.rate  # type: ignore[attr-defined]
-                track = self.state.stage.axes[name].steady(source.start + 64 * steps, steps)  # type: ignore[attr-defined]
-                found.append(np.interp(np.arange(samples) * steps / samples, np.arange(steps + 1), [*track, track[0]]))
-            if len(set(map(len, found))) != 1:
+            sources = [axis.source for axis in self.state.stage.axes.values()]
+            running = self.waves.running()
+            if self._turned is None or self._turned[0] != running or self._turned[1] != sources:
+                self._turned = (running, sources, self._steady_turn())
+            return self._turned[2]
+
+    def _steady_turn(self) -> tuple[float, NDArray[np.float64]] | None:
+        lengths, tracks = set(), []
+        for name, axis in self.state.stage.axes.items():
+            source = axis.source
+            if not isinstance(source, Wave) or not self.state.moved_by_wave(name):
                 return None
-            return steps * SERVO_S, np.stack(found, axis=1)
+            steps = len(source.table) * source.rate
+            track = axis.steady(source.start + (MEMORY // steps + 1) * steps, steps)
+            at = np.arange(_SAMPLES) * steps / _SAMPLES
+            lengths.add(steps)
+            tracks.append(np.interp(at, np.arange(steps + 1), [*track, track[0]]))
+        if len(lengths) != 1:
+            return None
+        return lengths.pop() * SERVO_S, np.stack(tracks, axis=1)
 
     def report(self) -> dict[str, Any]:
         """Counters and condition."""

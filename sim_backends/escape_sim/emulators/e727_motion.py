@@ -121,7 +121,9 @@ class Motion:
     def is_zeroed(self, args: Sequence[str]) -> str:
         """``ATZ?``."""
         names = self._state.axes_of(args)
-        return items({name: int(not self._state.zeroing(name) and self._state.axes[name].zeroed) for name in names})
+        return items(
+            {name: int(not self._state.zeroing(name) and self._state.axes[name].zeroed) for name in names}
+        )
 
     def on_target(self, args: Sequence[str]) -> str:
         """``ONT?``."""

@@ -65,7 +65,9 @@ class Recorder:
         steps = steps[(steps - self._begun) % self.rate == 0][: self.room - self._length()]
         for table, kept in self._kept.items():
             axis, option = self.sources[table]
-            track = tracks[axis][steps - first] if option == POSITION else self._stage.axes[axis].source.at(steps)
+            track = (
+                tracks[axis][steps - first] if option == POSITION else self._stage.axes[axis].source.at(steps)
+            )
             kept.append(np.asarray(track))
         self._next = first + count
         if not self.running:

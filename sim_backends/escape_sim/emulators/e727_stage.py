@@ -1,4 +1,4 @@
-"""A tip-tilt stage behind a digital servo: second order, integrated on the servo's clock when somebody looks."""
+"""A tip-tilt stage behind a digital servo: second order, integrated on the servo's clock when looked at."""
 
 from __future__ import annotations
 
@@ -70,11 +70,11 @@ class Wave:
         if self.cycles:
             along = np.minimum(along, self.cycles * n * self.rate - 1)
         point, part = np.divmod(along, self.rate)
-        here = self.table[point % n]
+        here: NDArray[np.float64] = self.table[point % n]
         if not self.interpolate or self.rate == 1:
             return here
         there = self.table[(point + 1) % n]
-        return here + (there - here) * (part / self.rate)
+        return np.asarray(here + (there - here) * (part / self.rate))
 
 
 @dataclass

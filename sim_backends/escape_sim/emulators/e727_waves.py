@@ -83,7 +83,9 @@ class Waves:
     def lengths(self, args: Sequence[str]) -> str:
         """``WAV? table 1``: points of each table."""
         wanted = [self._number(table) for table, what in grouped(args, 2) if _is(what, 1)] if args else []
-        return lines([f"{t} 1={len(self.tables.get(t, ())):.9e}" for t in wanted or sorted(self.tables) or [1]])
+        return lines(
+            [f"{t} 1={len(self.tables.get(t, ())):.9e}" for t in wanted or sorted(self.tables) or [1]]
+        )
 
     def read(self, args: Sequence[str]) -> str:
         """``GWD? first points tables``."""
@@ -96,7 +98,9 @@ class Waves:
         shortest = min(len(self.tables[table]) for table in tables)
         if first < 1 or count < 1 or first + count - 1 > shortest:
             raise Refusal(17)
-        return array({f"Wave Table {t}": self.tables[t][first - 1 : first - 1 + count] for t in tables}, SERVO_S)
+        return array(
+            {f"Wave Table {t}": self.tables[t][first - 1 : first - 1 + count] for t in tables}, SERVO_S
+        )
 
     # ------------------------------------------------------------------ generators
     def select(self, args: Sequence[str]) -> None:
@@ -178,7 +182,8 @@ class Waves:
             self._state.complain(f"WGO {name} starts with a jump of {jump:.1f} urad; MOV there first")
         if running:
             self._state.complain(
-                f"WGO {name} starts while {' and '.join(running)} turns already: the phase between the axes is lost"
+                f"WGO {name} starts while {' and '.join(running)} turns already: the phase between "
+                "the axes is lost"
             )
 
     def modes(self, args: Sequence[str]) -> str:

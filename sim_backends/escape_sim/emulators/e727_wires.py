@@ -96,7 +96,8 @@ class TcpServer:
             self._listener = socket.create_server((host, port))
         except OSError as error:
             raise ConfigError(
-                f"cannot listen on {host}:{port} ({error.strerror or error}); choose another --port, 0 for any"
+                f"cannot listen on {host}:{port} ({error.strerror or error}); choose another --port, "
+                "0 for any"
             ) from error
         self._stop.clear()
         self._thread = threading.Thread(target=self._serve, name="e727-tcp", daemon=True)
@@ -128,7 +129,8 @@ class TcpServer:
             ready, _, _ = select.select([listener, *([client] if client else [])], [], [], _LOOK_S)
             # Who hangs up makes room, also for one who rang at the same moment.
             if client in ready and client is not None and not self._talk(client):
-                client = self._hang_up(client)
+                self._hang_up(client)
+                client = None
             if listener in ready:
                 client = self._welcome(listener, client)
         if client is not None:
