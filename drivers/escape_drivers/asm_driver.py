@@ -151,15 +151,16 @@ class AsmMirror(AdaptiveSecondary):
     def _adopt(self, welcome: m.Welcome) -> None:
         """Take over what the mirror says of itself when a connection begins."""
         disabled = require_fit(self.name, self._section, welcome)
-        self._info = self._section.info(
-            f"adaptive secondary over TCP, protocol {welcome.version}",
-            simulated=welcome.simulated, serial=welcome.serial,
-        )  # fmt: skip
+        self._identify(welcome)
         if disabled:
             self._link.ask(m.SetDisabled(disabled, "devices.dm.limits.disabled"), m.Done)
         self._known, self._skips_in_a_row = welcome.state, 0
         floats = welcome.state in (ShellState.SET, ShellState.RUNNING)
         self._found = welcome.present.astype(np.float64) / self._section.stroke_m if floats else None
+
+    def _identify(self, welcome: m.Welcome) -> None:
+        model = f"adaptive secondary over TCP, protocol {welcome.version}"
+        self._info = self._section.info(model, simulated=welcome.simulated, serial=welcome.serial)
 
     def _close(self) -> None:
         self._stop.set()
@@ -256,7 +257,7 @@ class AsmMirror(AdaptiveSecondary):
         link = self._new_link(m.Role.TELEMETRY)
         link.address = self._address()
         try:
-            link.connect()
+            self._identify(link.connect())
             return _translated(link.ask(m.GetHealth(), m.Health))
         finally:
             link.drop("it was only looked at")

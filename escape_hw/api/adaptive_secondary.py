@@ -89,13 +89,15 @@ class AdaptiveSecondary(DeformableMirror):
 
     Attributes
     ----------
+    lift
+        As above; may be changed while it is closed.
     leave_set
         ``close`` leaves a floating shell afloat and flat instead of resting it.
     """
 
     def __init__(self, name: str, limits: MirrorLimits, *, lift: bool = True) -> None:
         super().__init__(name, limits)
-        self._lift = lift
+        self.lift = lift
         self.leave_set = False
 
     @property
@@ -218,7 +220,7 @@ class AdaptiveSecondary(DeformableMirror):
 
     def _after_open(self) -> None:
         super()._after_open()
-        if self._lift:
+        if self.lift:
             self.go(ShellState.RUNNING)
 
     def _before_close(self) -> None:

@@ -154,6 +154,29 @@ class DeformableMirror(Device):
             return SendReport(shape, self.now_ns(), report, kept is not None)
 
     @final
+    def check(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
+        """What :meth:`send` would make of a shape now; sends nothing.
+
+        Parameters
+        ----------
+        command
+            ``(n_act,)`` real numbers, fractions of full stroke.
+
+        Returns
+        -------
+        shape : ndarray of float64, ``(n_act,)``
+            Read-only: what would reach the mirror.
+        report : GuardReport
+            What the guard would change.
+
+        Raises
+        ------
+        CommandRejected
+            Malformed or not finite.
+        """
+        return self._checked().limit(command)
+
+    @final
     def allowed_share(self, command: ArrayLike) -> float:
         """Largest factor, at most 1, with which a shape breaks no limit by itself (slew apart).
 

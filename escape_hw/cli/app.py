@@ -8,7 +8,19 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli import calibrate, emulate, loop, modulator, perf, products, reproduce, systems
+from escape_hw.cli import (
+    asm,
+    calibrate,
+    camera,
+    dm,
+    emulate,
+    loop,
+    modulator,
+    perf,
+    products,
+    reproduce,
+    systems,
+)
 
 app = typer.Typer(
     name="escape",
@@ -30,7 +42,10 @@ app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)
 app.command("perf")(perf.perf)
+app.add_typer(dm.app, name="dm")
+app.add_typer(camera.app, name="camera")
 app.add_typer(modulator.app, name="modulator")
+app.add_typer(asm.app, name="asm")
 app.command("emulate")(emulate.emulate)
 
 

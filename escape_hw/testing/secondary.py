@@ -155,7 +155,8 @@ def check_secondary_rests_when_closed(factory: Factory) -> None:
         with opened(factory) as mirror:
             mirror.go(ShellState.RUNNING)
             mirror.leave_set = leave_set
-            step, steps = mirror._step, []  # noqa: SLF001 - what reaches the driver is what is checked
+            steps: list[ShellState] = []
+            step = mirror._step  # noqa: SLF001 - what reaches the driver is what is checked
 
             def walking(state: ShellState, step=step, steps=steps) -> None:  # type: ignore[no-untyped-def]
                 step(state)

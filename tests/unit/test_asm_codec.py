@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -52,7 +53,7 @@ REQUESTS: list[tuple[m.Request, int]] = [
 
 def cut(data: bytes, places: list[int]) -> list[bytes]:
     marks = [0, *sorted({p % (len(data) + 1) for p in places}), len(data)]
-    return [data[a:b] for a, b in zip(marks, marks[1:], strict=False)]
+    return [data[a:b] for a, b in pairwise(marks)]
 
 
 # --------------------------------------------------------------------- known bytes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import time
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -198,7 +199,7 @@ def offline() -> tuple[AsmEmulator, Connection, Wire]:
 
 def in_pieces(connection: Connection, wire: Wire, data: bytes, places: list[int]) -> None:
     marks = [0, *sorted({place % (len(data) + 1) for place in places}), len(data)]
-    for a, b in zip(marks, marks[1:], strict=False):
+    for a, b in pairwise(marks):
         if not wire.ended:
             connection.data_received(data[a:b])
 
@@ -226,10 +227,7 @@ def test_no_command_that_was_not_whole_is_applied(
     made, connection, wire = offline()
     sound = command(2, 1, 3e-7)
     where %= len(sound)
-    if cut_short:
-        data = sound[:where]
-    else:
-        data = sound[:where] + bytes([byte]) + sound[where + 1 :]
+    data = sound[:where] + (b"" if cut_short else bytes([byte]) + sound[where + 1 :])
     in_pieces(connection, wire, data, places)
     assert made.body.applied == int(data == sound)
     assert made.body.present_m.any() == (data == sound)
@@ -299,7 +297,7 @@ def test_a_port_that_is_taken_is_named() -> None:
 
 
 def test_contaminated_actuators_are_reported_with_what_their_neighbours_do() -> None:
-    made, connection, wire = offline()
+    made, connection, _ = offline()
     connection.data_received(command(2, 1, 4e-7))
     off = sorted(made.body.out_of_service)
     assert not made.body.present_m[off].any()
