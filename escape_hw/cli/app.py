@@ -12,7 +12,9 @@ from escape_hw.cli import (
     asm,
     calibrate,
     camera,
+    discover,
     dm,
+    doctor,
     emulate,
     loop,
     modulator,
@@ -20,6 +22,7 @@ from escape_hw.cli import (
     products,
     reproduce,
     systems,
+    udev,
 )
 
 app = typer.Typer(
@@ -46,6 +49,9 @@ app.add_typer(dm.app, name="dm")
 app.add_typer(camera.app, name="camera")
 app.add_typer(modulator.app, name="modulator")
 app.add_typer(asm.app, name="asm")
+app.command("doctor")(doctor.doctor)
+app.command("discover")(discover.discover)
+app.add_typer(udev.app, name="udev")
 app.command("emulate")(emulate.emulate)
 
 
