@@ -9,21 +9,21 @@ class FrameCounter:
     Parameters
     ----------
     first, last
-        Smallest and largest number that the device gives; after ``last`` comes ``first`` again (a
-        32-bit counter: 0 and 2**32 - 1; GigE Vision's block identifiers: 1 and 65535).
+        After ``last`` comes ``first`` again (a 32-bit counter: 0 and 2**32 - 1; GigE Vision's short block
+        identifiers: 1 and 65535). A device whose numbers go beyond ``last`` never starts over.
     """
 
     def __init__(self, first: int, last: int) -> None:
-        self._first, self._cycle = first, last - first + 1
-        self._newest: int | None = None
+        self._last, self._cycle = last, last - first + 1
+        self._newest = 0
         self._turns = 0
 
     def index(self, number: int) -> int:
-        """The index that belongs to a number; a number that fell by less than half a turn stays fallen."""
+        """The index of a number; one that fell by less than half a turn has not started over, and falls."""
         newest, self._newest = self._newest, number
-        if newest is not None and newest - number > self._cycle // 2:
+        if newest - number > self._cycle // 2 and newest <= self._last:
             self._turns += 1
-        return number - self._first + self._turns * self._cycle
+        return number + self._turns * self._cycle
 
 
 class CameraClock:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import ctypes
 import logging
 import math
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,14 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_drivers.frame_counter import CameraClock, FrameCounter
+from escape_drivers.camera_limits import CameraLimits, Range
 from escape_drivers.options import read_options, require_serial
-from escape_drivers.ximea_errors import NO_IMAGE, STOPPED, TIMEOUT
+from escape_drivers.waiting_camera import WaitingCamera
+from escape_drivers.ximea_errors import NO_IMAGE, TIMEOUT
 from escape_drivers.ximea_library import XiImage, XimeaLibrary
-from escape_drivers.ximea_limits import ROUNDING, XimeaLimits, rate_refused
-from escape_hw.api.camera import Camera
-from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
-from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
+from escape_hw.api.frames import CameraSettings, Frame, Region
+from escape_hw.errors import DeviceError, NotOpen
 
 if TYPE_CHECKING:
     from escape_hw.config.device_models import CameraConfig
@@ -29,8 +26,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Longest wait inside the library; ``stop`` and ``close`` come through this soon, whatever the time-out.
-_SLICE_MS = 50
 _FORMATS = {"RAW16": 6, "MONO16": 1}
 _BINNINGS = {"binning": 0, "skipping": 1}
 _TRIGGERS = {"off": 0, "rising": 1, "falling": 2}
@@ -91,10 +86,8 @@ class XimeaOptions:
             ("recent_frame", int(self.newest)),
         ]
         if self.zero_rot:
-            wanted += [
-                ("sensor_feature_selector", _ZERO_ROT),
-                ("sensor_feature_value", int(self.zero_rot == "on")),
-            ]
+            wanted.append(("sensor_feature_selector", _ZERO_ROT))
+            wanted.append(("sensor_feature_value", int(self.zero_rot == "on")))
         if self.bandwidth_mbit:
             wanted.append(("limit_bandwidth", self.bandwidth_mbit))
         if self.exposure_output:
@@ -121,7 +114,7 @@ def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> X
     return XimeaCamera(name, section, read_options(XimeaOptions, name, section))
 
 
-class XimeaCamera(Camera):
+class XimeaCamera(WaitingCamera):
     """A XIMEA camera.
 
     Frames are copied out of the library's ring at once, so that nothing overwrites them. Losses show as
@@ -139,35 +132,14 @@ class XimeaCamera(Camera):
     """
 
     def __init__(self, name: str, section: CameraConfig, options: XimeaOptions) -> None:
-        super().__init__(name)
-        self._section, self._options = section, options
-        self._settings = section.settings()
-        self._info = CameraInfo(
-            "XIMEA camera", section.serial, section.sensor_px[::-1], section.bit_depth, False
-        )
-        self._full_scale = self._info.full_scale
+        super().__init__(name, section, "XIMEA camera", (0, _UNFILLED))
+        self._options = options
         self._library: XimeaLibrary | None = None
-        self._limits: XimeaLimits | None = None
-        self._fastest_hz = math.inf
-        #: Held while the library waits for an image, so that nobody stops or closes it meanwhile.
-        self._waiting = threading.Lock()
-        self._halted, self._acquiring = True, False
         self._image = XiImage(size=ctypes.sizeof(XiImage))
         self._address = ctypes.c_void_p(ctypes.addressof(self._image))
         self._get_image: Callable[..., int] = _not_connected
         self._views: dict[int, NDArray[np.uint16]] = {}
         self._expected = (0, 0)
-        self._counter, self._clock = FrameCounter(0, _UNFILLED), CameraClock()
-
-    @property
-    def info(self) -> CameraInfo:
-        """Identity and fixed properties."""
-        return self._info
-
-    @property
-    def settings(self) -> CameraSettings:
-        """The settings in force, as read back from the camera."""
-        return self._settings
 
     def temperature_c(self) -> float:
         """Temperature of the sensor's chip in degrees Celsius.
@@ -187,76 +159,26 @@ class XimeaCamera(Camera):
         for name, value in self._options.parameters(self._section.bit_depth):
             library.set(name, value)
         _to_corner(library)
-        limits = self._limits = XimeaLimits.read(library)
+        limits = self._limits = _limits(library)
         sensor = (round(limits.width.high), round(limits.height.high))
-        if sensor != self._section.sensor_px:
-            raise DeviceError(
-                self.name,
-                f"is read out as {sensor[0]} x {sensor[1]} pixels, but sensor_px says {self._section.sensor_px[0]} "
-                f"x {self._section.sensor_px[1]}; correct sensor_px or the option 'downsampling'",
-            )
-        model = library.text("device_name")
-        log.info(
-            "%s: %s %s, xiAPI %s", self.name, model, library.text("device_sn"), library.text("api_version")
-        )
-        self._info = CameraInfo(
-            f"XIMEA {model} (stand-in)" if library.stand_in else f"XIMEA {model}",
-            self._section.serial,
-            sensor[::-1],
-            self._section.bit_depth,
-            simulated=library.stand_in,
-        )
+        self._require_sensor(sensor, "or the option 'downsampling'")
+        model, serial, version = (library.text(key) for key in ("device_name", "device_sn", "api_version"))
+        log.info("%s: %s %s, xiAPI %s", self.name, model, serial, version)
+        self._info = self._identity(f"XIMEA {model}", library.stand_in)
         self._get_image = library.c.xiGetImage
         self._settings = self._applied(self._check(self._section.settings()))
 
-    def _close(self) -> None:
-        self._halted = True
-        with self._waiting:
-            library, self._library, self._limits = self._library, None, None
-            self._get_image = _not_connected
-            self._views.clear()
-            if library is None or library.handle is None:
-                return
-            # A reader that came in between may have started it again.
-            self._stop_acquisition(library)
-            try:
-                library.close()
-            except DeviceError as error:
-                # It may have gone already.
-                log.warning("while closing: %s", error)
+    def _disconnect(self) -> None:
+        library, self._library, self._limits = self._library, None, None
+        self._get_image = _not_connected
+        self._views.clear()
+        if library is not None and library.handle is not None:
+            self._quietly(library.close)
 
-    def _abandon(self) -> None:
-        self._close()
-
-    def _check(self, want: CameraSettings) -> CameraSettings:
-        limits = self._limits
-        if limits is None:
-            raise NotOpen(self.name, "is not connected; call open() first")
-        region = limits.region(want.region)
-        gain = limits.gain_db(self.name, want.gain_db)
-        longest = 1 / want.frame_rate_hz if self._options.trigger == "off" else math.inf
-        answer = CameraSettings(region, limits.exposure_s(want.exposure_s, longest), want.frame_rate_hz, gain)
-        now = self._settings
-        as_fast = region == now.region and answer.exposure_s >= now.exposure_s
-        if as_fast and want.frame_rate_hz > self._fastest_hz * (1 + ROUNDING):
-            raise rate_refused(self.name, answer, self._fastest_hz)
-        return answer
-
-    def _configure(self, settings: CameraSettings) -> None:
-        before = self._settings
-        try:
-            self._settings = self._applied(settings)
-        except DeviceLost:
-            raise
-        except DeviceError as error:
-            self._tidy(lambda: self._put_back(before), error)
-            raise
-
-    def _put_back(self, before: CameraSettings) -> None:
-        self._settings = self._applied(before)
+    def _longest_s(self, want: CameraSettings) -> float:
+        return super()._longest_s(want) if self._options.trigger == "off" else math.inf
 
     def _applied(self, want: CameraSettings) -> CameraSettings:
-        """Set the camera and read back what it made of it; its limits depend on the order."""
         library, region = self._connected(), want.region
         _to_corner(library)
         library.set("width", region.width)
@@ -267,105 +189,49 @@ class XimeaCamera(Camera):
         library.set("gain", float(want.gain_db))
         rate = want.frame_rate_hz
         if self._options.trigger == "off":
-            self._fastest_hz = library.real("framerate:max")
-            if rate > self._fastest_hz * (1 + ROUNDING):
-                raise rate_refused(self.name, want, self._fastest_hz)
-            slowest = library.real("framerate:min")
-            if rate < slowest * (1 - ROUNDING):
-                raise SettingRejected(
-                    self.name, f"frame_rate_hz is {rate:g}; the camera goes no slower than {slowest:g}"
-                )
+            self._slowest_hz, self._fastest_hz = (library.real(f"framerate:{end}") for end in ("min", "max"))
+            self._require_rate(want)
             library.set("framerate", float(rate))
             rate = library.real("framerate")
         return self._read_back(library, rate)
 
     def _read_back(self, library: XimeaLibrary, rate_hz: float) -> CameraSettings:
-        limits = self._limits
-        assert limits is not None
+        limits = self._known_limits()
         region = Region(*(library.whole(name) for name in ("offsetX", "offsetY", "width", "height")))
         exposure_us = limits.exposure.nearest(library.real("exposure"))
         return CameraSettings(region, exposure_us * 1e-6, rate_hz, limits.gain.nearest(library.real("gain")))
 
-    def _start(self) -> None:
-        with self._waiting:
-            if self._acquiring:
-                return
-            region = self._settings.region
-            self._expected = (region.width, region.height)
-            self._counter, self._clock = FrameCounter(0, _UNFILLED), CameraClock()
-            self._views.clear()
-            ctypes.memset(self._address, 0, ctypes.sizeof(XiImage))
-            self._image.size = ctypes.sizeof(XiImage)
-            self._image.acq_nframe = _UNFILLED
-            self._connected().start()
-            self._halted, self._acquiring = False, True
+    def _begin(self) -> None:
+        region = self._settings.region
+        self._expected = (region.width, region.height)
+        self._views.clear()
+        ctypes.memset(self._address, 0, ctypes.sizeof(XiImage))
+        self._image.size = ctypes.sizeof(XiImage)
+        self._image.acq_nframe = _UNFILLED
+        self._connected().start()
 
-    def _stop(self) -> None:
-        self._halted = True
-        with self._waiting:
-            if self._library is not None:
-                self._stop_acquisition(self._library)
+    def _end(self) -> None:
+        self._connected().stop()
 
-    def _stop_acquisition(self, library: XimeaLibrary) -> None:
-        if not self._acquiring:
-            return
-        self._acquiring = False
-        code = library.c.xiStopAcquisition(library.handle)
-        if code not in (0, STOPPED):
-            # Whatever the camera says, it is not read any more, and close() still works.
-            log.warning("while stopping: %s", library.failure("xiStopAcquisition", code))
-
-    def _next_frame(self, timeout_s: float) -> Frame:
-        deadline = time.monotonic() + timeout_s
-        slice_ms = min(_SLICE_MS, math.ceil(timeout_s * 1e3))
-        while True:
-            frame = self._take(slice_ms)
-            if frame is not None:
-                return frame
-            left_s = deadline - time.monotonic()
-            if left_s <= 0:
-                break
-            slice_ms = min(_SLICE_MS, math.ceil(left_s * 1e3))
-        triggered = self._options.trigger != "off"
-        raise FrameTimeout(
-            self.name,
-            f"no frame within {timeout_s:g} s; check {'the trigger and its cable' if triggered else 'cable'}, "
-            f"the exposure ({self._settings.exposure_s:g} s), or allow a longer timeout",
-        )
-
-    def _poll(self) -> Frame | None:
-        return self._take(0)
+    def _hint(self) -> str:
+        where = "cable" if self._options.trigger == "off" else "the trigger and its cable"
+        return f"{where}, the exposure ({self._settings.exposure_s:g} s)"
 
     def _take(self, wait_ms: int) -> Frame | None:
-        """A frame, or ``None`` when there is none after so many milliseconds."""
-        with self._waiting:
-            if self._halted:
-                raise NotOpen(self.name, "was stopped or closed while a frame was awaited")
-            library = self._connected()
-            code = self._get_image(library.handle, wait_ms, self._address)
-            if code == 0:
-                # Copied before the lock goes: the next call may overwrite the library's buffer.
-                return self._copied(time.monotonic_ns())
+        library = self._connected()
+        code = self._get_image(library.handle, wait_ms, self._address)
         if code in (TIMEOUT, NO_IMAGE):
             return None
-        raise library.failure("xiGetImage", code)
-
-    def _copied(self, arrived_ns: int) -> Frame:
+        if code != 0:
+            raise library.failure("xiGetImage", code)
         image = self._image
         view = self._views.get(image.bp or 0)
         if view is None:
             view = self._view(image)
-        data = view.copy()
-        data.flags.writeable = False
-        top = self._full_scale
-        # Frames with no saturated pixel are the rule, and the maximum is quicker than counting.
-        saturated = int(np.count_nonzero(data >= top)) if data.max() >= top else 0
         number = image.acq_nframe
         if number == _UNFILLED:
             number = image.nframe
-        stamp_ns = image.tsSec * 1_000_000_000 + image.tsUSec * 1000
-        exposed_ns = self._clock.exposed_ns(stamp_ns, arrived_ns)
-        return Frame(data, self._counter.index(number), exposed_ns, arrived_ns, saturated)
+        return self._frame(view, number, image.tsSec * 1_000_000_000 + image.tsUSec * 1000)
 
     def _view(self, image: XiImage) -> NDArray[np.uint16]:
         """A look at one of the library's buffers, checked and made once; rows may be padded."""
@@ -392,6 +258,22 @@ def _to_corner(library: XimeaLibrary) -> None:
     """Move the region to the sensor's corner, so that its size can change freely."""
     library.set("offsetX", 0)
     library.set("offsetY", 0)
+
+
+def _limits(library: XimeaLibrary) -> CameraLimits:
+    """Ask the camera; its region must begin at the sensor's corner, or it would shrink the limits."""
+    width, height = (
+        Range(*(library.whole(f"{name}:{part}") for part in ("min", "max", "inc")))
+        for name in ("width", "height")
+    )
+    exposure, gain = (
+        # Single-precision increments as the decimal numbers that were meant: 0.1, not 0.10000000149.
+        Range(*(float(f"{library.real(f'{name}:{part}'):.7g}") for part in ("min", "max", "inc")))
+        for name in ("exposure", "gain")
+    )
+    return CameraLimits(
+        width, height, library.whole("offsetX:inc"), library.whole("offsetY:inc"), exposure, gain
+    )
 
 
 def _not_connected(*arguments: Any) -> int:

@@ -1,11 +1,10 @@
-"""What a XIMEA camera can be set to: its limits and increments, and the nearest it can do."""
+"""What a camera can be set to: its limits and increments, and the nearest it can do."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-from escape_drivers.ximea_library import XimeaLibrary
 from escape_hw.api.frames import CameraSettings, Region
 from escape_hw.errors import SettingRejected
 
@@ -20,17 +19,6 @@ class Range:
     low: float
     high: float
     step: float
-
-    @classmethod
-    def of_real(cls, library: XimeaLibrary, name: str) -> Range:
-        """Limits of a floating-point parameter."""
-        low, high, step = (library.real(f"{name}:{part}") for part in ("min", "max", "inc"))
-        return cls(low, high, _shortest(step))
-
-    @classmethod
-    def of_whole(cls, library: XimeaLibrary, name: str) -> Range:
-        """Limits of an integer parameter."""
-        return cls(*(library.whole(f"{name}:{part}") for part in ("min", "max", "inc")))
 
     def nearest(self, value: float) -> float:
         """The value on the grid of increments, within the limits; its own answer is a fixed point."""
@@ -52,7 +40,7 @@ class Range:
 
 
 @dataclass(frozen=True, slots=True)
-class XimeaLimits:
+class CameraLimits:
     """Limits of one camera as set up; exposure in microseconds, gain in decibels."""
 
     width: Range
@@ -62,20 +50,19 @@ class XimeaLimits:
     exposure: Range
     gain: Range
 
-    @classmethod
-    def read(cls, library: XimeaLibrary) -> XimeaLimits:
-        """Ask the camera; its region must begin at the corner of the sensor, or it would shrink the limits."""
-        return cls(
-            Range.of_whole(library, "width"),
-            Range.of_whole(library, "height"),
-            library.whole("offsetX:inc"),
-            library.whole("offsetY:inc"),
-            Range.of_real(library, "exposure"),
-            Range.of_real(library, "gain"),
-        )
+    def nearest(self, device: str, want: CameraSettings, longest_s: float) -> CameraSettings:
+        """The nearest settings, but for the frame rate; exposures are no longer than ``longest_s``.
+
+        Raises
+        ------
+        SettingRejected
+            The gain is outside its limits.
+        """
+        region, gain = self.region(want.region), self.gain_db(device, want.gain_db)
+        return CameraSettings(region, self.exposure_s(want.exposure_s, longest_s), want.frame_rate_hz, gain)
 
     def region(self, want: Region) -> Region:
-        """The largest region on the sensor's increments that reaches no further than asked, where possible."""
+        """The largest region on the sensor's increments that is within the one asked for, where possible."""
         width, height = round(self.width.below(want.width)), round(self.height.below(want.height))
         x = min(want.x, round(self.width.high) - width)
         y = min(want.y, round(self.height.high) - height)
@@ -98,17 +85,3 @@ class XimeaLimits:
         if not low - ROUNDING <= want_db <= high + ROUNDING:
             raise SettingRejected(device, f"gain_db is {want_db:g}; it must lie in {low:g}..{high:g}")
         return self.gain.nearest(want_db)
-
-
-def rate_refused(device: str, want: CameraSettings, fastest_hz: float) -> SettingRejected:
-    """The error for a frame rate that is out of reach."""
-    return SettingRejected(
-        device,
-        f"frame_rate_hz is {want.frame_rate_hz:g}; {want.region.height} rows and an exposure of "
-        f"{want.exposure_s:g} s allow at most {fastest_hz:.1f}",
-    )
-
-
-def _shortest(step: float) -> float:
-    """A single-precision increment as the decimal number that was meant: 0.1, not 0.10000000149."""
-    return float(f"{step:.7g}")
