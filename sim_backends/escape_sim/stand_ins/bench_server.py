@@ -46,7 +46,11 @@ _LONGEST = 1 << 20
 #: A wait that only asks whether a frame is there; the twin's clock hardly moves.
 _NO_WAIT_S = 1e-6
 #: Environment variable that names each stand-in's library to its driver.
-VARIABLES = {"asdk": "ESCAPE_ALPAO_LIBRARY", "m3api": "ESCAPE_XIMEA_LIBRARY"}
+VARIABLES = {
+    "asdk": "ESCAPE_ALPAO_LIBRARY",
+    "m3api": "ESCAPE_XIMEA_LIBRARY",
+    "aravis": "ESCAPE_ARAVIS_LIBRARY",
+}
 _SOCKET_VARIABLE = "ESCAPE_STAND_IN_BENCH"
 
 Answer = tuple[int, bytes]
