@@ -12,7 +12,7 @@ from escape_hw.config.registry import device_factory
 from escape_sim.stand_ins import StandIn, StandInUnavailable
 
 #: Driver, key in [devices] and stand-in.
-PARTS = {"alpao": ("dm", "asdk")}
+PARTS = {"alpao": ("dm", "asdk"), "ximea": ("wfs", "m3api"), "aravis": ("science", "aravis")}
 
 
 @cache

@@ -17,6 +17,8 @@ from escape_hw.errors import EscapeError
 #: What can be built: the vendor library that each stands for.
 LIBRARIES = {
     "asdk": "ALPAO's libasdk",
+    "m3api": "XIMEA's libm3api",
+    "aravis": "libaravis-0.8",
 }
 _FLAGS = ("-std=gnu11", "-shared", "-fPIC", "-O2", "-Wall", "-Wextra", "-fvisibility=hidden")
 _LIBS = ("-lm", "-lpthread")
