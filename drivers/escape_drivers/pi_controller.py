@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from itertools import product
@@ -18,6 +19,7 @@ from escape_drivers.pi_link import Link
 from escape_hw.errors import DeviceError
 
 V = TypeVar("V")
+log = logging.getLogger(__name__)
 
 #: Parameter that holds the servo's period.
 _SERVO_PERIOD = 0x0E000200
@@ -161,6 +163,12 @@ class E727:
         """Which axes have been auto-zeroed."""
         return [text == "1" for text in self._each("ATZ?", pi_gcs.values)]
 
+    def clear_error(self) -> None:
+        """Ask away an error that no command of ours has left, lest the next one be blamed for it."""
+        number = self.link.ask(_number, "ERR?")
+        if number:
+            log.warning("%s", Refused(self.link.name, number, "something before"))
+
     def check_error(self, cause: str) -> None:
         """Raise the error that a command which takes its time has left behind, if any.
 
@@ -169,7 +177,7 @@ class E727:
         Refused
             There is one.
         """
-        number = self.link.ask(lambda reply: pi_gcs.whole(pi_gcs.single(reply)), "ERR?")
+        number = self.link.ask(_number, "ERR?")
         if number:
             raise Refused(self.link.name, number, cause)
 
@@ -295,6 +303,11 @@ class E727:
 
     def _set_each(self, command: str, both: Sequence[int | float]) -> None:
         self.link.tell(command, self.axes[0], both[0], self.axes[1], both[1])
+
+
+def _number(reply: list[str]) -> int:
+    """A reply of one whole number."""
+    return pi_gcs.whole(pi_gcs.single(reply))
 
 
 def _first_whole(text: str) -> int:
