@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
     from escape_hw.api.matrix import InteractionMatrix
     from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
-    from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
+    from escape_hw.api.modulator import Modulation, ModulatorInfo, ModulatorStatus, TipTiltModulator
     from escape_hw.api.procedure import Procedure, Progress, Reporter, run
     from escape_hw.api.pyramid import PyramidPupils
     from escape_hw.api.registration import Registration
@@ -62,6 +62,7 @@ _HOME = {
     "MirrorLimits": "escape_hw.safety.limits",
     "Modulation": "escape_hw.api.modulator",
     "ModulatorInfo": "escape_hw.api.modulator",
+    "ModulatorStatus": "escape_hw.api.modulator",
     "PhaseScreen": "escape_hw.api.screen",
     "Procedure": "escape_hw.api.procedure",
     "Progress": "escape_hw.api.procedure",
@@ -114,6 +115,7 @@ __all__ = [
     "MirrorLimits",
     "Modulation",
     "ModulatorInfo",
+    "ModulatorStatus",
     "PhaseScreen",
     "Procedure",
     "Progress",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from itertools import product
@@ -18,6 +19,7 @@ from escape_drivers.pi_link import Link
 from escape_hw.errors import DeviceError
 
 V = TypeVar("V")
+log = logging.getLogger(__name__)
 
 #: Parameter that holds the servo's period.
 _SERVO_PERIOD = 0x0E000200
@@ -27,6 +29,8 @@ _POLL_S = 0.01
 _BUNCH = pi_gcs.MAX_ARGUMENTS - 5
 #: Recorder: target and current position of an axis.
 _TARGET, _POSITION = 1, 2
+#: How well volts, and places in the controller's units, have to read back.
+_SAME_VOLTS, _SAME_PLACE = 0.1, 1e-3
 #: Tilt units that the controller may report.
 _UNITS = {"urad": 1e-6, "µrad": 1e-6, "mrad": 1e-3, "rad": 1.0}
 
@@ -107,6 +111,7 @@ class E727:
     def set_servo(self, on: bool) -> None:
         """Switch both servos."""
         self._set_each("SVO", [int(on)] * 2)
+        self._require("SVO", [float(on)] * 2, [float(is_on) for is_on in self.servos()], 0)
 
     def servos(self) -> list[bool]:
         """Which servos are on."""
@@ -115,10 +120,12 @@ class E727:
     def set_volts(self, volts: float) -> None:
         """Drive both axes with the servos off."""
         self._set_each("SVA", [float(volts)] * 2)
+        self._require("SVA", [volts] * 2, self._each("SVA?", pi_gcs.reals), _SAME_VOLTS)
 
     def move(self, places: Sequence[float]) -> None:
         """Targets of both axes."""
         self._set_each("MOV", [float(place) for place in places])
+        self._require("MOV", places, self._each("MOV?", pi_gcs.reals), _SAME_PLACE)
 
     def go(self, places: NDArray[np.float64], longest_s: float, sleep: Callable[[float], None]) -> None:
         """Move both axes and wait until they are there.
@@ -156,6 +163,12 @@ class E727:
         """Which axes have been auto-zeroed."""
         return [text == "1" for text in self._each("ATZ?", pi_gcs.values)]
 
+    def clear_error(self) -> None:
+        """Ask away an error that no command of ours has left, lest the next one be blamed for it."""
+        number = self.link.ask(_number, "ERR?")
+        if number:
+            log.warning("%s", Refused(self.link.name, number, "something before"))
+
     def check_error(self, cause: str) -> None:
         """Raise the error that a command which takes its time has left behind, if any.
 
@@ -164,7 +177,7 @@ class E727:
         Refused
             There is one.
         """
-        number = self.link.ask(lambda reply: pi_gcs.whole(pi_gcs.single(reply)), "ERR?")
+        number = self.link.ask(_number, "ERR?")
         if number:
             raise Refused(self.link.name, number, cause)
 
@@ -197,6 +210,10 @@ class E727:
         self.link.tell("WGC", first, 0, second, 0)
         self.link.tell("WOS", first, 0, second, 0)
         self.link.tell("WTR", first, rate, int(rate > 1), second, rate, int(rate > 1))
+        self._require("WSL", [1, 2], self._each("WSL?", pi_gcs.reals), 0)
+        self._require("WGC", [0, 0], self._each("WGC?", pi_gcs.reals), 0)
+        self._require("WOS", [0, 0], self._each("WOS?", pi_gcs.reals), 0)
+        self._require("WTR", [rate, rate], self._rates(), 0)
 
     def start(self) -> None:
         """Start both axes in the same servo cycle."""
@@ -214,11 +231,15 @@ class E727:
     def played(self) -> tuple[Turn, list[NDArray[np.float64]]]:
         """The waves that the generators play: their turn, and the targets of both axes ``(points,)`` each."""
         tables = [pi_gcs.whole(text) for text in self._each("WSL?", pi_gcs.values)]
-        rates = [pi_gcs.whole(text.split()[0]) for text in self._each("WTR?", pi_gcs.values)]
+        rates = self._rates()
         offsets = self._each("WOS?", pi_gcs.reals)
         points = [self._length(table) for table in tables]
         waves = [self.table(t, n) + o for t, n, o in zip(tables, points, offsets, strict=True)]
         return Turn(points[0], rates[0]), waves
+
+    def _rates(self) -> list[int]:
+        # Rate and interpolation.
+        return self._each("WTR?", lambda reply, keys: [_first_whole(x) for x in pi_gcs.values(reply, keys)])
 
     def _length(self, table: int) -> int:
         return self.link.ask(lambda reply: int(pi_gcs.reals(reply, [f"{table} 1"])[0]), "WAV?", str(table), 1)
@@ -270,5 +291,25 @@ class E727:
     def _each(self, question: str, parse: Callable[[list[str], Sequence[str]], list[V]]) -> list[V]:
         return self.link.ask(lambda reply: parse(reply, self.axes), question, *self.axes)
 
+    def _require(self, command: str, want: Sequence[float], found: Sequence[float], within: float) -> None:
+        """Make sure that a confirmed command has had its effect."""
+        if any(abs(a - b) > within for a, b in zip(want, found, strict=True)):
+            shown = [", ".join(f"{x:g}" for x in values) for values in (want, found)]
+            raise DeviceError(
+                self.link.name,
+                f"confirmed '{command}' to {shown[0]}, but reads back {shown[1]}; does another "
+                "program (or an analogue input) drive the axes? Close it, then open again",
+            )
+
     def _set_each(self, command: str, both: Sequence[int | float]) -> None:
         self.link.tell(command, self.axes[0], both[0], self.axes[1], both[1])
+
+
+def _number(reply: list[str]) -> int:
+    """A reply of one whole number."""
+    return pi_gcs.whole(pi_gcs.single(reply))
+
+
+def _first_whole(text: str) -> int:
+    """The first of several whole numbers."""
+    return pi_gcs.whole((text.split() or [""])[0])

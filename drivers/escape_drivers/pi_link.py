@@ -158,7 +158,7 @@ class Link:
 
     def _exchange(self, text: bytes, parse: Callable[[list[str]], T]) -> T:
         """Send, and understand what comes back within the time."""
-        self._require_alive()
+        self.require_alive()
         try:
             self._clear_away()
             self._transport.write(text)
@@ -202,7 +202,7 @@ class Link:
 
         Returns the controller's pending error, which is hereby cleared.
         """
-        self._require_alive()
+        self.require_alive()
         if trouble is not None:
             self.recoveries += 1
             log.warning("%s: %s; link recovered by an identity question", self.name, trouble)
@@ -245,7 +245,8 @@ class Link:
                 return _error(reply) if reply[-1].strip().isdigit() else None
         return None
 
-    def _require_alive(self) -> None:
+    def require_alive(self) -> None:
+        """Raise :class:`DeviceLost` once the peer has been lost."""
         if self._dead:
             raise DeviceLost(self.name, self._dead)
 

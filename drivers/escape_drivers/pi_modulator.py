@@ -93,7 +93,11 @@ class PiModulator(TipTiltModulator):
     @property
     def modulation(self) -> Modulation | None:
         """The modulation in force; the controller is asked whether it still turns."""
-        if self._now is None or self._connection is None:
+        if self._connection is None:
+            return None
+        # Nobody knows what a stage does that has been lost.
+        self._connection.controller.link.require_alive()
+        if self._now is None:
             return None
         with self._understood():
             if all(self._connection.controller.running()):

@@ -144,6 +144,7 @@ class Turning:
 
     def stop(self) -> None:
         """Stop both axes where they are, and the trigger."""
+        self._controller.clear_error()
         if any(self._controller.running()):
             self._controller.stop()
         self._controller.clear_trigger()

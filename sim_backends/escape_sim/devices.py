@@ -32,6 +32,12 @@ def shared_bench(config: SystemConfig, shared: dict[str, object]) -> SimBench:
     return bench
 
 
+def present_bench(shared: dict[str, object]) -> SimBench | None:
+    """The simulated bench of an opened system, if any of its devices is a twin that has been made."""
+    bench = shared.get(_SHARED)
+    return bench if isinstance(bench, SimBench) else None
+
+
 def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> SimMirror:
     """Entry point ``sim-alpao``."""
     return SimMirror(name, shared_bench(config, shared))

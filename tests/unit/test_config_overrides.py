@@ -16,6 +16,7 @@ from escape_hw.errors import ConfigError
         ("a.b=[1, 2]", [1, 2]),
         ('a.b="x = y"', "x = y"),
         ("a.b=hardware", "hardware"),
+        ("a.b=192.168.0.10", "192.168.0.10"),
         ("a.b=/data/my modes.fits", "/data/my modes.fits"),
         ("a.b=inf", float("inf")),
     ],

@@ -64,10 +64,13 @@ class E727(Emulator):
             self._join(request.config, request.shared)
 
     def _join(self, config: Any, shared: dict[str, object]) -> None:
-        """From now on the twin's beam goes where this stage points."""
+        """From now on the twin's beam goes where this stage points, where there is a twin."""
         # Imported here: an emulator that stands alone needs no optics.
-        from escape_sim.devices import shared_bench
+        from escape_sim.devices import present_bench
 
+        bench = present_bench(shared)
+        if bench is None:
+            return
         urad = 1e-6
         centre = self.controller.make.travel / 2
         section = config.devices.modulator
@@ -76,7 +79,7 @@ class E727(Emulator):
         def track(places: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.asarray((places - centre) * urad * gains)
 
-        shared_bench(config, shared).beam_circle.follow(self.controller.turn, track)
+        bench.beam_circle.follow(self.controller.turn, track)
 
     def start(self) -> str:
         """Begin to listen; returns where."""

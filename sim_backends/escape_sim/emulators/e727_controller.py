@@ -64,7 +64,7 @@ class Controller:
             "IFC?": lambda _: "RSBAUD=115200\n",
             "CCL": self._set_level, "CCL?": lambda _: f"{self.state.level}\n",
             "SPA": self._set_parameter, "SPA?": self._parameters, "WPA": self._save, "RBT": self._reboot,
-            "SVO": motion.servo, "SVO?": motion.servos, "SVA": motion.volts, "SVA?": motion.voltages,
+            "SVO": motion.servo, "SVO?": motion.servos, "SVA": motion.volts, "SVA?": motion.told_volts,
             "VOL?": motion.voltages, "ATZ": motion.auto_zero, "ATZ?": motion.is_zeroed, "MOV": motion.move,
             "MVR": motion.move_by, "MOV?": motion.targets, "POS?": motion.places, "ONT?": motion.on_target,
             "VEL": motion.velocity, "VEL?": motion.velocities, "TMN?": motion.lower, "TMX?": motion.upper,
@@ -164,7 +164,7 @@ class Controller:
 
     def _parameter_list(self, args: Sequence[str]) -> str:
         return lines(
-            [f"0x{key:X}=0 1 FLOAT parameter" for key in sorted({key for _, key in self.state.parameters})]
+            [f"0x{key:X}= 0 1 FLOAT parameter" for key in sorted({key for _, key in self.state.parameters})]
         )
 
     def _stages(self, args: Sequence[str]) -> str:

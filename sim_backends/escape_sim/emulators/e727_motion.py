@@ -148,9 +148,13 @@ class Motion:
         return items({name: int(self._state.axes[name].servo) for name in self._state.axes_of(args)})
 
     def voltages(self, args: Sequence[str]) -> str:
-        """``SVA?`` and ``VOL?``."""
+        """``VOL?``: volts at the piezos now."""
         state = self._state
         return items({name: state.position(name) / PER_VOLT for name in state.axes_of(args)})
+
+    def told_volts(self, args: Sequence[str]) -> str:
+        """``SVA?``: volts as commanded."""
+        return items({name: self._state.axes[name].volts for name in self._state.axes_of(args)})
 
     def velocities(self, args: Sequence[str]) -> str:
         """``VEL?``."""

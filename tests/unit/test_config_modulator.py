@@ -1,0 +1,65 @@
+"""The wire and the stage of a modulator in the configuration, and one device built alone."""
+
+from __future__ import annotations
+
+import pytest
+
+from escape_drivers.pi_modulator import PiModulator
+from escape_drivers.pi_transports import SerialTransport, TcpTransport
+from escape_drivers.pi_usb import UsbTransport
+from escape_drivers.pi_wire import EmulatedTransport, make_transport
+from escape_hw.api.modulator import TipTiltModulator
+from escape_hw.api.screen import PhaseScreen
+from escape_hw.bench import build_device
+from escape_hw.config.load import load_system
+from escape_hw.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ('stage.axes=["1","1"]', "two different axes are needed"),
+        ("stage.axis_gain=[1.0,0.05]", "less than a tenth of normal"),
+        ("stage.min_points=100", ""),
+        ('stage.correct="table"', "needs stage.corrections; 'recorder' measures them"),
+        ("stage.corrections=[[303.0,0.01,1.0,0.0,0.0]]", "out of range"),
+        ("stage.trigger_line=4", "out of range"),
+        ("wire.port=0", "out of range"),
+        ('wire.kind="udp"', "'tcp', 'serial', 'usb' or 'emulator'"),
+        ("wire.hots=1", "did you mean 'devices.modulator.wire.host'"),
+    ],
+)
+def test_what_makes_no_stage_is_refused(change, says):
+    overrides = [f"devices.modulator.{change}"]
+    if not says:
+        overrides.append("devices.modulator.stage.max_points=64")
+        says = "max_points is 64"
+    with pytest.raises(ConfigError) as refused:
+        load_system("razor-pywfs", overrides=overrides)
+    assert says in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "transport"),
+    [
+        ("tcp", TcpTransport),
+        ("serial", SerialTransport),
+        ("usb", UsbTransport),
+        ("emulator", EmulatedTransport),
+    ],
+)
+def test_the_wire_is_the_configured_one_and_connects_to_nothing(kind, transport):
+    config = load_system("razor-pywfs", overrides=[f"devices.modulator.wire.kind={kind}"])
+    assert config.devices.modulator is not None
+    assert type(make_transport(config.devices.modulator, config, {})) is transport
+
+
+def test_one_device_is_built_alone():
+    config = load_system("razor-pywfs", overrides=["devices.modulator.mode=hardware"])
+    stage = build_device("modulator", config, TipTiltModulator)
+    assert isinstance(stage, PiModulator)
+    assert not stage.is_open
+    with pytest.raises(ConfigError, match="makes a PiModulator, not a PhaseScreen"):
+        build_device("modulator", config, PhaseScreen)
+    with pytest.raises(ConfigError, match=r"'razor-shwfs' has no driver for devices\.modulator"):
+        build_device("modulator", load_system("razor-shwfs"), TipTiltModulator)
