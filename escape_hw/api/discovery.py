@@ -1,9 +1,10 @@
-"""Devices that are there: what a search finds, and how packages take part in it."""
+"""What packages tell about devices and libraries that are there, for ``escape discover`` and ``doctor``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,3 +38,23 @@ class Found:
 
 #: What an entry point of the group ``escape.discover`` is: looks at hosts (``name`` or ``name:port``).
 Discoverer = Callable[[Sequence[str]], list[Found]]
+
+
+class NativeLibrary(Protocol):
+    """What an entry point of the group ``escape.libraries`` is, by the name of the driver that loads it."""
+
+    @property
+    def what(self) -> str:
+        """Name for people."""
+
+    @property
+    def default(self) -> tuple[str, ...]:
+        """File names that the system's loader is asked for, the preferred one first."""
+
+    @property
+    def variable(self) -> str:
+        """Environment variable that may hold a path."""
+
+    @property
+    def source(self) -> str:
+        """How to come by it."""

@@ -11,24 +11,21 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 from escape_hw.errors import ConfigError
 from escape_hw.runtime import udev
 from escape_hw.runtime.host import Host, route_to, user_name
 
 if TYPE_CHECKING:
+    from escape_hw.api.discovery import NativeLibrary
     from escape_hw.config.device_models import DeviceConfig
     from escape_hw.config.models import SystemConfig
 
 Level = Literal["ok", "info", "warning", "error"]
 
-#: Vendor libraries by driver: name, file names, environment variable, where to get it.
-LIBRARIES = {
-    "alpao": ("libasdk", ("libasdk.so",), "ESCAPE_ALPAO_LIBRARY", "the SDK that came with the mirror"),
-    "ximea": ("libm3api", ("libm3api.so.2", "libm3api.so"), "ESCAPE_XIMEA_LIBRARY", "XIMEA's installer"),
-    "aravis": ("libaravis", ("libaravis-0.8.so.0",), "ESCAPE_ARAVIS_LIBRARY", "apt install libaravis-0.8-0"),
-}
+#: Group of the vendors' libraries, by driver (:class:`~escape_hw.api.discovery.NativeLibrary`).
+LIBRARIES = "escape.libraries"
 #: Where drivers look for their device unless their section says otherwise.
 HOSTS = {"asm": ("127.0.0.1", 7336)}
 #: Port that is asked about where only the way matters.
@@ -125,18 +122,20 @@ def _packages() -> Iterator[Finding]:
 
 # --------------------------------------------------------------------- vendor libraries
 def _libraries(real: dict[str, DeviceConfig] | None) -> Iterator[Finding]:
-    for driver, (name, files, variable, source) in LIBRARIES.items():
+    for entry in sorted(importlib.metadata.entry_points(group=LIBRARIES), key=lambda one: one.name):
+        driver = entry.name
         if real is not None and driver not in real:
             continue
+        library = cast("NativeLibrary", entry.load())
         option = "" if real is None else str(real[driver].options.get("library", ""))
-        chosen = option or os.environ.get(variable, "")
-        found, failures = _loaded((chosen,) if chosen else files)
+        chosen = option or os.environ.get(library.variable, "")
+        found, failures = _loaded((chosen,) if chosen else library.default)
         if found:
-            yield Finding(f"library {name}", "ok", f"{found} (driver '{driver}')")
+            yield Finding(library.what, "ok", f"{found} (driver '{driver}')")
             continue
-        way = f"{source}; or set {variable}, or options.library in the device's section, to its path"
+        way = f"{library.source}; or set {library.variable}, or options.library in its section, to a path"
         level: Level = "info" if real is None else "error"
-        yield Finding(f"library {name}", level, f"driver '{driver}' cannot load it ({failures})", way)
+        yield Finding(library.what, level, f"driver '{driver}' cannot load it ({failures})", way)
 
 
 def _loaded(names: tuple[str, ...]) -> tuple[str, str]:

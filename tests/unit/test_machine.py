@@ -128,7 +128,7 @@ def test_doctor_names_what_is_wrong_and_the_way_out(bench: Path) -> None:
         assert found[item].level == "warning", item
         assert text in found[item].text
         assert way in found[item].way_out
-    assert found["library libasdk"].level in ("info", "ok")
+    assert found["ALPAO SDK"].level in ("info", "ok")
     assert doctor.exit_code(list(found.values())) == 1
 
 
@@ -147,9 +147,9 @@ def test_what_a_real_system_needs_and_lacks_is_an_error(bench: Path, monkeypatch
     monkeypatch.setenv("ESCAPE_ALPAO_LIBRARY", "/nowhere/libasdk.so")
     config = load_system("razor-shwfs", overrides=["devices.dm.mode=hardware"])
     found = levels(bench, config)
-    assert found["library libasdk"].level == "error"
-    assert "ESCAPE_ALPAO_LIBRARY" in found["library libasdk"].way_out
-    assert "library libm3api" not in found, "its camera is a twin"
+    assert found["ALPAO SDK"].level == "error"
+    assert "ESCAPE_ALPAO_LIBRARY" in found["ALPAO SDK"].way_out
+    assert "XIMEA API" not in found, "its camera is a twin"
     assert doctor.exit_code(list(found.values())) == 2
 
 
@@ -230,6 +230,13 @@ def test_a_device_in_use_says_by_whom(bench: Path) -> None:
     found = {one.serial: one for one in discover((), Host(bench))}
     assert found["12345678"].in_use_by == ("xiCamTool (4711)",)
     assert found["19001"].in_use_by == ()
+
+
+def test_a_library_that_is_there_is_named_by_its_file(bench: Path, monkeypatch) -> None:
+    monkeypatch.setenv("ESCAPE_ALPAO_LIBRARY", "libc.so.6")
+    found = levels(bench)["ALPAO SDK"]
+    assert found.level == "ok"
+    assert re.search(r"/libc\S*\.so", found.text)
 
 
 def test_a_mirror_on_the_network_is_found_where_it_is_looked_for(document) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,10 +14,11 @@ from asm_bench import driver, emulator, port_of, wait_for
 from escape_drivers import asm_messages as m
 from escape_drivers.asm_codec import AsmCodec
 from escape_drivers.asm_driver import AsmMirror, make_asm
+from escape_drivers.asm_observer import AsmObserver
 from escape_drivers.asm_options import AsmOptions
 from escape_hw.api.adaptive_secondary import ShellState
 from escape_hw.config.load import load_system
-from escape_hw.errors import ConfigError, DeviceError, SettingRejected
+from escape_hw.errors import ConfigError, DeviceError, FrameTimeout, SettingRejected
 from escape_hw.testing import Check, Factory, parametrize_device_checks
 from escape_sim.emulators.asm import AsmEmulator
 
@@ -263,3 +266,65 @@ def test_watching_says_nothing_on_a_quiet_link(caplog: pytest.LogCaptureFixture)
         wait_for(lambda: len(made.server.calls) > seen + 3, "signs of life")
         assert mirror.state is ShellState.RUNNING
     assert not [r for r in caplog.records if r.levelno >= logging.WARNING]
+
+
+# --------------------------------------------------------------------- observers
+def test_observers_see_what_the_owner_does() -> None:
+    with emulator() as made, driver(port_of(made)) as owner:
+        owner.set_parameter("telemetry_hz", 100.0)
+        shape = 0.02 * _enabled(owner)
+        owner.send(shape)
+        with contextlib.ExitStack() as stack:
+            observers = [
+                stack.enter_context(AsmObserver("watch", "127.0.0.1", port_of(made))) for _ in range(9)
+            ]
+            for observer in observers:
+                sample = observer.sample(30.0)
+                assert sample.state is ShellState.RUNNING
+                assert sample.position.shape == sample.current.shape == sample.flags.shape == (336,)
+                enabled = np.flatnonzero(_enabled(owner))
+                assert sample.command[enabled] == pytest.approx(0.02e-5)
+                assert set(np.flatnonzero(sample.flags & 8)) == set(owner.limits.disabled)
+            made.inject("trip")
+            for observer in observers:
+                while observer.fault is None:
+                    observer.sample(30.0)
+                assert observer.fault.text == "panic, as arranged"
+        owner.recover()
+        assert made.complaints == ()
+
+
+def test_an_observer_that_sleeps_gets_the_newest() -> None:
+    with emulator() as made:
+        owner = driver(port_of(made)).open()
+        owner.set_parameter("telemetry_hz", 100.0)
+        with AsmObserver("watch", "127.0.0.1", port_of(made)) as observer:
+            first = observer.sample(30.0)
+            wait_for(lambda: time.monotonic_ns() - first.time_ns > 0.5e9, "time passes")
+            behind = time.monotonic_ns() - observer.sample(30.0).time_ns
+            assert behind < 0.4e9
+            wait_for(lambda: _told_health(observer), "health every second")
+            made.stop()
+            with pytest.raises(DeviceError, match="link to"):
+                _watch_on(observer)
+        with pytest.raises(DeviceError):
+            owner.close()
+
+
+def _watch_on(observer: AsmObserver) -> None:
+    for _ in range(1000):
+        observer.sample(30.0)
+
+
+def _told_health(observer: AsmObserver) -> bool:
+    observer.sample(30.0)
+    return observer.health is not None
+
+
+def test_silence_is_told_to_an_observer() -> None:
+    with emulator() as made, AsmObserver("watch", "127.0.0.1", port_of(made)) as observer:
+        made.body.parameters["telemetry_hz"] = 1e-9
+        with contextlib.suppress(FrameTimeout):
+            observer.sample(0.3)  # one may have been on its way
+        with pytest.raises(FrameTimeout, match=r"no telemetry within 0\.05 s"):
+            observer.sample(0.05)
