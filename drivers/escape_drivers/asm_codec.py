@@ -79,7 +79,7 @@ class AsmCodec:
         _HEAD.pack_into(out, 0, MAGIC, VERSIONS[1], _COMMAND, 0, sequence, end - HEADER_BYTES, time_ns)
         view = memoryview(out)
         _CRC.pack_into(out, _HEAD.size, zlib.crc32(view[: _HEAD.size]))
-        _COMMAND_FIELDS.pack_into(out, HEADER_BYTES, counter & 0xFFFFFFFF, _FROM_FLAT)
+        _COMMAND_FIELDS.pack_into(out, HEADER_BYTES, counter, _FROM_FLAT)
         self._metres[:] = metres
         _CRC.pack_into(out, end, zlib.crc32(view[HEADER_BYTES:end]))
         return out
@@ -122,7 +122,7 @@ def frame(kind: int, sequence: int, time_ns: int, payload: bytes) -> bytes:
     """
     if len(payload) > LARGEST_PAYLOAD:
         raise ValueError(f"{len(payload)} bytes are more than the {LARGEST_PAYLOAD} that a frame may have")
-    head = _HEAD.pack(MAGIC, VERSIONS[1], kind, 0, sequence & 0xFFFFFFFF, len(payload), time_ns)
+    head = _HEAD.pack(MAGIC, VERSIONS[1], kind, 0, sequence, len(payload), time_ns)
     return b"".join((head, _CRC.pack(zlib.crc32(head)), payload, _CRC.pack(zlib.crc32(payload))))
 
 

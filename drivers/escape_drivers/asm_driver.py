@@ -95,6 +95,7 @@ class AsmMirror(AdaptiveSecondary):
         self._known, self._fault = ShellState.OFF, ""
         self._found: NDArray[np.float64] | None = None
         self._tried_s = 0.0
+        self._said = ""
         self._skips_in_a_row = self._skipped = 0
 
     # ------------------------------------------------------------------ identity
@@ -200,8 +201,11 @@ class AsmMirror(AdaptiveSecondary):
                 self._reconnect()
         except DeviceError as error:
             # Nobody is there to raise it to; the next call meets it, too.
-            log.warning("%s", error)
+            if str(error) != self._said:
+                log.warning("%s", error)
+            self._said = str(error)
         else:
+            self._said = ""
             if self._known is not before:
                 log.warning(
                     "%s: went from %s to %s by itself %s", self.name, before, self._known, self._fault
@@ -214,7 +218,12 @@ class AsmMirror(AdaptiveSecondary):
     def _reconnect(self) -> None:
         """Get a lost connection back; the mirror stays as it is, nothing is sent again."""
         self._tried_s = time.monotonic()
-        self._adopt(self._link.connect())
+        welcome = self._link.connect()
+        try:
+            self._adopt(welcome)
+        except DeviceError as error:
+            self._link.drop(f"it came back, but {error.args[1]}")
+            raise
         # What became of the last command before the link broke is not known; its shape is.
         self._checked().reset(self._found)
         log.warning("%s: the link is back; the mirror is %s, nothing was sent again", self.name, self._known)

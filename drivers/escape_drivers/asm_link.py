@@ -20,6 +20,8 @@ log = logging.getLogger(__name__)
 
 #: Most bytes taken from the socket at once.
 _CHUNK = 65536
+#: Numbers of requests and commands begin anew after this one.
+_WRAP = 0xFFFFFFFF
 R = TypeVar("R", bound=m.Welcome | m.Ack | m.Done | m.Param | m.Health)
 
 
@@ -127,8 +129,8 @@ class AsmLink:
         DeviceLost
             No answer, or the connection broke; it is closed now.
         """
-        self._sequence += 1
-        return self._exchange(self._codec.request(self._sequence, time.monotonic_ns(), message), answer)
+        sequence = self._next()
+        return self._exchange(self._codec.request(sequence, time.monotonic_ns(), message), answer)
 
     def command(self, metres: NDArray[np.float64]) -> m.Ack:
         """Send a shape ``(n_act,)`` in metres from flat and wait for its acknowledgement.
@@ -138,10 +140,14 @@ class AsmLink:
         Refused, DeviceLost
             As for :meth:`ask`.
         """
-        self._sequence += 1
-        self._counter += 1
-        data = self._codec.command(self._sequence, time.monotonic_ns(), self._counter, metres)
+        self._counter = self._counter % _WRAP + 1
+        data = self._codec.command(self._next(), time.monotonic_ns(), self._counter, metres)
         return self._exchange(data, m.Ack)
+
+    def _next(self) -> int:
+        """The next sequence number; 0 stands for what nobody asked."""
+        self._sequence = self._sequence % _WRAP + 1
+        return self._sequence
 
     def receive(self, timeout_s: float) -> list[m.Reply]:
         """Whatever comes unasked within a time; what arrived together is delivered together.
@@ -176,7 +182,7 @@ class AsmLink:
     def _exchange(self, data: bytes | bytearray, answer: type[R]) -> R:
         if self._socket is None:
             raise self.lost()
-        asked, deadline = self._sequence & 0xFFFFFFFF, time.monotonic() + self._reply_s
+        asked, deadline = self._sequence, time.monotonic() + self._reply_s
         try:
             self._socket.settimeout(self._reply_s)
             self._socket.sendall(data)

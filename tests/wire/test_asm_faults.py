@@ -119,6 +119,35 @@ def test_a_command_into_a_broken_link_is_lost_and_says_so() -> None:
             assert mirror.state is ShellState.RUNNING
 
 
+def test_numbers_begin_anew_after_four_thousand_million() -> None:
+    with emulator() as made:
+        mirror = driver(port_of(made))
+        mirror.lift = False
+        with mirror:
+            mirror._link._sequence = mirror._link._counter = 0xFFFFFFFF - 30
+            # As a peer that has counted along.
+            assert made.server.owner is not None
+            made.server.owner._sequence_in = made.server.counter = 0xFFFFFFFF - 31
+            mirror.go(ShellState.RUNNING)
+            for _ in range(60):
+                mirror.send(np.zeros(336))
+            assert 0 < mirror._link._sequence < 100
+            assert 0 < mirror._link._counter < 100
+        assert made.complaints == ()
+
+
+def test_a_mirror_that_comes_back_dirty_is_not_taken_over() -> None:
+    with emulator() as made:
+        mirror = driver(port_of(made), heartbeat_s=0.02, retry_s=0.05).open()
+        made.inject("dust:12")
+        broken(mirror, made)
+        wait_for(lambda: "came back, but actuators [12]" in mirror._link.why, "the dust is noticed")
+        with pytest.raises(DeviceLost, match=r"disabled = \[12, 248"):
+            mirror.send(np.zeros(336))
+        with pytest.raises(DeviceLost):
+            mirror.close()
+
+
 def test_who_comes_back_takes_over_from_his_own_half_open_connection() -> None:
     with emulator() as made:
         mirror = driver(port_of(made), reply_s=0.3, heartbeat_s=0.02, retry_s=0.05).open()
@@ -214,8 +243,8 @@ def test_silence_is_first_held_and_then_rested() -> None:
 
 
 def test_signs_of_life_keep_a_shell_afloat() -> None:
-    with emulator(hold=1.0, rest=1.5) as made, driver(port_of(made), heartbeat_s=0.05) as mirror:
-        time.sleep(2.0)
+    with emulator(hold=1.0, rest=2.0) as made, driver(port_of(made), heartbeat_s=0.05) as mirror:
+        time.sleep(2.5)
         assert mirror.state is ShellState.RUNNING
         assert made.complaints == ()
 

@@ -43,7 +43,7 @@ def ended(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
 @pytest.fixture
 def remote() -> Iterator[tuple[subprocess.Popen[str], int]]:
     """``escape emulate asm`` and its port."""
-    options = ["speed=1000", "hold=0.3", "rest=1.0"]
+    options = ["speed=1000", "hold=0.5", "rest=3.0"]
     words = [*_ESCAPE, "emulate", "asm", "--port", "0", *(f"--option={option}" for option in options)]
     with ended(subprocess.Popen(words, stderr=subprocess.PIPE, text=True)) as process:
         assert process.stderr is not None
@@ -56,7 +56,7 @@ def test_a_peer_that_is_stopped_is_told_in_time_and_rests_when_it_goes_on(
     remote: tuple[subprocess.Popen[str], int],
 ) -> None:
     process, port = remote
-    mirror = driver(port, reply_s=0.5).open()
+    mirror = driver(port, reply_s=0.5, heartbeat_s=0.05).open()
     process.send_signal(signal.SIGSTOP)
     with pytest.raises(DeviceLost, match=r"no answer within 0\.5 s"):
         mirror.send(np.zeros(336))

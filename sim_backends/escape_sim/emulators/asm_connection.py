@@ -24,6 +24,11 @@ _ABSOLUTE = 0
 _OF_THE_MIRROR = ("skip", "dust", "stuck", "overcurrent", "watchdog", "trip", "calm")
 
 
+def _later(number: int, than: int) -> bool:
+    """True when a number that begins anew after 2**32 is later than another."""
+    return 0 < (number - than) & 0xFFFFFFFF < 1 << 31
+
+
 class Connection(asyncio.Protocol):
     """Reads requests, answers them, and plays the faults of the script.
 
@@ -142,8 +147,7 @@ class Connection(asyncio.Protocol):
         low, high = self._server.versions
         if request.kind != w.HELLO and not low <= request.version <= high:
             return self._refuse(request, w.UNSUPPORTED, f"version {request.version} is not spoken here")
-        ahead = (request.sequence - self._sequence_in) & 0xFFFFFFFF
-        if not 0 < ahead < 1 << 31:
+        if not _later(request.sequence, self._sequence_in):
             return self._refuse(request, w.STALE, f"request {request.sequence} after {self._sequence_in}")
         self._sequence_in = request.sequence
         if request.sent_ns < self._sent_ns:
@@ -234,7 +238,7 @@ class Connection(asyncio.Protocol):
         if found is None:
             return self._refuse(request, w.BAD_LENGTH, f"{len(request.payload)} bytes of command")
         counter, mode, metres = found
-        if counter <= server.counter:
+        if not _later(counter, server.counter):
             return self._refuse(request, w.STALE, f"command {counter} after {server.counter}")
         server.counter = counter
         self._note(request, metres.copy())
