@@ -35,7 +35,8 @@ def driver(emulator: E727, *overrides: str) -> PiModulator:
 def said(emulator: E727, since: int = 0) -> list[str]:
     """Commands that set something, in order; ``ERR?`` stands for itself."""
     everything = emulator.controller.seen[since:]
-    return [line for line in everything if not line.partition(" ")[0].endswith("?") or line == "ERR?"]
+    questions = [line for line in everything if line.partition(" ")[0].endswith("?") or line == "#9"]
+    return [line for line in everything if line not in questions or line == "ERR?"]
 
 
 def confirmed(*commands: str) -> list[str]:
