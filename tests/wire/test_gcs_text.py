@@ -173,4 +173,4 @@ def test_a_line_without_end_is_refused_and_the_next_one_understood():
 
 
 def test_bytes_that_are_commands_are_taken_out_of_the_line():
-    assert list(Framer().feed(b"PO\x05S?\n\x09\0")) == ["#5", "POS?", "#9"]
+    assert list(Framer().feed(b"PO\x05S?\n\x09\0")) == ["\x05", "POS?", "\x09"]
