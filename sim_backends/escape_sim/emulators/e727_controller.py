@@ -77,7 +77,7 @@ class Controller:
             "IMP": self._step_response, "TWC": waves.clear_trigger, "TWS": waves.set_trigger,
             "CTO": waves.set_output, "CTO?": waves.output, "DRC": recorder.configure,
             "DRC?": recorder.configuration, "DRT": recorder.set_trigger,
-            "DRT?": lambda _: f"0={recorder.trigger} 0\n",
+            "DRT?": lambda _: "0=0 0\n",
             "RTR": recorder.set_rate, "RTR?": lambda _: f"{recorder.rate}\n",
             "TNR?": lambda _: f"{len(recorder.sources)}\n", "DRL?": recorder.lengths, "DRR?": recorder.read,
         }  # fmt: skip

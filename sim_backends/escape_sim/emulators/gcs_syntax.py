@@ -57,8 +57,8 @@ class Framer:
                 overflowed, self._overflowed = self._overflowed, False
                 if overflowed:
                     yield None
-                elif line.strip():
-                    yield line.decode(CODE, "replace").strip()
+                elif text := line.decode(CODE, "replace").strip():
+                    yield text
             elif chr(byte) in ONE_BYTE:
                 yield chr(byte)
             elif len(self._line) >= MAX_LINE:
