@@ -1,4 +1,4 @@
 """Drivers of real hardware, found by the core through the ``escape.devices`` entry points.
 
-No driver loads its vendor's library before its device is opened.
+Vendor libraries are loaded when a device is opened, never before.
 """

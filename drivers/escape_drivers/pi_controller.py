@@ -23,6 +23,10 @@ log = logging.getLogger(__name__)
 
 #: Parameter that holds the servo's period.
 _SERVO_PERIOD = 0x0E000200
+#: Question of a single byte: which wave generators run.
+_RUNNING = 9
+#: Error that every stop leaves.
+_STOPPED = 10
 #: How often a stage on its way is asked whether it has arrived, in seconds.
 _POLL_S = 0.01
 #: Values of a line of points: the other five arguments are table, how, kind, first and number.
@@ -48,6 +52,7 @@ class E727:
 
     def __init__(self, link: Link, axes: tuple[str, str]) -> None:
         self.link, self.axes = link, axes
+        self._order: list[str] | None = None
 
     # ------------------------------------------------------------------ who and what
     @property
@@ -181,6 +186,14 @@ class E727:
         if number:
             raise Refused(self.link.name, number, cause)
 
+    def halt(self) -> None:
+        """Stop all motion, auto-zero too; the error that this leaves is expected."""
+        try:
+            self.link.tell("STP")
+        except Refused as stopped:
+            if stopped.number != _STOPPED:
+                raise
+
     # ------------------------------------------------------------------ waves
     def write_points(self, table: int, points: NDArray[np.float64]) -> None:
         """A wave table point by point, in as many lines as it takes."""
@@ -224,9 +237,11 @@ class E727:
         self.link.tell("WGO", self.axes[0], 0, self.axes[1], 0)
 
     def running(self) -> list[bool]:
-        """Which of the axes' generators run."""
-        modes = self._each("WGO?", pi_gcs.values)
-        return [pi_gcs.whole(mode, 0) != 0 for mode in modes]
+        """Which of the axes' generators run: a mask over all axes, asked with a single byte."""
+        if self._order is None:
+            self._order = self.channels()
+        mask = self.link.ask_byte(_RUNNING)
+        return [bool(mask >> self._order.index(axis) & 1) for axis in self.axes]
 
     def played(self) -> tuple[Turn, list[NDArray[np.float64]]]:
         """The waves that the generators play: their turn, and the targets of both axes ``(points,)`` each."""

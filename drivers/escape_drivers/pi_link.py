@@ -103,10 +103,10 @@ class Link:
         with self._lock:
             return self._ask(parse, pi_gcs.line(question, *arguments))
 
-    def ask_byte(self, number: int) -> str:
-        """The answer to a question of a single byte, such as 9 (generators running)."""
+    def ask_byte(self, number: int) -> int:
+        """The mask that answers a question of a single byte, such as 9 (generators running)."""
         with self._lock:
-            return self._ask(pi_gcs.single, bytes([number]))
+            return self._ask(lambda reply: pi_gcs.whole(pi_gcs.single(reply), 16), bytes([number]))
 
     def tell(self, command: str, *arguments: str | float, again: bool = True) -> None:
         """Give a command and ask how it went.

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: What becomes of a stage that nobody can reach.
+_GOES_ON = "the stage goes on as it was; opening it again stops and centres it, cutting its power lets it go"
+
 
 def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> PiModulator:
     """Entry point ``pi-e727``.
@@ -112,7 +115,7 @@ class PiModulator(TipTiltModulator):
             try:
                 start_up(self.name, here.controller, self._section.stage, here.travel, self._sleep)
             except BaseException as failure:
-                self._tidy(lambda: self._switch_off(here.controller), failure)
+                self._tidy(lambda: self._give_up(here.controller), failure)
                 raise
         self._connection = here
 
@@ -145,6 +148,12 @@ class PiModulator(TipTiltModulator):
         finally:
             here.controller.link.close()
 
+    def _give_up(self, controller: E727) -> None:
+        """Stop whatever a start-up had begun, then switch off."""
+        if controller.link.alive:
+            controller.halt()
+        self._switch_off(controller)
+
     def _switch_off(self, controller: E727) -> None:
         """Servos off and no volts, unless the link has been lost before, which was told then."""
         if controller.link.alive:
@@ -160,7 +169,8 @@ class PiModulator(TipTiltModulator):
         try:
             with self._understood():
                 here.turning.turn(modulation)
-        except DeviceLost:
+        except DeviceLost as lost:
+            lost.add_note(_GOES_ON)
             raise
         except DeviceError as failure:
             # A circle that is not the one asked for is worse than none.
@@ -171,9 +181,13 @@ class PiModulator(TipTiltModulator):
     def _park(self) -> None:
         here = self._connected()
         self._now = None
-        with self._understood():
-            here.turning.stop()
-            here.controller.go(here.travel.centre, self._section.stage.settle_s, self._sleep)
+        try:
+            with self._understood():
+                here.turning.stop()
+                here.controller.go(here.travel.centre, self._section.stage.settle_s, self._sleep)
+        except DeviceLost as lost:
+            lost.add_note(_GOES_ON)
+            raise
 
     def _status(self) -> ModulatorStatus:
         with self._understood():

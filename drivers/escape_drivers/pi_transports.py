@@ -115,11 +115,11 @@ class TcpTransport:
     def read(self, timeout_s: float) -> bytes:
         """What has arrived."""
         wire = self._connected()
-        # A time-out of zero would mean "non-blocking", whose answer is another error.
-        wire.settimeout(max(timeout_s, 1e-6))
+        # Zero means "do not wait at all": the least that the kernel waits is a millisecond.
+        wire.settimeout(timeout_s)
         try:
             data = wire.recv(_SIZE)
-        except TimeoutError:
+        except (TimeoutError, BlockingIOError):
             return b""
         except OSError as error:
             raise self._gone(error) from error

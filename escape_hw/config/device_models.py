@@ -183,8 +183,14 @@ class ModulatorConfig(DeviceConfig):
     frequency_hz: float = Field(
         gt=0, le=5000, description="turns per second that are asked for, hertz; the stage's clock rounds them"
     )
+    beam_m: float | None = Field(
+        None, gt=0, le=10, description="diameter of the beam on the modulator's mirror, metres"
+    )
     rad_per_lambda_d: float = Field(
-        gt=0, le=0.1, description="mirror tilt that moves the beam by 1 lambda/D on the pyramid, radians"
+        gt=0,
+        le=0.1,
+        description="mirror tilt that moves the beam by 1 lambda/D on the pyramid, radians; absent: "
+        "wavelength / (2 beam_m)",
     )
     max_tilt_rad: float = Field(
         gt=0, le=0.1, description="largest tilt of the mirror from its centre, radians"

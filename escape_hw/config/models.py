@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal, Self, TypeVar, get_args
+from typing import Any, Literal, Self, TypeVar, get_args
 
 from pydantic import Field, model_validator
 
 from escape_hw.config.device_models import DeviceConfig, DevicesConfig, Mode
+from escape_hw.config.modulator_models import with_tilt
 from escape_hw.config.section import Breach, Section, enforce
 from escape_hw.config.sensor_models import AnySensor, PyramidSection, SensorSection
 from escape_hw.config.telescope_models import TelescopeSection
@@ -126,6 +127,12 @@ class SystemConfig(Section):
     )
     twin: TwinConfig = Field(default_factory=TwinConfig, description="the simulated bench")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _derived(cls, document: Any) -> Any:
+        """Keys that follow from others."""
+        return with_tilt(document)
+
     @property
     def simulated(self) -> bool:
         """True when any device is to be a twin."""
@@ -184,6 +191,12 @@ class SystemConfig(Section):
         if radius and modulator is None:
             text = "needs a modulator, [devices.modulator]; 0 is a pyramid without modulation"
             yield Breach("sensor.modulation", radius, text)
+        beam_m = None if modulator is None else modulator.beam_m
+        if modulator is not None and beam_m is not None:
+            tilt = self.system.wavelength_m / (2 * beam_m)
+            if abs(modulator.rad_per_lambda_d / tilt - 1) > 0.05:
+                text = f"a beam of {beam_m:g} m has {tilt:.3g} (wavelength / (2 beam_m)); leave one out"
+                yield Breach("devices.modulator.rad_per_lambda_d", modulator.rad_per_lambda_d, text)
         if modulator is not None and radius * modulator.rad_per_lambda_d > modulator.max_tilt_rad:
             largest = modulator.max_tilt_rad / modulator.rad_per_lambda_d
             yield Breach("sensor.modulation", radius, f"the modulator reaches {largest:.4g} lambda/D")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -19,6 +19,24 @@ Correction = Listed[
     ]
 ]
 AxisGain = Annotated[float, Field(ge=-10, le=10)]
+
+
+def with_tilt(document: Any) -> Any:
+    """A document whose modulator knows its tilt per lambda/D, if it tells the size of its beam.
+
+    Reflection doubles the tilt, and a beam of diameter D on the mirror has its lambda/D there:
+    ``rad_per_lambda_d = wavelength / (2 D)``.
+    """
+    try:
+        wavelength_m, modulator = document["system"]["wavelength_m"], document["devices"]["modulator"]
+        if "rad_per_lambda_d" in modulator or not modulator["beam_m"] > 0:
+            return document
+        tilt = wavelength_m / (2 * modulator["beam_m"])
+    except (KeyError, TypeError):
+        # What is missing or of the wrong kind is reported key by key later on.
+        return document
+    devices = {**document["devices"], "modulator": {**modulator, "rad_per_lambda_d": tilt}}
+    return {**document, "devices": devices}
 
 
 class WireConfig(Section):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from escape_drivers.pi_modulator import PiModulator
@@ -11,7 +13,7 @@ from escape_drivers.pi_wire import EmulatedTransport, make_transport
 from escape_hw.api.modulator import TipTiltModulator
 from escape_hw.api.screen import PhaseScreen
 from escape_hw.bench import build_device
-from escape_hw.config.load import load_system
+from escape_hw.config.load import load_system, load_text
 from escape_hw.errors import ConfigError
 
 
@@ -37,6 +39,19 @@ def test_what_makes_no_stage_is_refused(change, says):
     with pytest.raises(ConfigError) as refused:
         load_system("razor-pywfs", overrides=overrides)
     assert says in str(refused.value)
+
+
+def test_the_tilt_follows_from_the_beam():
+    text = load_system("razor-pywfs").to_toml()
+    wide = re.sub(r"rad_per_lambda_d = .*", "beam_m = 6.75e-3", text)
+    modulator = load_text(wide, "bench.toml").devices.modulator
+    assert modulator is not None
+    # Half of lambda/D: 635 nm on 6.75 mm are 94.1 urad, and reflection doubles the tilt.
+    assert modulator.rad_per_lambda_d == pytest.approx(47.04e-6, rel=1e-3)
+    again = load_text(load_text(wide, "bench.toml").to_toml(), "bench.toml")
+    assert again.devices.modulator == modulator
+    with pytest.raises(ConfigError, match=r"a beam of 0\.003 m has 0\.000106 .* leave one out"):
+        load_system("razor-pywfs", overrides=["devices.modulator.beam_m=3e-3"])
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,8 @@ WRONG = [
     ("WAV 1 X PNT 1 2 5", 404), ("WAV 1 X SIN_P 40 9 0 80 0 20", 403),
     ("WAV 1 X SIN_P 40 9 0 40 0 40", 405), ("WAV 1 X SIN_P 300000 9 0 9 0 4", 67), ("WSL 1 7", 401),
     ("WGO 1 1", 75), ("WGO 1 2", 406), ("WTR 0 0 0", 17), ("DRC 9 1 2", 57), ("DRC 1 7 2", 58),
-    ("DRC 1 1 9", 59), ("HLT", 10), ("STP", 10), ("#24", 10), ("MOV " + "1 2 " * 20, 24),
+    ("DRC 1 1 9", 59), ("DRT 0 2 0", 59), ("HLT", 10), ("STP", 10), ("\x18", 10), ("#24", 2), ("#", 2),
+    ("MOV " + "1 2 " * 20, 24),
 ]  # fmt: skip
 
 
@@ -122,6 +123,20 @@ def test_errors_have_to_be_asked_for(client):
     assert client.complaints == ["no ERR? after 'SVO 1 1' (then: 'SVO 2 1')"]
     client.controller.hang_up()
     assert client.complaints[1:] == ["no ERR? after 'SVO 2 1' (then: 'hung up')"]
+
+
+def test_moves_keep_to_the_velocity_and_the_range(servo):
+    assert servo.error("VEL 1 1000") == 0
+    assert servo.error("MOV 1 500") == 0
+    servo.wait(0.25)
+    assert servo.values("POS? 1")[0] == pytest.approx(250.0, abs=1.0)
+    assert (servo.say("ONT? 1"), servo.values("MOV? 1")) == ("1=0\n", [500.0])
+    servo.wait(0.3)
+    assert servo.say("ONT? 1") == "1=1\n"
+    assert servo.error("CCL 1 advanced") == 0
+    assert servo.error("SPA 1 0x07000001 600") == 0
+    assert servo.say("TMX? 1") == "1=6.000000000e+02\n"
+    assert servo.error("MOV 1 700") == 7
 
 
 def circle(client: Client, points: int = 40, *, extra: str = "") -> None:

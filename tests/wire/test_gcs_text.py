@@ -158,6 +158,25 @@ def test_garbage_neither_crashes_the_controller_nor_moves_anything(noise):
     assert controller.state.describe() == "at rest"
 
 
+WORDS = [*"0123X&+", "-1", "1e9", "nan", "SIN_P", "PNT", "0x101", "40", "900", "262145", "9" * 30, "advanced"]
+SAID = st.tuples(
+    st.sampled_from(sorted(Controller()._handlers)), st.lists(st.sampled_from(WORDS), max_size=8)
+)
+
+
+@given(st.lists(SAID, max_size=12))
+@settings(max_examples=60, deadline=None)
+def test_any_words_get_an_answer_or_an_error(said):
+    now = [0.0]
+    controller = Controller(Make(zeroed=True), clock=lambda: now[0])
+    for name, words in said:
+        now[0] += 1e-3
+        (line,) = controller.received(f"{name} {' '.join(words)}\n".encode())
+        reply = controller.answer(line)
+        error = int(controller.answer("ERR?"))
+        assert bool(reply) == (name.endswith("?") and error == 0), (name, words, error)
+
+
 @given(st.integers(1, 20))
 def test_a_command_that_is_not_whole_is_not_carried_out(cut):
     controller = Controller(Make(zeroed=True), clock=lambda: 0.0)
@@ -173,4 +192,4 @@ def test_a_line_without_end_is_refused_and_the_next_one_understood():
 
 
 def test_bytes_that_are_commands_are_taken_out_of_the_line():
-    assert list(Framer().feed(b"PO\x05S?\n\x09\0")) == ["#5", "POS?", "#9"]
+    assert list(Framer().feed(b"PO\x05S?\n\x09\0")) == ["\x05", "POS?", "\x09"]

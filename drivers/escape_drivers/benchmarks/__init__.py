@@ -1,1 +1,1 @@
-"""What the drivers cost."""
+"""Benchmarks of the drivers."""

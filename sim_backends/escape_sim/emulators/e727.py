@@ -96,7 +96,7 @@ class E727(Emulator):
 
     def report(self) -> dict[str, Any]:
         """Counters and condition."""
-        return self.controller.report()
+        return {**self.controller.report(), "left": self.server.conversation.left}
 
 
 def _make(request: EmulatorRequest) -> Make:

@@ -16,6 +16,7 @@ from escape_sim.emulators.e727_state import Make, State
 from escape_sim.emulators.e727_waves import Waves
 from escape_sim.emulators.gcs_syntax import (
     MAX_ARGUMENTS,
+    ONE_BYTE,
     Framer,
     Refusal,
     items,
@@ -76,7 +77,7 @@ class Controller:
             "IMP": self._step_response, "TWC": waves.clear_trigger, "TWS": waves.set_trigger,
             "CTO": waves.set_output, "CTO?": waves.output, "DRC": recorder.configure,
             "DRC?": recorder.configuration, "DRT": recorder.set_trigger,
-            "DRT?": lambda _: f"0={recorder.trigger} 0\n",
+            "DRT?": lambda _: "0=0 0\n",
             "RTR": recorder.set_rate, "RTR?": lambda _: f"{recorder.rate}\n",
             "TNR?": lambda _: f"{len(recorder.sources)}\n", "DRL?": recorder.lengths, "DRR?": recorder.read,
         }  # fmt: skip
@@ -102,11 +103,12 @@ class Controller:
     def _answer(self, line: str | None) -> bytes:
         if line is None:
             return self._refuse("a line without end", Refusal(3))
-        self.seen.append(line)
+        shown = ONE_BYTE.get(line, line)
+        self.seen.append(shown)
         try:
             return self._dispatch(line)
         except Refusal as refusal:
-            return self._refuse(line, refusal)
+            return self._refuse(shown, refusal)
 
     def _refuse(self, line: str, refusal: Refusal) -> bytes:
         """Remember the error. A careful driver foresees every refusal; a stop is none."""
@@ -117,8 +119,8 @@ class Controller:
         return b""
 
     def _dispatch(self, line: str) -> bytes:
-        if line.startswith("#"):
-            return self._byte(line)
+        if line in ONE_BYTE:
+            return self._byte(ONE_BYTE[line])
         words = line.split()
         name, args = words[0].upper(), words[1:]
         if name == "ERR?":
@@ -142,6 +144,7 @@ class Controller:
             self._unasked = ""
 
     def _byte(self, line: str) -> bytes:
+        """Commands of a single byte, as people write them."""
         if line == "#24":
             self._motion.halt([])
         busy = any(self.state.zeroing(name) for name in self.state.axes)

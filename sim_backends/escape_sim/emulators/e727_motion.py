@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from escape_sim.emulators.e727_stage import SERVO_S, Rest, Wave
+from escape_sim.emulators.e727_stage import SERVO_S, Ramp, Rest, Wave
 from escape_sim.emulators.e727_state import PER_VOLT, VOLTS, State
 from escape_sim.emulators.gcs_syntax import Refusal, grouped, items, number, whole
 
@@ -77,11 +76,13 @@ class Motion:
             state.require_idle(name)
             if not state.axes[name].servo:
                 raise Refusal(5)
-            if not 0 <= place <= state.make.travel:
+            low, high = state.travel(name)
+            if not low <= place <= high:
                 raise Refusal(7)
-        state.stage.advance()
+        now = state.stage.advance()
         for name, place in pairs:
-            state.stage.axes[name].source = Rest(place)
+            here = float(state.stage.axes[name].source.at(np.array([now]))[0])
+            state.stage.axes[name].source = Ramp(here, place, now, state.axes[name].velocity * SERVO_S)
 
     def auto_zero(self, args: Sequence[str]) -> None:
         """``ATZ axis volts|NaN``: sweeps the full range."""
@@ -162,11 +163,11 @@ class Motion:
 
     def lower(self, args: Sequence[str]) -> str:
         """``TMN?``."""
-        return items({name: self._limit(name, 0x07000000) for name in self._state.axes_of(args)})
+        return items({name: self._state.travel(name)[0] for name in self._state.axes_of(args)})
 
     def upper(self, args: Sequence[str]) -> str:
         """``TMX?``."""
-        return items({name: self._limit(name, 0x07000001) for name in self._state.axes_of(args)})
+        return items({name: self._state.travel(name)[1] for name in self._state.axes_of(args)})
 
     def units(self, args: Sequence[str]) -> str:
         """``PUN?``."""
@@ -180,11 +181,6 @@ class Motion:
             off = abs(state.position(name) - state.target(name)) > float(state.parameters[name, 0x07000900])
             mask |= (state.zeroing(name) or state.moved_by_wave(name) or off) << bit
         return mask
-
-    def _limit(self, name: str, parameter: int) -> float:
-        value = float(self._state.parameters[name, parameter])
-        assert math.isfinite(value)
-        return value
 
 
 def _unique(pairs: Sequence[Sequence[str]]) -> list[Sequence[str]]:

@@ -30,7 +30,6 @@ class Recorder:
         self._stage = stage
         self.sources = {table: ("0", NOTHING) for table in range(1, TABLES + 1)}
         self.rate = 1
-        self.trigger = 0
         self._kept: dict[int, list[NDArray[np.float64]]] = {}
         self._begun = -1
         self._next = 0
@@ -99,13 +98,10 @@ class Recorder:
         self.rate = whole(text)
 
     def set_trigger(self, args: Sequence[str]) -> None:
-        """``DRT table source value``: 0 the usual commands, 2 the next command."""
+        """``DRT table source value``: here for all tables (0) and the usual commands (0) only."""
         for text, option, _value in grouped(args, 3):
-            if whole(text):
-                self._table(text)
-            if whole(option) not in (0, 1, 2):
+            if whole(text) or whole(option):
                 raise Refusal(59)
-            self.trigger = whole(option)
 
     def lengths(self, args: Sequence[str]) -> str:
         """``DRL?``: points recorded."""

@@ -35,6 +35,31 @@ class Rest:
         return np.full(len(steps), self.place)
 
 
+@dataclass(frozen=True)
+class Ramp:
+    """From one place to another at a constant velocity.
+
+    Parameters
+    ----------
+    begin, end
+        Places.
+    start
+        Servo step of the beginning.
+    per_step
+        Way in a servo period.
+    """
+
+    begin: float
+    end: float
+    start: int
+    per_step: float
+
+    def at(self, steps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Targets; the end is held."""
+        way = np.clip((steps - self.start) * self.per_step, 0.0, abs(self.end - self.begin))
+        return np.asarray(self.begin + np.copysign(way, self.end - self.begin))
+
+
 @dataclass(frozen=True, eq=False)
 class Wave:
     """A wave table played back.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from escape_sim.emulators.e727_recorder import POINTS, TABLES, Recorder
-from escape_sim.emulators.e727_stage import SERVO_S, Axis, Rest, Stage, Wave
+from escape_sim.emulators.e727_stage import SERVO_S, Axis, Ramp, Rest, Stage, Wave
 from escape_sim.emulators.gcs_syntax import Refusal
 
 #: Microradians per volt, and the volts that the amplifier gives.
@@ -113,6 +113,11 @@ class State:
             self.axis(name)
         return list(args) or list(self.axes)
 
+    def travel(self, name: str) -> tuple[float, float]:
+        """Range of an axis, as its parameters have it."""
+        low, high = (self.parameters[name, number] for number in (0x07000000, 0x07000001))
+        return float(low), float(high)
+
     def moved_by_wave(self, name: str) -> bool:
         """True while a wave generator drives the axis."""
         source = self.stage.axes[name].source
@@ -146,7 +151,10 @@ class State:
         return self.stage.axes[name].position + offset
 
     def target(self, name: str) -> float:
-        """Where the axis is told to be now."""
+        """Where the axis is told to be now; of a move its end."""
+        source = self.stage.axes[name].source
+        if isinstance(source, Ramp):
+            return source.end
         return float(self.stage.axes[name].source.at(np.array([self.stage.now]))[0])
 
     def describe(self) -> str:

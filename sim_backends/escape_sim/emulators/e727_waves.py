@@ -172,7 +172,8 @@ class Waves:
         if not state.axes[name].servo:
             raise Refusal(5)
         wave = self.tables[generator.table] + generator.offset
-        if wave.min() < 0 or wave.max() > state.make.travel:
+        low, high = state.travel(name)
+        if wave.min() < low or wave.max() > high:
             raise Refusal(405)
         return wave
 

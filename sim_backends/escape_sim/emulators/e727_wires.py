@@ -28,6 +28,11 @@ class Conversation:
         Who answers.
     wire
         The faults.
+
+    Attributes
+    ----------
+    left
+        In what condition the last client left the stage; empty before anybody left.
     """
 
     def __init__(self, controller: Controller, wire: FaultyWire) -> None:
@@ -59,7 +64,15 @@ class Conversation:
 
 
 class Server(Protocol):
-    """Something that listens in a thread of its own."""
+    """Something that listens in a thread of its own.
+
+    Attributes
+    ----------
+    conversation
+        With whoever is connected.
+    """
+
+    conversation: Conversation
 
     def start(self) -> str:
         """Begin; returns where."""
@@ -87,7 +100,6 @@ class TcpServer:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._listener: socket.socket | None = None
-        self.clients = self.refused = 0
 
     def start(self) -> str:
         """Begin to listen; returns ``tcp HOST:PORT``."""
@@ -139,13 +151,11 @@ class TcpServer:
     def _welcome(self, listener: socket.socket, client: socket.socket | None) -> socket.socket | None:
         other, address = listener.accept()
         if client is not None:
-            self.refused += 1
             self._controller.state.complain(
                 f"second client from {address[0]} refused: the controller serves one at a time"
             )
             other.close()
             return client
-        self.clients += 1
         other.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         other.settimeout(1.0)
         return other

@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-#: Commands of a single byte: moving, ready, macro running, generators running, stop all.
-ONE_BYTE = {5: "#5", 7: "#7", 8: "#8", 9: "#9", 24: "#24"}
+#: Commands of a single byte, and how people write them: moving, ready, macro, generators, stop all.
+ONE_BYTE = {"\x05": "#5", "\x07": "#7", "\x08": "#8", "\x09": "#9", "\x18": "#24"}
 #: Arguments and bytes of a line at most.
 MAX_ARGUMENTS, MAX_LINE = 32, 4096
 CODE = "cp1252"
@@ -57,10 +57,10 @@ class Framer:
                 overflowed, self._overflowed = self._overflowed, False
                 if overflowed:
                     yield None
-                elif line.strip():
-                    yield line.decode(CODE, "replace").strip()
-            elif byte in ONE_BYTE:
-                yield ONE_BYTE[byte]
+                elif text := line.decode(CODE, "replace").strip():
+                    yield text
+            elif chr(byte) in ONE_BYTE:
+                yield chr(byte)
             elif len(self._line) >= MAX_LINE:
                 self._overflowed = True
             elif byte:
