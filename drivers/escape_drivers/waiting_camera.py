@@ -139,6 +139,10 @@ class WaitingCamera(Camera):
             )
 
     def _configure(self, settings: CameraSettings) -> None:
+        if self._acquiring:
+            raise DeviceError(
+                self.name, "could not be stopped, and keeps its settings; close and open it again"
+            )
         before = self._settings
         try:
             self._settings = self._applied(settings)
@@ -173,22 +177,26 @@ class WaitingCamera(Camera):
         with self._waiting:
             # A reader that came in after stop() may have started it again.
             self._end_if_acquiring()
+            self._acquiring = False
             self._disconnect()
+            self._limits = None
+            self._slowest_hz, self._fastest_hz = 0.0, math.inf
 
     def _abandon(self) -> None:
         self._close()
 
     def _end_if_acquiring(self) -> None:
         if self._acquiring:
-            self._acquiring = False
-            self._quietly(self._end)
+            self._acquiring = not self._managed(self._end)
 
-    def _quietly(self, step: Callable[[], None]) -> None:
-        """Take a step of shutting down; a camera that has gone cannot, and is not read any more."""
+    def _managed(self, step: Callable[[], None]) -> bool:
+        """Take a step of stopping or closing, which a camera that has gone cannot; false when it failed."""
         try:
             step()
         except DeviceError as error:
             log.warning("while stopping or closing: %s", error)
+            return False
+        return True
 
     def _next_frame(self, timeout_s: float) -> Frame:
         deadline = time.monotonic() + timeout_s

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli import calibrate, loop, perf, products, reproduce, systems
+from escape_hw.cli import calibrate, loop, perf, products, rehearse, reproduce, systems
 
 app = typer.Typer(
     name="escape",
@@ -30,6 +30,7 @@ app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)
 app.command("perf")(perf.perf)
+app.command("rehearse")(rehearse.rehearse)
 
 
 def _version(wanted: bool) -> None:

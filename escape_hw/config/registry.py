@@ -8,6 +8,7 @@ from typing import Any, cast
 
 from escape_hw.api.device import Device
 from escape_hw.api.model import SyntheticModel
+from escape_hw.api.rehearsal import RehearsalFactory
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.config.models import SystemConfig
 from escape_hw.config.outline import nearest
@@ -15,7 +16,8 @@ from escape_hw.errors import ConfigError
 
 DEVICES = "escape.devices"
 MODELS = "escape.models"
-_KINDS = {DEVICES: "device driver", MODELS: "synthetic model"}
+REHEARSALS = "escape.rehearsals"
+_KINDS = {DEVICES: "device driver", MODELS: "synthetic model", REHEARSALS: "rehearsal"}
 #: What the name of every twin begins with; other drivers drive real hardware.
 TWIN = "sim-"
 
@@ -84,6 +86,17 @@ def model_factory(name: str) -> ModelFactory:
         Unknown name (with the nearest one), or its package is not completely installed.
     """
     return cast(ModelFactory, _load(MODELS, name))
+
+
+def rehearsal_factory() -> RehearsalFactory:
+    """The factory of the simulated bench behind real drivers.
+
+    Raises
+    ------
+    ConfigError
+        The package that holds it is not completely installed.
+    """
+    return cast(RehearsalFactory, _load(REHEARSALS, "bench"))
 
 
 def _load(group: str, name: str, hardware: bool = False) -> Any:
