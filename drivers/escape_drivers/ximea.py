@@ -141,6 +141,19 @@ class XimeaCamera(WaitingCamera):
         self._views: dict[int, NDArray[np.uint16]] = {}
         self._expected = (0, 0)
 
+    @property
+    def handle(self) -> ctypes.c_void_p:
+        """The library's handle, for calls that this driver does not make.
+
+        Raises
+        ------
+        NotOpen
+            The camera is not connected.
+        """
+        handle = self._connected().handle
+        assert handle is not None
+        return handle
+
     def temperature_c(self) -> float:
         """Temperature of the sensor's chip in degrees Celsius.
 
