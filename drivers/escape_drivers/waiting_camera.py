@@ -50,6 +50,8 @@ class WaitingCamera(Camera):
         super().__init__(name)
         self._section, self._settings = section, section.settings()
         self._info = self._identity(kind, stand_in=False)
+        self._top = np.uint16(self._info.full_scale)
+        self._mask = np.empty((0, 0), np.bool_)
         self._limits: CameraLimits | None = None
         self._slowest_hz, self._fastest_hz = 0.0, math.inf
         self._waiting = threading.Lock()
@@ -224,8 +226,13 @@ class WaitingCamera(Camera):
         arrived_ns = time.monotonic_ns()
         data = view.copy()
         data.flags.writeable = False
-        top = self.info.full_scale
         # Frames with no saturated pixel are the rule, and the maximum is quicker than counting.
-        saturated = int(np.count_nonzero(data >= top)) if data.max() >= top else 0
+        saturated = self._at_the_top(data) if data.max() >= self._top else 0
         exposed_ns = self._clock.exposed_ns(stamp_ns, arrived_ns)
         return Frame(data, self._counter.index(number), exposed_ns, arrived_ns, saturated)
+
+    def _at_the_top(self, data: NDArray[np.uint16]) -> int:
+        """Number of pixels at the top of the scale."""
+        if self._mask.shape != data.shape:
+            self._mask = np.empty(data.shape, np.bool_)
+        return int(np.count_nonzero(np.equal(data, self._top, out=self._mask)))
