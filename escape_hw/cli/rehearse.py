@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
+import sys
 import threading
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated
@@ -17,6 +18,7 @@ from escape_hw.cli.session import Session, session
 if TYPE_CHECKING:
     from escape_hw.api.rehearsal import Rehearsal
 
+_ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
 #: What a shell says of a command that is not there.
 _NOT_FOUND = 127
 
@@ -60,8 +62,10 @@ def rehearse(
 
 def _run(one: Session, command: Sequence[str], environment: Mapping[str, str]) -> int:
     """Run a command to its end; a Ctrl-C is its business, for its mirror must become flat."""
+    # The very program that runs, also where its folder is not on the path.
+    words = [*_ESCAPE, *command[1:]] if command[0] == "escape" else command
     try:
-        child = subprocess.Popen(command, env={**os.environ, **environment})
+        child = subprocess.Popen(words, env={**os.environ, **environment})
     except OSError as error:
         one.tell(f"error: {command[0]}: {error.strerror}")
         return _NOT_FOUND

@@ -33,7 +33,7 @@ def test_a_calibration_in_hardware_mode_on_the_simulated_bench(escape, system: P
         "calibrate", system, "--mode", "hardware", "--set", REGION, "--frames", 50, "--quiet", "--json",
         "--out", tmp_path / "run",
     )  # fmt: skip
-    done = escape("rehearse", system, "--set", REGION, "--", *ESCAPE, *calibrate)
+    done = escape("rehearse", system, "--set", REGION, "--", "escape", *calibrate)
     document = json.loads(done.stdout)
     assert done.returncode == 0, done.stderr
     assert document["simulated"] is True
