@@ -119,6 +119,18 @@ class AlpaoMirror(DeformableMirror):
         """True after :meth:`play`, until the next command or :meth:`stop_pattern`."""
         return self._playing
 
+    @property
+    def handle(self) -> c_void_p:
+        """The SDK's handle, for calls that this driver does not make.
+
+        Raises
+        ------
+        NotOpen
+            The mirror is not connected.
+        """
+        self.require_open()
+        return self._connected()[1]
+
     def play(self, patterns: ArrayLike, repeats: int = 1) -> None:
         """Have the electronics send shapes by themselves, one after the other; returns at once.
 

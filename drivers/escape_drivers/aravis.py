@@ -123,7 +123,7 @@ class AravisCamera(WaitingCamera):
         self._settings = self._applied(self._check(self._section.settings()))
 
     def _disconnect(self) -> None:
-        library, self._library, self._limits = self._library, None, None
+        library, self._library = self._library, None
         if library is not None:
             library.close()
 
@@ -197,20 +197,20 @@ class AravisCamera(WaitingCamera):
             why = _STATUS.get(got.status, f"status {got.status}")
             log.info("%s: frame %d thrown away: %s", self.name, got.frame_id, why)
             return None
-        region = self._settings.region
-        if not got.address or (got.width, got.height) != (region.width, region.height):
-            raise DeviceError(
-                self.name,
-                f"delivered {got.width} x {got.height} pixels for a region of {region.width} x "
-                f"{region.height}",
-            )
         return self._frame(self._counts(got), got.frame_id, got.timestamp_ns)
 
     def _counts(self, got: Received) -> NDArray[np.uint16]:
         """Counts in a buffer; a look at it where that is possible."""
+        region = self._settings.region
         kind: Any = np.uint8 if self._options.pixel_format == "Mono8" else np.uint16
-        size = got.width * got.height * np.dtype(kind).itemsize
-        held = (ctypes.c_ubyte * size).from_address(got.address)
+        needed = region.width * region.height * np.dtype(kind).itemsize
+        if (got.width, got.height) != (region.width, region.height) or not got.address or got.size < needed:
+            raise DeviceError(
+                self.name,
+                f"delivered {got.width} x {got.height} pixels in {got.size} bytes for a region of "
+                f"{region.width} x {region.height} in {self._options.pixel_format}",
+            )
+        held = (ctypes.c_ubyte * needed).from_address(got.address)
         counts = np.ndarray((got.height, got.width), kind, buffer=held).astype(np.uint16, copy=False)
         return np.right_shift(counts, np.uint16(self._options.shift)) if self._options.shift else counts
 

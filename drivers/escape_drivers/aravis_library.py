@@ -80,6 +80,7 @@ class Received(NamedTuple):
     """A buffer that came from the stream."""
 
     address: int
+    size: int
     status: int
     frame_id: int
     timestamp_ns: int
@@ -226,9 +227,11 @@ class AravisLibrary:
 
     def received(self, buffer: int) -> Received:
         """What a buffer holds."""
-        c = self.c
+        c, size = self.c, c_size_t()
+        address = c.arv_buffer_get_data(buffer, byref(size))
         return Received(
-            c.arv_buffer_get_data(buffer, None) or 0,
+            address or 0,
+            size.value,
             c.arv_buffer_get_status(buffer),
             c.arv_buffer_get_frame_id(buffer),
             c.arv_buffer_get_timestamp(buffer),

@@ -50,6 +50,8 @@ class WaitingCamera(Camera):
         super().__init__(name)
         self._section, self._settings = section, section.settings()
         self._info = self._identity(kind, stand_in=False)
+        self._top = np.uint16(self._info.full_scale)
+        self._mask = np.empty((0, 0), np.bool_)
         self._limits: CameraLimits | None = None
         self._slowest_hz, self._fastest_hz = 0.0, math.inf
         self._waiting = threading.Lock()
@@ -139,6 +141,10 @@ class WaitingCamera(Camera):
             )
 
     def _configure(self, settings: CameraSettings) -> None:
+        if self._acquiring:
+            raise DeviceError(
+                self.name, "could not be stopped, and keeps its settings; close and open it again"
+            )
         before = self._settings
         try:
             self._settings = self._applied(settings)
@@ -173,22 +179,26 @@ class WaitingCamera(Camera):
         with self._waiting:
             # A reader that came in after stop() may have started it again.
             self._end_if_acquiring()
+            self._acquiring = False
             self._disconnect()
+            self._limits = None
+            self._slowest_hz, self._fastest_hz = 0.0, math.inf
 
     def _abandon(self) -> None:
         self._close()
 
     def _end_if_acquiring(self) -> None:
         if self._acquiring:
-            self._acquiring = False
-            self._quietly(self._end)
+            self._acquiring = not self._managed(self._end)
 
-    def _quietly(self, step: Callable[[], None]) -> None:
-        """Take a step of shutting down; a camera that has gone cannot, and is not read any more."""
+    def _managed(self, step: Callable[[], None]) -> bool:
+        """Take a step of stopping or closing, which a camera that has gone cannot; false when it failed."""
         try:
             step()
         except DeviceError as error:
             log.warning("while stopping or closing: %s", error)
+            return False
+        return True
 
     def _next_frame(self, timeout_s: float) -> Frame:
         deadline = time.monotonic() + timeout_s
@@ -216,8 +226,13 @@ class WaitingCamera(Camera):
         arrived_ns = time.monotonic_ns()
         data = view.copy()
         data.flags.writeable = False
-        top = self.info.full_scale
         # Frames with no saturated pixel are the rule, and the maximum is quicker than counting.
-        saturated = int(np.count_nonzero(data >= top)) if data.max() >= top else 0
+        saturated = self._at_the_top(data) if data.max() >= self._top else 0
         exposed_ns = self._clock.exposed_ns(stamp_ns, arrived_ns)
         return Frame(data, self._counter.index(number), exposed_ns, arrived_ns, saturated)
+
+    def _at_the_top(self, data: NDArray[np.uint16]) -> int:
+        """Number of pixels at the top of the scale."""
+        if self._mask.shape != data.shape:
+            self._mask = np.empty(data.shape, np.bool_)
+        return int(np.count_nonzero(np.equal(data, self._top, out=self._mask)))

@@ -141,6 +141,19 @@ class XimeaCamera(WaitingCamera):
         self._views: dict[int, NDArray[np.uint16]] = {}
         self._expected = (0, 0)
 
+    @property
+    def handle(self) -> ctypes.c_void_p:
+        """The library's handle, for calls that this driver does not make.
+
+        Raises
+        ------
+        NotOpen
+            The camera is not connected.
+        """
+        handle = self._connected().handle
+        assert handle is not None
+        return handle
+
     def temperature_c(self) -> float:
         """Temperature of the sensor's chip in degrees Celsius.
 
@@ -169,11 +182,11 @@ class XimeaCamera(WaitingCamera):
         self._settings = self._applied(self._check(self._section.settings()))
 
     def _disconnect(self) -> None:
-        library, self._library, self._limits = self._library, None, None
+        library, self._library = self._library, None
         self._get_image = _not_connected
         self._views.clear()
         if library is not None and library.handle is not None:
-            self._quietly(library.close)
+            self._managed(library.close)
 
     def _longest_s(self, want: CameraSettings) -> float:
         return super()._longest_s(want) if self._options.trigger == "off" else math.inf
@@ -236,13 +249,16 @@ class XimeaCamera(WaitingCamera):
     def _view(self, image: XiImage) -> NDArray[np.uint16]:
         """A look at one of the library's buffers, checked and made once; rows may be padded."""
         width, height = self._expected
-        if not image.bp or (image.width, image.height) != (width, height):
+        pitch = 2 * width + image.padding_x
+        # A library that fills no size (it may not in every policy) leaves 0.
+        too_short = 0 < image.bp_size < pitch * height
+        if not image.bp or (image.width, image.height) != (width, height) or too_short:
             raise DeviceError(
                 self.name,
-                f"delivered {image.width} x {image.height} pixels for a region of {width} x {height}; "
-                "is the library's version the one this driver knows (4.x, XI_IMG of 288 bytes)?",
+                f"delivered {image.width} x {image.height} pixels in {image.bp_size} bytes for a region of "
+                f"{width} x {height}; is the library's version one that this driver knows "
+                "(4.x, XI_IMG of 288 bytes)?",
             )
-        pitch = 2 * width + image.padding_x
         bytes_ = (ctypes.c_ubyte * (pitch * height)).from_address(image.bp)
         view: NDArray[np.uint16] = np.ndarray((height, width), np.uint16, buffer=bytes_, strides=(pitch, 2))
         self._views[image.bp] = view

@@ -33,7 +33,7 @@ ERRORS: dict[int, tuple[str, str]] = {
     114: ("cannot be set now", ""),
     119: ("not available in this context", ""),
 }
-NO_IMAGE, TIMEOUT = 9, 10
+NO_IMAGE, TIMEOUT, STOPPED = 9, 10, 45
 #: The camera has gone, or has forgotten everything; only opening it again helps.
 LOST = frozenset({1, 55, 56})
 

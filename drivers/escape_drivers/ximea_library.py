@@ -10,7 +10,7 @@ from ctypes import POINTER, c_char_p, c_double, c_float, c_int, c_uint32, c_void
 from typing import Any
 
 from escape_drivers.vendor_library import VendorLibrary, is_stand_in, require
-from escape_drivers.ximea_errors import LOST, explain
+from escape_drivers.ximea_errors import LOST, STOPPED, explain
 from escape_hw.errors import DeviceError, DeviceLost
 
 XIAPI = VendorLibrary(
@@ -138,14 +138,15 @@ class XimeaLibrary:
         self._done("xiStartAcquisition", self.c.xiStartAcquisition(self.handle))
 
     def stop(self) -> None:
-        """Stop acquisition.
+        """Stop acquisition; that it has stopped already, as after a reset, will do.
 
         Raises
         ------
         DeviceLost, DeviceError
             It failed.
         """
-        self._done("xiStopAcquisition", self.c.xiStopAcquisition(self.handle))
+        code = self.c.xiStopAcquisition(self.handle)
+        self._done("xiStopAcquisition", 0 if code == STOPPED else code)
 
     def set(self, name: str, value: int | float) -> None:
         """Set a parameter, of the type that the value has.

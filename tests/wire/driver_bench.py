@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from escape_hw.config.load import load_system
+from escape_hw.config.models import SystemConfig
 from escape_hw.config.registry import device_factory
 from escape_sim.stand_ins import StandIn, StandInUnavailable
 
@@ -29,10 +30,15 @@ def fresh(name: str, script: str = "") -> StandIn:
     return stand_in(name).clear().script(script)
 
 
+@cache
+def _configuration(system: str, overrides: tuple[str, ...]) -> SystemConfig:
+    return load_system(system, mode="hardware", overrides=overrides)
+
+
 def make(driver: str, *more: str, system: str = "razor-shwfs") -> Any:
     """A device of the system, not open, on the stand-in as it is."""
     key, library = PARTS[driver]
     path = stand_in(library).path
     chosen = (f'devices.{key}.driver="{driver}"', f'devices.{key}.options.library="{path}"')
-    config = load_system(system, mode="hardware", overrides=(*chosen, *more))
+    config = _configuration(system, (*chosen, *more))
     return device_factory(driver, hardware=True)(key, config, {})

@@ -42,8 +42,9 @@ def test_the_structure_is_laid_out_as_in_the_header() -> None:
     offsets = {
         "size": 0, "bp": 8, "bp_size": 16, "frm": 20, "width": 24, "height": 28, "nframe": 32, "tsSec": 36,
         "tsUSec": 40, "GPI_level": 44, "black_level": 48, "padding_x": 52, "AbsoluteOffsetX": 56,
-        "AbsoluteOffsetY": 60, "transport_frm": 64, "img_desc": 68, "DownsamplingX": 180, "DownsamplingY": 184,
-        "flags": 188, "exposure_time_us": 192, "gain_db": 196, "acq_nframe": 200, "image_user_data": 204,
+        "AbsoluteOffsetY": 60, "transport_frm": 64, "img_desc": 68, "DownsamplingX": 180,
+        "DownsamplingY": 184, "flags": 188, "exposure_time_us": 192, "gain_db": 196, "acq_nframe": 200,
+        "image_user_data": 204,
         "exposure_sub_times_us": 208, "data_saturation": 232, "wb": 240, "black_levels": 252, "ranges": 260,
         "gain_ratio": 268, "fDownsampling": 272, "color_filter_array": 280,
     }  # fmt: skip

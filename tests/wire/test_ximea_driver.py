@@ -91,7 +91,8 @@ def test_options_become_parameters(xi) -> None:
     with make("ximea", *(f"devices.wfs.options.{key}={value}" for key, value in options.items())):
         for line in (
             "imgdataformat 1", "recent_frame 0", "buffers_queue_size 8", "sensor_feature_selector 0",
-            "sensor_feature_value 1", "limit_bandwidth 2000", "gpo_selector 1", "gpo_mode 4", "downsampling_type 1",
+            "sensor_feature_value 1", "limit_bandwidth 2000", "gpo_selector 1", "gpo_mode 4",
+            "downsampling_type 1",
         ):  # fmt: skip
             assert f"xiSetParamInt {line}" in xi.calls, line
 
@@ -169,7 +170,7 @@ def test_an_older_library_that_fills_less_still_gives_frames(xi, filled) -> None
 def test_a_structure_that_is_not_filled_is_no_frame(xi) -> None:
     xi.script("xiGetImage 1 short 20")
     with make("ximea") as camera:
-        with pytest.raises(DeviceError, match=r"delivered 0 x 0 pixels for a region of 400 x 400"):
+        with pytest.raises(DeviceError, match=r"delivered 0 x 0 pixels in .* for a region of 400 x 400"):
             camera.next_frame(1.0)
         camera.next_frame(1.0)
 
@@ -225,11 +226,11 @@ def test_a_rate_out_of_reach_leaves_the_camera_as_it_was(xi) -> None:
     with make("ximea") as camera:
         before = camera.settings
         tall = replace(before, region=Region(0, 0, 640, 512))
-        with pytest.raises(SettingRejected, match="512 rows and an exposure of 0.0019 s allow at most 416"):
+        with pytest.raises(SettingRejected, match=r"512 rows and an exposure of 0.0019 s allow at most 416"):
             camera.configure(tall)
         assert camera.settings == before
         assert camera.next_frame(1.0).data.shape == (400, 400)
-        with pytest.raises(SettingRejected, match="no slower than 0.8"):
+        with pytest.raises(SettingRejected, match=r"no slower than 0.8"):
             camera.configure(replace(before, frame_rate_hz=0.5))
     assert not xi.complaints
 
@@ -255,7 +256,7 @@ def test_one_camera_has_one_owner(xi) -> None:
 
 
 def test_a_camera_that_is_not_there_says_what_to_check(xi) -> None:
-    with pytest.raises(DeviceError, match="camera 'MQ_1' was not opened: error 56.*permissions"):
+    with pytest.raises(DeviceError, match=r"camera 'MQ_1' was not opened: error 56.*permissions"):
         make("ximea", "devices.wfs.serial=MQ_1").open()
 
 

@@ -319,9 +319,9 @@ EXPORT void arv_camera_start_acquisition(void *handle, GError **error) {
 }
 
 EXPORT void arv_camera_stop_acquisition(void *handle, GError **error) {
+    camera.acquiring = 0; /* asked for, even if it fails now */
     BEGIN("arv_camera_stop_acquisition", , "%s", "");
     if (camera.waiting) si_complain("arv_camera_stop_acquisition: somebody waits at the stream");
-    camera.acquiring = 0;
     if (camera.linked) si_ask(&camera.bench, SI_STOP, NULL, 0, NULL, 0, NULL);
 }
 
@@ -344,6 +344,10 @@ static int fill(Buffer *buffer, uint64_t wait_us, const struct si_rule *rule) {
         si_sleep_until(ready < deadline ? ready : deadline);
         if (ready > deadline || si_unplugged) return 0;
         buffer->stamp_ns = (uint64_t)ready;
+    }
+    if (buffer->size < (size_t)(n * camera.bytes)) {
+        si_complain("a buffer of %zu bytes cannot hold %d pixels", buffer->size, n);
+        return 0;
     }
     for (int i = 0; i < n; i++) {
         int value = camera.linked ? from_bench.pixels[i]

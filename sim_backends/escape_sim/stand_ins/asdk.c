@@ -178,7 +178,8 @@ EXPORT COMPL_STAT asdkRelease(asdkDM *dm) {
     si_log("asdkRelease");
     int no = refused(dm, &f, &rule, &outcome);
     if (dm < mirrors || dm >= mirrors + MAX_DM || dm->open == 0) return outcome;
-    if (dm->open == 1 && is_playing(dm)) si_complain("asdkRelease: a pattern is being sent; asdkStop first");
+    if (dm->open == 1 && is_playing(dm) && !si_unplugged)
+        si_complain("asdkRelease: a pattern is being sent; asdkStop first");
     if (dm->open == 1 && dm->touched && !si_unplugged)
         si_complain("asdkRelease: the mirror is not at zero; asdkReset first");
     dm->open = 0;

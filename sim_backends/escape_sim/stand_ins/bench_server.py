@@ -1,4 +1,4 @@
-"""A simulated bench that the stand-ins of vendor libraries talk to, so that real drivers close the loop on it.
+"""A simulated bench that the stand-ins of vendor libraries talk to: real drivers close the loop on it.
 
 A driver's process loads a stand-in, which connects to this server over a local socket: shapes go in, frames
 come out, one request and one reply at a time. Time is the twin's: it advances when a frame is asked for, as

@@ -25,6 +25,7 @@
 #include <string.h>
 #include <strings.h>
 #include <sys/socket.h>
+#include <sys/time.h>
 #include <sys/un.h>
 #include <time.h>
 #include <unistd.h>
@@ -32,6 +33,7 @@
 #define EXPORT __attribute__((visibility("default")))
 #define SI_RULES 256
 #define SI_LOG_BYTES (8u << 20)
+#define SI_PATIENCE_S 60 /* a twin compiles its optics on the first frame */
 
 enum si_action { SI_NONE, SI_ERROR, SI_IGNORE, SI_TIMEOUT, SI_RESET, SI_SHORT, SI_UNPLUG, SI_HALF, SI_LOSE };
 static const char *const si_actions[] = {"", "error", "ignore", "timeout", "reset",
@@ -268,6 +270,10 @@ static int si_link_bench(struct si_link *link, const char *kind, const char *ser
     snprintf(address.sun_path, sizeof address.sun_path, "%s", path);
     link->fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
     if (link->fd < 0) return -1;
+    /* A bench that was stopped in its tracks must not hold a driver for ever. */
+    struct timeval patience = {.tv_sec = SI_PATIENCE_S};
+    setsockopt(link->fd, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
+    setsockopt(link->fd, SOL_SOCKET, SO_SNDTIMEO, &patience, sizeof patience);
     char greeting[160];
     int n = snprintf(greeting, sizeof greeting, "%s %s", kind, serial);
     if (connect(link->fd, (struct sockaddr *)&address, sizeof address) != 0 ||
