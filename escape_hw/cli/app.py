@@ -46,7 +46,6 @@ app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)
 app.command("perf")(perf.perf)
-<<<<<<< HEAD
 app.add_typer(dm.app, name="dm")
 app.add_typer(camera.app, name="camera")
 app.add_typer(modulator.app, name="modulator")
@@ -55,9 +54,7 @@ app.command("doctor")(doctor.doctor)
 app.command("discover")(discover.discover)
 app.add_typer(udev.app, name="udev")
 app.command("emulate")(emulate.emulate)
-=======
 app.command("rehearse")(rehearse.rehearse)
->>>>>>> abi
 
 
 def _version(wanted: bool) -> None:
