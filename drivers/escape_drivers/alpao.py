@@ -267,16 +267,8 @@ class AlpaoMirror(DeformableMirror):
         return self._library, self._handle
 
     def _identity(self, model: str, stand_in: bool) -> DMInfo:
-        section = self._section
-        return DMInfo(
-            f"{model} (stand-in)" if stand_in else model,
-            section.serial,
-            section.n_act,
-            section.actuator_map(),
-            section.positions() * section.pitch_m,
-            section.stroke_m,
-            simulated=stand_in,
-        )
+        name = f"{model} (stand-in)" if stand_in else model
+        return self._section.info(name, simulated=stand_in)
 
 
 def _not_connected(handle: c_void_p | None, pointer: c_void_p) -> int:
