@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.results import CalibrationResult, StrehlEstimate
+from escape_hw.api.results import StrehlEstimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,32 +108,28 @@ class GainsResult:
 
     Parameters
     ----------
+    method
+        Of the matrix that the gains are relative to.
     rounds
         One for each amplitude, in their order.
     closure
         The gains tried before.
     converged
         Whether the last round found the gains that the loop was scaled with, at the last poke.
-    reference
-        The matrix that the gains are relative to.
-    rescaled
-        It, scaled by them: the one to close the loop with.
-    measured
-        The closed-loop DO-CRIME matrix of the last round; ``None`` if no round was finished.
+    loop_gain
+        Gain that the loop ran with, its matrix scaled.
+    frames, lost_frames
+        Of all rounds and the closure.
     beside
         Gains of other matrices by name, from the last round.
-    loop_gain
-        Gain that the loop ran with.
     partial
         Stopped by the operator.
     """
 
+    method: str
     rounds: tuple[GainRound, ...]
     closure: tuple[ClosureStep, ...]
     converged: bool
-    reference: CalibrationResult
-    rescaled: CalibrationResult
-    measured: CalibrationResult | None
     loop_gain: float
     frames: int
     lost_frames: int

@@ -82,13 +82,13 @@ def close_first(
         raise CalibrationError("the pokes alone hold the mirror at its limits; use smaller ones")
     if answer is None:
         raise CalibrationError(
-            f"the loop cannot be closed: with this matrix the pokes have no answer ({opened.why or 'noise'}). "
-            "Measure the matrix again, with more frames, or use larger pokes"
+            "the loop cannot be closed: with this matrix the pokes have no answer "
+            f"({opened.why or 'noise'}). Measure the matrix again, with more frames, or use larger pokes"
         )
     if answer[0] < 0:
         raise CalibrationError(
-            f"the loop cannot be closed: the sensor answers the pokes with {answer[0]:.2g} of what the matrix "
-            "says; a sign is wrong (of the matrix, or of the mirror), or the pupil is flipped"
+            f"the loop cannot be closed: the sensor answers the pokes with {answer[0]:.2g} of what the "
+            "matrix says; a sign is wrong (of the matrix, or of the mirror), or the pupil is flipped"
         )
     beyond = opened.residual_nm / answer[0]
     search = _Search(wanted, beyond)

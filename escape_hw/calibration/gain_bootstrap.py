@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,17 @@ _REPEATS = 4
 _RETRIES, _LOWER = 3, 0.7
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class GainsRun:
+    """A bootstrap, and the matrix scaled by its gains: the one to close the loop with.
+
+    The matrix is as it was when no round was finished.
+    """
+
+    result: GainsResult
+    rescaled: CalibrationResult
+
+
 @dataclass(slots=True, eq=False)
 class _State:
     """What the bootstrap has so far."""
@@ -49,6 +61,7 @@ class _State:
     beside: dict[str, OpticalGains] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     gain: float = math.nan
+    amplitude: float = math.nan
     converged: bool = False
     partial: bool = False
 
@@ -64,7 +77,7 @@ def bootstrap_gains(
     gain: float | None = None,
     beside: Mapping[str, InteractionMatrix] | None = None,
     model_psf: NDArray[np.float32] | None = None,
-) -> Procedure[GainsResult]:
+) -> Procedure[GainsRun]:
     """Close the loop on a matrix of unknown scale, and scale it mode by mode to the turbulence there.
 
     Parameters
@@ -90,8 +103,8 @@ def bootstrap_gains(
 
     Returns
     -------
-    GainsResult
-        ``converged`` says whether to trust it. Stopped early, ``partial`` is true.
+    GainsRun
+        ``result.converged`` says whether to trust it. Stopped early, ``result.partial`` is true.
 
     Raises
     ------
@@ -114,9 +127,23 @@ def bootstrap_gains(
         yield from _rounds(loop, wanted, poke, accuracy, budget, frames, list(others), model_psf, state)
     except Aborted:
         state.partial = True
+        _salvage(loop, state)
     finally:
         loop.open_again()
-    return _result(loop, calibration, state, bench.wfs.status().lost - before)
+    return _run_of(loop, calibration, state, bench.wfs.status().lost - before)
+
+
+def _salvage(loop: GainLoop, state: _State) -> None:
+    """Keep what a round told that was aborted after enough frames; the loop is about to be opened."""
+    measured = loop.so_far()
+    if state.applied is None or measured is None:
+        return
+    found = _smooth(measured, 0)
+    change = found.best / _positive(state.applied) - 1
+    state.rounds.append(
+        GainRound(found, state.amplitude, measured.frames, _rms(change), math.nan, math.nan, math.nan, False)
+    )
+    state.applied = found
 
 
 def _require_sense(**numbers: float) -> None:
@@ -162,10 +189,11 @@ def _rounds(
         amplitude = poke_amplitudes(loop.bench, loop.reference.m2c, size)
         if last:
             amplitude = within_budget(amplitude, budget, *_optics(loop.bench), _raised(loop, state))
+        state.amplitude = float(amplitude.max())
         asked = accuracy if last else _COARSE * accuracy
         stretch = yield from loop.measure(
             least, amplitude, f"round {len(state.rounds) + 1}, poke {amplitude.max():.2g}",
-            most=frames, enough=lambda gains, asked=asked: _error(_smooth(gains, 0)) <= asked,
+            most=frames, enough=partial(_accurate, asked=asked),
         )  # fmt: skip
         if stretch.diverged or stretch.gains is None or _swings(stretch, state):
             retries += 1
@@ -185,6 +213,11 @@ def _rounds(
         state.converged = last and _agrees(state.rounds[-1])
         repeats += last
         size = max(poke, size * _LESS)
+
+
+def _accurate(measured: MeasuredGains, asked: float) -> bool:
+    """Whether gains are known as well as asked for."""
+    return _error(_smooth(measured, 0)) <= asked
 
 
 def _swings(stretch: Stretch, state: _State) -> bool:
@@ -220,7 +253,7 @@ def _book(
             strehl_loss(amplitude, *_optics(loop.bench), _raised(loop, state)),
             _error(found) <= asked,
             _strehl(stretch, model_psf),
-        )  # fmt: skip
+        )
     )
     state.applied = found
     _apply(loop, state)
@@ -252,7 +285,8 @@ def _positive(gains: OpticalGains) -> NDArray[np.float64]:
     least = 0.3 * float(np.median(gains.trend))
     if not least > 0:
         raise CalibrationError(
-            "the optical gains are not positive: the loop works against the turbulence; measure the matrix again"
+            "the optical gains are not positive: the loop works against the turbulence; "
+            "measure the matrix again"
         )
     return np.maximum(gains.best, least)
 
@@ -271,7 +305,7 @@ def _raised(loop: GainLoop, state: _State) -> float:
     return noise_gain(state.gain, loop.bench.config.loop.leak, delay)
 
 
-def _result(loop: GainLoop, calibration: CalibrationResult, state: _State, lost: int) -> GainsResult:
+def _run_of(loop: GainLoop, calibration: CalibrationResult, state: _State, lost: int) -> GainsRun:
     rescaled, notes = calibration, list(state.notes)
     if state.rounds and state.applied is not None:
         sigma = np.hypot(state.applied.best_sigma, state.applied.best * state.applied.common_sigma)
@@ -279,7 +313,8 @@ def _result(loop: GainLoop, calibration: CalibrationResult, state: _State, lost:
         rescaled = replace(calibration, matrix=matrix, measured=None, partial=state.partial)
         if not state.rounds[-1].reached:
             notes.append("the last round ended at its number of frames, before the accuracy asked for")
-    return GainsResult(
-        tuple(state.rounds), tuple(state.steps), state.converged, calibration, rescaled, None,
-        state.gain, loop.frames, lost, state.beside, state.partial, tuple(notes),
+    result = GainsResult(
+        calibration.matrix.method, tuple(state.rounds), tuple(state.steps), state.converged, state.gain,
+        loop.frames, lost, state.beside, state.partial, tuple(notes),
     )  # fmt: skip
+    return GainsRun(result, rescaled)

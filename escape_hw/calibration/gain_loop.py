@@ -80,7 +80,7 @@ class GainLoop:
         self._dropped = bench.config.loop.dropped_modes
         self._stroke = np.sqrt(np.mean(np.square(self.reference.m2c), axis=0))
         # Refused here, before anything moves, if a mode is noise.
-        self._meter()
+        self._meter = self._new_meter()
         prepare_sensor(bench)
         slopes_of = extractor(bench, calibration.grid)
         self._loop = RunningLoop(bench, self.reference.m2c, slopes_of, self.control, science=science)
@@ -139,7 +139,8 @@ class GainLoop:
             Asked now and then.
         """
         most = frames if most is None else max(most, frames)
-        pokes, loop, meter = RandomPokes(amplitude, self.bench.rng), self._loop, self._meter()
+        pokes, loop, meter = RandomPokes(amplitude, self.bench.rng), self._loop, self._new_meter()
+        self._meter = meter
         report = Reporter(stage, most)
         loop.record = LoopRecord()
         yield from loop.run(SETTLING, inject=pokes, report=report)
@@ -160,7 +161,11 @@ class GainLoop:
         rms = float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan
         return Stretch(gains, rms, done, loop.record.diverged, loop.record, why)
 
-    def _meter(self) -> GainMeter:
+    def so_far(self) -> MeasuredGains | None:
+        """What the last measurement found, also when it was aborted; ``None`` if it was too short."""
+        return _solved(self._meter)[0]
+
+    def _new_meter(self) -> GainMeter:
         c = self.bench.config.calibration
         return GainMeter(self._references, self._weights, order=c.whiten_order, lags=c.lags)
 
