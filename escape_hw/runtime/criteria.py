@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from escape_hw.api.gains import GainsResult
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import LoopResult, RegistrationEstimate
 
@@ -35,6 +36,18 @@ def _words(name: str) -> str:
 def converged(label: str, estimate: RegistrationEstimate | None) -> dict[str, Any]:
     """SPRINT converged."""
     return check(f"{label}: SPRINT converged", estimate is not None and estimate.converged)
+
+
+def gains_converged(result: GainsResult) -> dict[str, Any]:
+    """The bootstrap of the optical gains converged."""
+    if not result.rounds:
+        return check("optical gains: measured at least once", False)
+    last = result.rounds[-1]
+    return check(
+        f"optical gains: converged in {len(result.rounds)} rounds (last change {100 * last.change:.1f} %, "
+        f"{100 * last.expected_change:.1f} % expected of the errors, poke {100 * last.poke:.2g} % of stroke)",
+        result.converged,
+    )
 
 
 def recovered(label: str, estimate: RegistrationEstimate, planted: Registration) -> dict[str, Any]:
