@@ -39,7 +39,33 @@ def shwfs(
             return reproduce_shwfs(bench, frames=frames, loop_frames=loop_frames, plants=plants)
 
         result, document = _run(one, _paper_case(system, set, seed, mode), "shwfs", out, start, keep_shwfs)
-        _show_shwfs(one, result, document)
+        _show_comparison(one, result, document)
+
+
+@app.command("maps")
+def maps(
+    system: Annotated[str, typer.Option("--system", help="System to run on.")] = "maps-nir",
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")] = 60_000,
+    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 10_000,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """A matrix measured on the sky beside its simulation, and the loop on ESCAPE's, with a dirty mirror."""
+    with session("reproduce maps", json=json, quiet=quiet) as one:
+        from escape_hw.runtime.reproduce_keep import keep_maps
+        from escape_hw.runtime.reproduce_maps import reproduce_maps
+
+        def start(bench: Any) -> Any:
+            return reproduce_maps(bench, frames=frames, loop_frames=loop_frames)
+
+        result, document = _run(
+            one, options.Choice.of(system, set, seed, mode), "maps", out, start, keep_maps
+        )
+        _show_comparison(one, result, document)
 
 
 @app.command("table1")
@@ -141,12 +167,13 @@ def _run(
     return result, document
 
 
-def _show_shwfs(one: Session, result: Any, document: dict[str, Any]) -> None:
+def _show_comparison(one: Session, result: Any, document: dict[str, Any]) -> None:
     from escape_hw.cli.views import bands, rich_table
     from escape_hw.report.tables import strehl_table
 
     one.show(bands(document["simulated"], False))
-    _show_registration(one, {"": result.calibrations["ESCAPE"]}, document)
+    if "ESCAPE" in result.calibrations:
+        _show_registration(one, {"": result.calibrations["ESCAPE"]}, document)
     one.show(rich_table(strehl_table(result.loops)))
     one.show(*result.notes)
     _show_end(one, document)

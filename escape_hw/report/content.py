@@ -26,6 +26,7 @@ METHOD_LABELS = {
     "docrime": "DO-CRIME",
     "docrime-whitened": "DO-CRIME",
     "escape": "ESCAPE",
+    "simulated": "simulation",
 }
 
 
