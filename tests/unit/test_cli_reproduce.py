@@ -70,3 +70,20 @@ def test_reproduce_maps_shows_the_matrix_beside_its_simulation(escape, bench, tm
     for word in ("simulation", "dirty mirror", "Stacked closed-loop PSFs"):
         assert word in page
     assert load_loop(run / "loop_docrime.fits").header["PARENT1"] == "docrime.fits"
+
+
+@pytest.mark.usefixtures("reports")
+def test_reproduce_all_leads_to_every_report(escape, document, bench, tmp_path):
+    words = ("reproduce", "all", "--out", tmp_path / "all", "--only", "maps", "--only", "table1")
+    code, out, _ = escape(*words, "--share", 0.1)
+    assert code == 1
+    assert [options["frames"] for name, options in bench.calls if name == "escape"] == [1000, 10_000, 6000]
+    page = (tmp_path / "all" / "index.html").read_text()
+    for part in ("table1", "maps"):
+        assert f'href="{part}/report.html"' in page
+        assert (tmp_path / "all" / part / "report.html").is_file()
+    assert "index.html" in out.splitlines()[-1]
+    code, found, _ = document(*words)
+    assert list(found["parts"]) == ["table1", "maps"]
+    assert document("reproduce", "all", "--out", tmp_path / "x", "--only", "mops")[0] == 2
+    assert not (tmp_path / "x").exists()
