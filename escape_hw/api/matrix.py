@@ -27,7 +27,8 @@ class InteractionMatrix:
     system
         Name of the system it was measured on.
     method
-        ``push-pull``, ``docrime``, ``docrime-whitened`` or ``escape``.
+        ``push-pull``, ``push-pull-fast``, ``modulated``, ``docrime``, ``docrime-whitened`` or ``escape``;
+        ``docrime-closed`` and ``push-pull-fast-closed`` were measured in closed loop.
     simulated
         True when any device that took part was simulated.
     metrics

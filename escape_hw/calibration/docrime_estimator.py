@@ -6,13 +6,15 @@ The paper's estimator, ``D = <s c^T> <c c^T>^-1``, is the special case of a filt
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.docrime_fit import MIN_FREEDOM, empty_sums, first_fit, require_excitation
+from escape_hw.calibration.docrime_solution import DocrimeSolution
 from escape_hw.calibration.response import ResponseTracker, covariances, filtered
 from escape_hw.calibration.significance import require_response
 from escape_hw.calibration.telemetry import Recorder, Telemetry
@@ -22,43 +24,6 @@ from escape_hw.errors import TooFewFrames
 BURN_IN = 1000
 #: Frames gathered before the sums are updated: large enough for matrix products to be efficient.
 BLOCK = 500
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DocrimeSolution:
-    """A solved DO-CRIME run.
-
-    Parameters
-    ----------
-    matrix, sigma
-        ``(n_slopes, n_modes)``: slopes per unit mode, and standard errors of single elements beside a
-        gain that they share.
-    covariance
-        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; ``None`` where
-        correlations were not asked for.
-    gram
-        Sum over frames of filtered pokes times filtered pokes ``(n_modes, n_modes)``; in closed loop
-        what stands in its place: the inverse of the covariance of a row of the matrix, per variance of
-        its slope's noise.
-    variance
-        Variance of each slope's filtered noise, with what its correlation over time adds ``(n_slopes,)``.
-    whitener
-        The filter used, ``[1]`` for the plain estimator.
-    gain_sigma
-        Relative standard error of the gain that all elements share: an error of the temporal response,
-        which is scaled to sum 1, scales the whole matrix.
-    """
-
-    matrix: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    response: TemporalResponse
-    covariance: NDArray[np.float64] | None
-    gram: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    whitener: NDArray[np.float64]
-    frames: int
-    lost_frames: int
-    gain_sigma: float
 
 
 class DocrimeEstimator:
@@ -194,6 +159,16 @@ class DocrimeEstimator:
         self._next = int(index[-1]) + 1
         return self
 
+    def break_off(self) -> None:
+        """The run pauses, the mirror goes flat, and the next frame may have any index."""
+        if self._next is None:
+            return
+        for _ in range(self._memory() + self.order + self.lags):
+            self._recorder.lose_one(flat=True)
+            if self._recorder.full:
+                self._absorb()
+        self._next = None
+
     def _lose(self, frames: int) -> None:
         """Lay out lost frames; a gap longer than all memory separates the stretches for good."""
         self.lost_frames += frames
@@ -205,6 +180,86 @@ class DocrimeEstimator:
     def _memory(self) -> int:
         """Rows before a row that its filtered slopes and pokes are made of."""
         return 2 * self.order + self.lags
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Plain values and arrays from which :meth:`restore` makes this estimator again, for another run.
+
+        These are the sums or, before there is a filter, the frames themselves.
+        """
+        if self._whitener is None or self._response is None or self._tracker is None:
+            # A filter found now would be that of too few frames.
+            waiting = self._recorder.telemetry()
+            return {}, {"rows": waiting.rows.copy(), "present": waiting.present.copy()}
+        self._absorb()
+        arrays: dict[str, NDArray[Any]] = {
+            "whitener": self._whitener,
+            "response": self._response.weights,
+            "response_sigma": self._response.sigma,
+            "response_covariance": self._response_covariance,
+            **{f"sums.{name}": array.copy() for name, array in self._sums.arrays().items()},
+            **{f"tracker.{name}": array.copy() for name, array in self._tracker.arrays().items()},
+        }
+        values = {
+            "frames": self.frames,
+            "lost_frames": self.lost_frames,
+            "spread": self._spread,
+            "count": self._sums.count,
+            "first_rows": self._tracker.first_rows,
+            "later_rows": self._tracker.rows,
+        }
+        return values, arrays
+
+    def restore(self, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what :meth:`state` of an equal estimator gave; the mirror was flat meanwhile.
+
+        Raises
+        ------
+        ValueError
+            The estimator has taken frames, or the arrays have other shapes.
+        """
+        if self.frames or self._recorder.filled:
+            raise ValueError("an estimator that has taken frames cannot be restored")
+        if "rows" in arrays:
+            self._replay(arrays["rows"], arrays["present"])
+            return
+        self.frames, self.lost_frames = int(values["frames"]), int(values["lost_frames"])
+        self._whitener, self._spread = arrays["whitener"], float(values["spread"])
+        self._response = TemporalResponse(arrays["response"], arrays["response_sigma"])
+        self._response_covariance = arrays["response_covariance"]
+        self._tracker = ResponseTracker(
+            np.zeros((self.n_slopes, self.n_modes)), self._response, self._response_covariance,
+            int(values["first_rows"]), arrays["tracker.spectra"],
+        )  # fmt: skip
+        self._tracker.rows, self._sums.count = int(values["later_rows"]), int(values["count"])
+        for prefix, own in (("sums", self._sums.arrays()), ("tracker", self._tracker.arrays())):
+            for name, array in own.items():
+                if array.shape != arrays[f"{prefix}.{name}"].shape:
+                    raise ValueError(
+                        f"{prefix}.{name} is {arrays[f'{prefix}.{name}'].shape}, not {array.shape}"
+                    )
+                array[...] = arrays[f"{prefix}.{name}"]
+        self._recorder.resize(BLOCK + self._memory())
+        # Rows before the first that is new: the mirror was flat, no slopes are known.
+        self._recorder.lose_one(flat=True)
+        self._next = 0
+        self.break_off()
+
+    def _replay(self, rows: NDArray[np.float32], present: NDArray[np.bool_]) -> None:
+        """Take kept frames again, by their places on the time line."""
+        at = np.flatnonzero(present)
+        if at.size:
+            self.extend(at, rows[at, : self.n_slopes], rows[at, self.n_slopes :])
+        self.break_off()
+
+    @property
+    def taken(self) -> int:
+        """Frames taken, those that are not in the sums yet included."""
+        return self.frames + self._recorder.fresh
+
+    @property
+    def settled(self) -> bool:
+        """Whether the filter is found, so that a solution in the middle of a run costs nothing later."""
+        return self._tracker is not None
 
     def solve(self) -> DocrimeSolution:
         """The matrix, its standard errors and the temporal response so far.

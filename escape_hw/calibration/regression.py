@@ -76,6 +76,11 @@ class RegressionSums:
             self.count,
         )
 
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """All sums by name, themselves and no copies: written into, they are restored."""
+        names = ("cross", "gram", "power", "few", "slopes", "pokes")
+        return {name: getattr(self, name) for name in names}
+
     def information(self) -> NDArray[np.float64]:
         """What the frames tell of the modes ``(n_modes, n_modes)``.
 

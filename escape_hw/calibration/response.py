@@ -241,8 +241,8 @@ class ResponseTracker:
         spectra: NDArray[np.float64],
     ) -> None:
         self._step = max(1, -(-matrix.shape[0] // SLOPES))
-        self._matrix = np.ascontiguousarray(matrix[:: self._step].T, np.float32)
-        self._first, self._covariance, self._first_rows = first, covariance, rows
+        self._matrix = np.array(matrix[:: self._step].T, np.float32, order="C")
+        self._first, self._covariance, self.first_rows = first, covariance, rows
         self._spectra = spectra
         lags = first.weights.size
         #: Products of what the pokes say with the slopes, and with what the commands say, by lag; and
@@ -264,9 +264,19 @@ class ResponseTracker:
             self._past[:] = self._normal
         self.rows += data.now.size
 
+    def arrays(self) -> dict[str, NDArray[np.floating]]:
+        """What it has gathered by name, themselves and no copies: written into, they are restored."""
+        return {
+            "matrix": self._matrix,
+            "spectra": self._spectra,
+            "right": self._right,
+            "normal": self._normal,
+            "past": self._past,
+        }
+
     def response(self) -> TemporalResponse:
         """The response of all rows so far."""
-        if self.rows < self._first_rows:
+        if self.rows < self.first_rows:
             return self._first
         weights = solve_toeplitz((self._normal, self._past), self._right)
         share = self._share()
@@ -291,5 +301,5 @@ class ResponseTracker:
 
     def _share(self) -> float:
         """Share of the rows behind the first response; one as long as nothing else is used."""
-        later = self.rows if self.rows >= self._first_rows else 0
-        return self._first_rows / (self._first_rows + later)
+        later = self.rows if self.rows >= self.first_rows else 0
+        return self.first_rows / (self.first_rows + later)

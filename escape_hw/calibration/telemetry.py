@@ -133,11 +133,16 @@ class Recorder:
         self.filled = k = k + 1
         return len(self._slots) - k
 
-    def lose_one(self) -> None:
-        """Put in a lost frame, for which there must be room; something must stand before it."""
+    def lose_one(self, *, flat: bool = False) -> None:
+        """Put in a lost frame, for which there must be room.
+
+        The last command stays on the mirror, for which something must stand before, unless the mirror
+        is ``flat``.
+        """
         k = self.filled
-        self._rows[k, : self.n_slopes] = 0
-        self._rows[k, self.n_slopes :] = self._rows[k - 1, self.n_slopes :]
+        self._rows[k] = 0
+        if not flat:
+            self._rows[k, self.n_slopes :] = self._rows[k - 1, self.n_slopes :]
         self._present[k] = False
         self.filled = k + 1
 
