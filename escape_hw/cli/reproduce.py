@@ -38,6 +38,30 @@ def shwfs(
         _show_comparison(one, result, document)
 
 
+@app.command("pywfs")
+def pywfs(
+    system: Annotated[str, typer.Option("--system", help="System to run on.")] = "razor-pywfs",
+    frames: Annotated[
+        int, typer.Option("--frames", min=1, help="Frames of the open-loop DO-CRIME.")
+    ] = 100_000,
+    closed_frames: Annotated[
+        int, typer.Option("--closed-frames", min=1, help="Frames of each round in closed loop, at most.")
+    ] = 20_000,
+    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 20_000,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Matrices, optical gains and loops with and without them, on the pyramid bench."""
+    with session("reproduce pywfs", json=json, quiet=quiet) as one:
+        counts = {"frames": frames, "closed_frames": closed_frames, "loop_frames": loop_frames}
+        result, document = _case(one, "pywfs", counts, options.Choice.of(system, set, seed, mode), out)
+        _show_comparison(one, result, document)
+
+
 @app.command("maps")
 def maps(
     system: Annotated[str, typer.Option("--system", help="System to run on.")] = "maps-nir",
@@ -81,7 +105,7 @@ def table1(
 def everything(
     out: Annotated[Path, typer.Option("--out", help="Folder; each part gets a folder of its own in it.")],
     only: Annotated[
-        list[str] | None, typer.Option("--only", help="A part (table1, shwfs, maps); repeatable.")
+        list[str] | None, typer.Option("--only", help="A part (table1, shwfs, pywfs, maps); repeatable.")
     ] = None,
     share: Annotated[
         float,

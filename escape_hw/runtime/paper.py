@@ -10,8 +10,9 @@ from escape_hw.api.procedure import Procedure
 from escape_hw.bench import Bench
 from escape_hw.errors import ConfigError
 from escape_hw.runtime.reproduce import PAPER_CASE, reproduce_shwfs, reproduce_table1
-from escape_hw.runtime.reproduce_keep import keep_maps, keep_shwfs, keep_table1
+from escape_hw.runtime.reproduce_keep import keep_maps, keep_pywfs, keep_shwfs, keep_table1
 from escape_hw.runtime.reproduce_maps import reproduce_maps
+from escape_hw.runtime.reproduce_pywfs import reproduce_pywfs
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,11 @@ CASES = {
         PaperCase(
             "shwfs", "Shack-Hartmann bench: matrices and loops", "razor-shwfs",
             {"frames": 10_000, "loop_frames": 30_000}, reproduce_shwfs, keep_shwfs, PAPER_CASE,
+        ),
+        PaperCase(
+            "pywfs", "pyramid bench: matrices, optical gains, loops with and without them", "razor-pywfs",
+            {"frames": 100_000, "closed_frames": 20_000, "loop_frames": 20_000},
+            reproduce_pywfs, keep_pywfs,
         ),
         PaperCase(
             "maps", "telescope with a dirty mirror: matrix, simulation and loops", "maps-nir",

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.gains import GainsResult
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.bench import Bench
@@ -40,6 +41,7 @@ class Comparison:
     loops: dict[str, LoopResult] = field(default_factory=dict)
     scans: dict[str, list[LoopResult]] = field(default_factory=dict)
     sky_time: dict[str, Any] | None = None
+    gains: GainsResult | None = None
     notes: list[str] = field(default_factory=list)
     partial: bool = False
 

@@ -21,6 +21,14 @@ def keep_shwfs(
     return keep_comparison(folder, record, result, wall_seconds, "reproduce shwfs", title)
 
 
+def keep_pywfs(
+    folder: RunFolder, record: BenchRecord, result: Comparison, wall_seconds: float
+) -> dict[str, Any]:
+    """As :func:`keep_comparison`, of :func:`~escape_hw.runtime.reproduce_pywfs.reproduce_pywfs`."""
+    title = f"Calibration and optical gains without a source: {record.system}"
+    return keep_comparison(folder, record, result, wall_seconds, "reproduce pywfs", title)
+
+
 def keep_maps(
     folder: RunFolder, record: BenchRecord, result: Comparison, wall_seconds: float
 ) -> dict[str, Any]:
