@@ -10,13 +10,42 @@ from escape_hw.io.run_folder import RunFolder
 from escape_hw.runtime import criteria
 from escape_hw.runtime.keep import finish, keep_calibration, keep_loop, key_of
 from escape_hw.runtime.records import BenchRecord
-from escape_hw.runtime.reproduce import ShwfsResult, Table1Result, measured_part
+from escape_hw.runtime.reproduce import Comparison, Table1Result, measured_part
 
 
 def keep_shwfs(
-    folder: RunFolder, record: BenchRecord, result: ShwfsResult, wall_seconds: float
+    folder: RunFolder, record: BenchRecord, result: Comparison, wall_seconds: float
 ) -> dict[str, Any]:
-    """Products, ``result.json`` and report of :func:`~escape_hw.runtime.reproduce.reproduce_shwfs`.
+    """As :func:`keep_comparison`, of :func:`~escape_hw.runtime.reproduce.reproduce_shwfs`."""
+    title = f"Calibration without a source: {record.system}"
+    return keep_comparison(folder, record, result, wall_seconds, "reproduce shwfs", title)
+
+
+def keep_pywfs(
+    folder: RunFolder, record: BenchRecord, result: Comparison, wall_seconds: float
+) -> dict[str, Any]:
+    """As :func:`keep_comparison`, of :func:`~escape_hw.runtime.reproduce_pywfs.reproduce_pywfs`."""
+    title = f"Calibration and optical gains without a source: {record.system}"
+    return keep_comparison(folder, record, result, wall_seconds, "reproduce pywfs", title)
+
+
+def keep_maps(
+    folder: RunFolder, record: BenchRecord, result: Comparison, wall_seconds: float
+) -> dict[str, Any]:
+    """As :func:`keep_comparison`, of :func:`~escape_hw.runtime.reproduce_maps.reproduce_maps`."""
+    title = f"Calibration on the sky, with a dirty mirror: {record.system}"
+    return keep_comparison(folder, record, result, wall_seconds, "reproduce maps", title)
+
+
+def keep_comparison(
+    folder: RunFolder,
+    record: BenchRecord,
+    result: Comparison,
+    wall_seconds: float,
+    command: str,
+    title: str,
+) -> dict[str, Any]:
+    """Products, ``result.json`` and report of several calibrations of one system.
 
     Returns
     -------
@@ -43,8 +72,8 @@ def keep_shwfs(
     labels |= {f"loop_{key_of(label)}": {"label": label} for label in result.loops}
     labels.setdefault("escape", {}).update(measured="DO-CRIME", column="")
     document = {
-        **record.head("reproduce shwfs"),
-        "title": f"Calibration without a source: {record.system}",
+        **record.head(command),
+        "title": title,
         "calibrations": {k: documents.calibration_document(v) for k, v in result.calibrations.items()},
         **documents.registration_document(estimate),
         "loops": {label: documents.loop_document(loop) for label, loop in result.loops.items()},
