@@ -86,13 +86,13 @@ def _gains_and_loops(
     model = yield from model_psf(bench)
     known = dict(result.calibrations)
     beside = {label: one.matrix for label, one in known.items() if label != "ESCAPE"}
-    gains = yield from bootstrap_gains(
+    run = yield from bootstrap_gains(
         bench, known["ESCAPE"], beside=beside, frames=closed_frames, model_psf=model
     )
-    result.gains, result.partial = gains, gains.partial
-    if gains.partial:
+    result.gains, result.partial = run.result, run.result.partial
+    if result.partial:
         return
-    closed = yield from docrime_closed_loop(bench, gains.rescaled, frames=closed_frames, poke=CLOSED_POKE)
+    closed = yield from docrime_closed_loop(bench, run.rescaled, frames=closed_frames, poke=CLOSED_POKE)
     result.calibrations["DO-CRIME closed"], result.partial = closed, closed.partial
     if closed.partial:
         return
@@ -106,6 +106,7 @@ def _to_close(
     known: dict[str, CalibrationResult], result: Comparison
 ) -> Iterator[tuple[str, CalibrationResult]]:
     """Each matrix as it is, and scaled by its optical gains."""
+    from escape_hw.calibration.gain_bootstrap import usable
     from escape_hw.calibration.optical_gain import scaled_matrix
 
     if result.gains is None or result.gains.gains is None:
@@ -113,5 +114,5 @@ def _to_close(
     every = {"ESCAPE": result.gains.gains, **result.gains.beside}
     for label, one in known.items():
         yield label, one
-        scaled = scaled_matrix(one.matrix, every[label].best, every[label].best_sigma)
+        scaled = scaled_matrix(one.matrix, usable(every[label]), every[label].best_sigma)
         yield label + WITH_GAINS, replace(one, matrix=scaled, measured=None)
