@@ -99,8 +99,8 @@ def loops(results: Mapping[str, LoopResult]) -> list[dict[str, Any]]:
         difference = ours.value - theirs.value
         checks.append(
             check(
-                f"Strehl ({what}) of {ours_name} minus {name}: {100 * difference:+.1f} ± {100 * error:.1f} %, "
-                "not below zero by more than two standard errors",
+                f"Strehl ({what}) of {ours_name} minus {name}: {100 * difference:+.1f} ± "
+                f"{100 * error:.1f} %, not below zero by more than two standard errors",
                 difference >= -2 * error,
             )
         )
