@@ -16,6 +16,7 @@ from escape_hw.cli import (
     dm,
     doctor,
     emulate,
+    gains,
     loop,
     modulator,
     perf,
@@ -40,6 +41,7 @@ app.command("systems")(systems.systems)
 app.add_typer(systems.config_app, name="config")
 app.command("calibrate")(calibrate.calibrate)
 app.command("sprint")(calibrate.sprint)
+app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
