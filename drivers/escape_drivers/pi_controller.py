@@ -52,7 +52,7 @@ class E727:
 
     def __init__(self, link: Link, axes: tuple[str, str]) -> None:
         self.link, self.axes = link, axes
-        self._order: list[str] | None = None
+        self._bits: list[int] | None = None
 
     # ------------------------------------------------------------------ who and what
     @property
@@ -72,7 +72,14 @@ class E727:
 
     def channels(self) -> list[str]:
         """Names of all axes."""
-        return self.link.ask(lambda reply: [text.strip() for text in reply], "SAI?")
+
+        def parse(reply: list[str]) -> list[str]:
+            names = [text.strip() for text in reply]
+            if not all(name.isascii() and name.isalnum() for name in names):
+                raise Garbled(f"{' / '.join(reply)[:80]!r} where names of axes were due")
+            return names
+
+        return self.link.ask(parse, "SAI?")
 
     def stages(self) -> list[str]:
         """What is connected to the axes in use."""
@@ -235,13 +242,19 @@ class E727:
     def stop(self) -> None:
         """Stop both axes' generators."""
         self.link.tell("WGO", self.axes[0], 0, self.axes[1], 0)
+        self._require("WGO", [0, 0], [float(runs) for runs in self.running()], 0)
 
     def running(self) -> list[bool]:
         """Which of the axes' generators run: a mask over all axes, asked with a single byte."""
-        if self._order is None:
-            self._order = self.channels()
+        if self._bits is None:
+            order = self.channels()
+            if not set(self.axes) <= set(order):
+                raise Garbled(
+                    f"axes {', '.join(order)}, where {' and '.join(self.axes)} have to be among them"
+                )
+            self._bits = [order.index(axis) for axis in self.axes]
         mask = self.link.ask_byte(_RUNNING)
-        return [bool(mask >> self._order.index(axis) & 1) for axis in self.axes]
+        return [bool(mask >> bit & 1) for bit in self._bits]
 
     def played(self) -> tuple[Turn, list[NDArray[np.float64]]]:
         """The waves that the generators play: their turn, and the targets of both axes ``(points,)`` each."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 from escape_drivers import pi_gcs
@@ -188,13 +188,25 @@ class Link:
                 return reply
 
     def _receive(self, deadline: float) -> list[str] | None:
-        """The next complete reply; ``None`` when it does not come in time."""
+        """The next complete reply; ``None`` when it does not come in time.
+
+        What has arrived by the deadline counts, even if this thread was not let run meanwhile.
+        """
+        late = False
         while True:
             reply = self._reader.take()
-            left = deadline - time.monotonic()
-            if reply is not None or left <= 0:
+            if reply is not None or late:
                 return reply
-            self._reader.feed(self._transport.read(left))
+            left = deadline - time.monotonic()
+            late = left <= 0
+            self._reader.feed(self._transport.read(max(left, 0.0)))
+
+    def _replies(self, deadline: float) -> Iterator[list[str]]:
+        """The replies that come in time; one that has been waiting may be late, no second one."""
+        while (reply := self._receive(deadline)) is not None:
+            yield reply
+            if time.monotonic() > deadline:
+                return
 
     # ------------------------------------------------------------------ recovery
     def _meet(self, trouble: Garbled | None = None) -> int:
@@ -229,7 +241,7 @@ class Link:
         )
 
     def _await_identity(self, deadline: float) -> bool:
-        while (reply := self._receive(deadline)) is not None:
+        for reply in self._replies(deadline):
             if self.identity and reply[-1].endswith(self.identity):
                 return True
             if not self.identity and _MAKER in reply[-1]:
@@ -240,7 +252,7 @@ class Link:
 
     def _await_number(self, deadline: float) -> int | None:
         """The answer to ``ERR?`` behind what still comes of the identity; ``None`` if none comes in time."""
-        while (reply := self._receive(deadline)) is not None:
+        for reply in self._replies(deadline):
             if not reply[-1].endswith(self.identity):
                 return _error(reply) if reply[-1].strip().isdigit() else None
         return None

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 from escape_drivers.pi_transports import SerialTransport, TcpTransport, Transport, WireLost
 from escape_drivers.pi_usb import UsbTransport
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.emulator import Emulator
     from escape_hw.config.device_models import ModulatorConfig
     from escape_hw.config.models import SystemConfig
 
+#: Where an emulated controller listens, ``HOST:PORT``; goes before the configuration, for rehearsals.
+ENVIRONMENT = "ESCAPE_E727"
 #: Name of the emulator in the group ``escape.emulators``.
 _EMULATOR = "e727"
 
 
 def make_transport(section: ModulatorConfig, config: SystemConfig, shared: dict[str, object]) -> Transport:
-    """The wire that ``devices.modulator.wire`` names; not open.
+    """The wire that ``devices.modulator.wire`` names, or :data:`ENVIRONMENT`; not open.
 
     Parameters
     ----------
@@ -29,9 +33,14 @@ def make_transport(section: ModulatorConfig, config: SystemConfig, shared: dict[
     Raises
     ------
     ConfigError
-        An emulator is asked for and none is installed.
+        An emulator is asked for and none is installed, or the environment holds no address.
     """
     wire = section.wire
+    if address := os.environ.get(ENVIRONMENT):
+        host, _, port = address.rpartition(":")
+        if not host or not port.isdigit():
+            raise ConfigError(f"{ENVIRONMENT}={address}: write HOST:PORT, or unset it")
+        return TcpTransport(host, int(port), wire.connect_s, wire.timeout_s)
     if wire.kind == "tcp":
         return TcpTransport(wire.host, wire.port, wire.connect_s, wire.timeout_s)
     if wire.kind == "serial":

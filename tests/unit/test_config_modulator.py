@@ -69,6 +69,16 @@ def test_the_wire_is_the_configured_one_and_connects_to_nothing(kind, transport)
     assert type(make_transport(config.devices.modulator, config, {})) is transport
 
 
+def test_the_environment_goes_before_the_wire(monkeypatch):
+    config = load_system("razor-pywfs", overrides=["devices.modulator.wire.kind=serial"])
+    assert config.devices.modulator is not None
+    monkeypatch.setenv("ESCAPE_E727", "127.0.0.1:4711")
+    assert make_transport(config.devices.modulator, config, {}).where == "127.0.0.1:4711"
+    monkeypatch.setenv("ESCAPE_E727", "here")
+    with pytest.raises(ConfigError, match="ESCAPE_E727=here: write HOST:PORT"):
+        make_transport(config.devices.modulator, config, {})
+
+
 def test_one_device_is_built_alone():
     config = load_system("razor-pywfs", overrides=["devices.modulator.mode=hardware"])
     stage = build_device("modulator", config, TipTiltModulator)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Protocol
 
 import numpy as np
@@ -102,6 +103,16 @@ class Wave:
         return np.asarray(here + (there - here) * (part / self.rate))
 
 
+@cache
+def _closed_loop(
+    frequency_hz: float, damping: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Filter (numerator, denominator) on the servo's clock, and its state at a rest of 1."""
+    w = 2 * np.pi * frequency_hz
+    top, bottom, _ = cont2discrete(([w * w], [1.0, 2 * damping * w, w * w]), SERVO_S)
+    return top.ravel(), bottom, lfilter_zi(top.ravel(), bottom)
+
+
 @dataclass
 class Axis:
     """One axis: a source of targets and a closed loop of second order that follows it late.
@@ -120,11 +131,8 @@ class Axis:
     source: Source = field(default_factory=lambda: Rest(0.0))
 
     def __post_init__(self) -> None:
-        w = 2 * np.pi * self.frequency_hz
-        system = ([w * w], [1.0, 2 * self.damping * w, w * w])
-        top, bottom, _ = cont2discrete(system, SERVO_S)
-        self._filter = (top.ravel(), bottom)
-        self._unit = lfilter_zi(*self._filter)
+        top, bottom, self._unit = _closed_loop(self.frequency_hz, self.damping)
+        self._filter = (top, bottom)
         self._state = self._unit * 0.0
         self._step = 0
         self.position = 0.0
