@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
-    from escape_hw.config.device_models import DeviceConfig
+    from escape_hw.config.device_models import CameraConfig, DeviceConfig
+    from escape_hw.config.models import SystemConfig
 
 Options = TypeVar("Options")
 
@@ -47,6 +48,20 @@ def read_options(kind: type[Options], device: str, section: DeviceConfig) -> Opt
     if problems:
         raise ConfigError("\n".join(problems))
     return kind(**values)
+
+
+def camera_section(device: str, config: SystemConfig) -> CameraConfig:
+    """The section of one of the cameras.
+
+    Raises
+    ------
+    ConfigError
+        The system has no such camera.
+    """
+    section = {"wfs": config.devices.wfs, "science": config.devices.science}.get(device)
+    if section is None:
+        raise ConfigError(f"devices.{device}: system '{config.system.name}' has no such camera")
+    return section
 
 
 def require_serial(device: str, section: DeviceConfig) -> str:

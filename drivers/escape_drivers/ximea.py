@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_drivers.camera_limits import CameraLimits, Range
-from escape_drivers.options import read_options, require_serial
+from escape_drivers.options import camera_section, read_options, require_serial
 from escape_drivers.waiting_camera import WaitingCamera
 from escape_drivers.ximea_errors import NO_IMAGE, TIMEOUT
 from escape_drivers.ximea_library import XiImage, XimeaLibrary
@@ -105,11 +105,9 @@ def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> X
     Raises
     ------
     ConfigError
-        No such device section, no serial number, or an option that this driver does not know.
+        No such camera, no serial number, or an option that this driver does not know.
     """
-    section = config.devices.science if name == "science" else config.devices.wfs
-    if section is None:
-        section = config.devices.wfs
+    section = camera_section(name, config)
     require_serial(name, section)
     return XimeaCamera(name, section, read_options(XimeaOptions, name, section))
 
