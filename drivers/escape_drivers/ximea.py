@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -53,6 +52,9 @@ class XimeaOptions:
         Frames that the library buffers.
     trigger, gpi
         Edge on that input that starts an exposure; ``"off"``: the camera keeps its own rate.
+    trigger_margin
+        Share of the frame that the exposure leaves free with a trigger: for readout, and for edges that
+        come a little faster than ``frame_rate_hz`` says. A camera that is not ready misses every other one.
     exposure_output
         Whether output 1 is high while the camera exposes.
     zero_rot
@@ -69,6 +71,7 @@ class XimeaOptions:
     queue: int = 4
     trigger: Literal["off", "rising", "falling"] = "off"
     gpi: int = 1
+    trigger_margin: float = 0.02
     exposure_output: bool = False
     zero_rot: Literal["", "on", "off"] = ""
     bandwidth_mbit: int = 0
@@ -187,7 +190,9 @@ class XimeaCamera(WaitingCamera):
             self._managed(library.close)
 
     def _longest_s(self, want: CameraSettings) -> float:
-        return super()._longest_s(want) if self._options.trigger == "off" else math.inf
+        """Longest exposure; with a trigger, one that leaves the camera ready for the next edge."""
+        spare = 0.0 if self._options.trigger == "off" else self._options.trigger_margin
+        return super()._longest_s(want) * (1 - spare)
 
     def _applied(self, want: CameraSettings) -> CameraSettings:
         library, region = self._connected(), want.region

@@ -99,7 +99,8 @@ def test_options_become_parameters(xi) -> None:
 
 def test_the_modulators_edges_start_the_exposures(xi) -> None:
     xi.script("set trigger_hz 303.03")
-    with make("ximea", "devices.wfs.exposure_s=3.2e-3", system="razor-pywfs") as camera:
+    with make("ximea", system="razor-pywfs") as camera:
+        assert camera.settings.exposure_s == pytest.approx(3266e-6), "3.3 ms would miss every other edge"
         wanted = [
             "gpi_selector 1",
             "gpi_mode 1",
