@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from escape_drivers.alpao_library import AlpaoLibrary, version_text
-from escape_drivers.options import read_options, require_serial
+from escape_drivers.options import read_options, require_between, require_serial
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.errors import CommandRejected, DeviceError
 
@@ -82,7 +82,9 @@ def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> A
     """
     section = config.devices.dm
     require_serial(name, section)
-    return AlpaoMirror(name, section, read_options(AlpaoOptions, name, section))
+    options = read_options(AlpaoOptions, name, section)
+    require_between(name, options, {"ack_timeout_ms": (0, 60_000)})
+    return AlpaoMirror(name, section, options)
 
 
 class AlpaoMirror(DeformableMirror):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_drivers.camera_limits import CameraLimits, Range
-from escape_drivers.options import camera_section, read_options, require_serial
+from escape_drivers.options import camera_section, read_options, require_between, require_serial
 from escape_drivers.waiting_camera import WaitingCamera
 from escape_drivers.ximea_errors import NO_IMAGE, TIMEOUT
 from escape_drivers.ximea_library import XiImage, XimeaLibrary
@@ -30,6 +30,10 @@ _BINNINGS = {"binning": 0, "skipping": 1}
 _TRIGGERS = {"off": 0, "rising": 1, "falling": 2}
 _UNSAFE, _GPI_TRIGGER, _GPO_EXPOSURE, _ZERO_ROT = 0, 1, 4, 0
 _FREE_RUN, _FRAME_RATE = 0, 1
+_RANGES = {
+    "downsampling": (1, 16), "queue": (2, 1000), "gpi": (1, 16), "trigger_margin": (0, 0.5),
+    "bandwidth_mbit": (0, 100_000),
+}  # fmt: skip
 #: Never a frame number; stays where the library is too old to fill the field.
 _UNFILLED = 2**32 - 1
 
@@ -112,7 +116,9 @@ def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> X
     """
     section = camera_section(name, config)
     require_serial(name, section)
-    return XimeaCamera(name, section, read_options(XimeaOptions, name, section))
+    options = read_options(XimeaOptions, name, section)
+    require_between(name, options, _RANGES)
+    return XimeaCamera(name, section, options)
 
 
 class XimeaCamera(WaitingCamera):

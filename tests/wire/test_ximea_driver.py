@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from escape_drivers.ximea_errors import ERRORS, explain
 from escape_hw.api.frames import Region
 from escape_hw.config.registry import available
-from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
+from escape_hw.errors import ConfigError, DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
 
 SET_UP = [
     "xiOpenDeviceBy 1 SIMWFS",
@@ -249,6 +249,18 @@ def test_the_wrong_downsampling_is_noticed(xi) -> None:
     with pytest.raises(DeviceError, match=r"is read out as 1280 x 1024 pixels, but sensor_px says 640 x 512"):
         make("ximea", "devices.wfs.options.downsampling=1").open()
     assert xi.calls[-1] == "xiCloseDevice"
+
+
+def test_numbers_out_of_range_are_all_told_at_once() -> None:
+    wrong = ("downsampling=0", "queue=1", "trigger_margin=0.9")
+    with pytest.raises(ConfigError) as refused:
+        make("ximea", *(f"devices.wfs.options.{one}" for one in wrong))
+    told = str(refused.value).splitlines()
+    assert [line.split(":")[0].rpartition(".")[2] for line in told] == [
+        "downsampling",
+        "queue",
+        "trigger_margin",
+    ]
 
 
 def test_one_camera_has_one_owner(xi) -> None:

@@ -1,7 +1,8 @@
 /* Stand-in of XIMEA's libm3api: one MQ013MG-ON, strict about order, ranges, types and structure sizes.
  *
  * Properties (set KEY VALUE): serial, width_inc, height_inc, padding (bytes after each row), first (number of
- * the first frame), pace (0: frames are always ready), dim (halvings of the light), trigger_hz (edges on the input; 0: none), lost_code.
+ * the first frame), pace (0: frames are always ready), dim (halvings of the light), trigger_hz (edges on the
+ * input; 0: none), lost_code.
  */
 #define _GNU_SOURCE
 #include "stand_in.h"
