@@ -309,6 +309,20 @@ def test_a_long_time_out_never_outlasts_close(xi, call) -> None:
     assert not xi.complaints, "neither stopped nor closed while xiGetImage was waiting"
 
 
+def test_a_reader_that_starts_it_again_while_it_closes_is_stopped_too(xi) -> None:
+    camera = make("ximea").open()
+    camera.next_frame(1.0)
+
+    def overtaken() -> None:
+        camera.stop()
+        camera.start()
+
+    camera._before_close = overtaken
+    camera.close()
+    assert xi.names()[-3:] == ["xiStartAcquisition", "xiStopAcquisition", "xiCloseDevice"]
+    assert not xi.complaints
+
+
 def test_readers_and_a_closer_in_many_threads(xi) -> None:
     for _ in range(10):
         camera = make("ximea").open()

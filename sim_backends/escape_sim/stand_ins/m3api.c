@@ -508,6 +508,7 @@ static XI_RETURN from_the_bench(DWORD timeout_ms, int64_t *stamp_ns, long *numbe
 
 static XI_RETURN from_the_sensor(DWORD timeout_ms, long lose, int64_t *stamp_ns, long *number) {
     *number = next_frame(timeout_ms, lose);
+    if (*number >= 0) camera.counters[0] += lose;
     if (*number < 0) return si_unplugged ? lost_code : TIMEOUT;
     *stamp_ns = camera.start_ns + (int64_t)((double)(*number + 1) * (pace ? camera.period_ns : 1e6));
     int slots = (int)VALUE(QUEUE), top = (1 << bits()) - 1;
@@ -535,7 +536,9 @@ static XI_RETURN picture(XI_IMG *image, DWORD timeout_ms, long lose, XI_IMG *ful
     }
     full->width = (DWORD)VALUE(WIDTH);
     full->height = (DWORD)VALUE(HEIGHT);
-    full->nframe = full->acq_nframe = (DWORD)(number + first);
+    full->acq_nframe = (DWORD)(number + first);
+    /* The library counts what reached it; what was lost on the cable only the camera knows. */
+    full->nframe = full->acq_nframe - (DWORD)camera.counters[0];
     full->tsSec = (DWORD)(stamp_ns / 1000000000);
     full->tsUSec = (DWORD)(stamp_ns / 1000 % 1000000);
     return OK;
