@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from escape_drivers import asm_messages as m
 from escape_drivers.asm_codec import AsmCodec
 from escape_drivers.asm_link import AsmLink, Refused
-from escape_drivers.asm_options import EMULATOR, AsmOptions
+from escape_drivers.asm_options import EMULATOR, RANGES, AsmOptions
 from escape_drivers.asm_welcome import require_fit
-from escape_drivers.options import read_options, require_serial
+from escape_drivers.options import read_options, require_between, require_serial
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.api.mirror import DMInfo
 from escape_hw.config.registry import emulator_factory
-from escape_hw.errors import ConfigError, DeviceError
+from escape_hw.errors import DeviceError
 
 if TYPE_CHECKING:
     from escape_hw.config.device_models import MirrorConfig
@@ -44,8 +44,7 @@ def make_asm(name: str, config: SystemConfig, shared: dict[str, object]) -> AsmM
     section = config.devices.dm
     require_serial(name, section)
     options = read_options(AsmOptions, name, section)
-    if problems := options.problems():
-        raise ConfigError("\n".join(f"devices.{name}.options.{problem}" for problem in problems))
+    require_between(name, options, RANGES)
     emulator = None
     if options.host == EMULATOR:
         emulator = emulator_factory("asm")(EmulatorRequest(port=0, shared=shared, config=config))

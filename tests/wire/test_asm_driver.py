@@ -227,9 +227,9 @@ def test_fresh_dust_is_told_with_the_line_to_configure() -> None:
     ("word", "message"),
     [
         ("hots=x", "did you mean 'host'"),
-        ("port=0", "port is 0"),
-        ("reply_s=-1.0", "reply_s is -1.0"),
-        ("max_skips=0", "at least 1"),
+        ("port=0", "allowed range 1 to 65535"),
+        ("reply_s=-1.0", "reply_s: -1  is out of range"),
+        ("max_skips=0", "max_skips: 0  is out of range"),
         ("lift=1", "type bool"),
     ],
 )
