@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from driver_bench import fresh, make, stand_in
 
-from escape_drivers.aravis_library import ARAVIS, AravisLibrary
+from escape_drivers.aravis_library import ARAVIS, AravisLibrary, Received
 from escape_hw.api.frames import Region
 from escape_hw.errors import ConfigError, DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
 from escape_hw.testing import Check, Factory, parametrize_device_checks
@@ -97,6 +97,14 @@ def test_pixel_formats(arv, format_, shift, top) -> None:
         assert data.dtype == np.uint16
         assert data.max() <= top
         assert data[3, 5] == (15 + 21) >> shift
+
+
+def test_a_buffer_shorter_than_the_frame_is_never_read(arv) -> None:
+    with make("aravis") as camera:
+        held = ctypes.create_string_buffer(100)
+        short = Received(ctypes.addressof(held), 100, 0, 1, 1, 128, 128)
+        with pytest.raises(DeviceError, match="delivered 128 x 128 pixels in 100 bytes"):
+            camera._counts(short)
 
 
 def test_newest_skips_what_waits(arv) -> None:

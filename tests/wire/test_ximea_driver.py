@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from escape_drivers.ximea_errors import ERRORS, explain
+from escape_drivers.ximea_library import XiImage
 from escape_hw.api.frames import Region
 from escape_hw.config.registry import available
 from escape_hw.errors import ConfigError, DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
@@ -282,6 +283,23 @@ def test_every_code_is_explained(xi, code) -> None:
             camera.next_frame(1.0)
         assert isinstance(failed.value, DeviceLost) == (code in (1, 55, 56))
     assert explain(999).startswith("error 999, unknown error")
+
+
+def test_a_buffer_shorter_than_its_rows_is_never_read(xi) -> None:
+    with make("ximea") as camera:
+        camera.next_frame(1.0)
+        short = XiImage(bp=camera._image.bp, bp_size=400 * 400 * 2 - 1, width=400, height=400)
+        with pytest.raises(DeviceError, match="delivered 400 x 400 pixels in 319999 bytes"):
+            camera._view(short)
+
+
+def test_a_camera_that_was_reset_has_stopped_already(xi, caplog) -> None:
+    xi.script("xiGetImage 1 reset")
+    with make("ximea") as camera:
+        with pytest.raises(DeviceLost, match=r"error 55, the camera was reset; .* open it again"):
+            camera.next_frame(1.0)
+        camera.stop()
+        assert not caplog.records, "that it has stopped by itself is no failure of stopping"
 
 
 @pytest.mark.parametrize("call", ["close", "stop"])
