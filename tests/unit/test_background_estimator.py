@@ -44,6 +44,10 @@ def test_every_frame_arrives_once_and_in_order(frames):
         assert beside.finish() is recorder
     assert recorder.index == list(range(frames))
     assert recorder.rows == [[k] * 3 + [k + 0.25] * 2 + [k + 0.5] * 2 for k in range(frames)]
+    if frames > 1:
+        motion = beside.motion.state()
+        assert motion[0] == pytest.approx(np.sum(np.arange(frames)))
+        assert motion[1] == pytest.approx(np.sum(np.square(np.arange(frames))), rel=1e-5)
     assert len(looked) == -(-frames // background.BLOCK)
     assert beside.skipped == 0
 
