@@ -257,8 +257,8 @@ class DocrimeEstimator:
 
     @property
     def taken(self) -> int:
-        """Frames taken, those that are not in the sums yet included."""
-        return self.frames + self._recorder.fresh
+        """Frames taken, also those not in the sums yet; less those whose slopes will not be taken."""
+        return self.frames + self._recorder.fresh - self._blind
 
     @property
     def settled(self) -> bool:
