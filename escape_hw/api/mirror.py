@@ -177,6 +177,11 @@ class DeformableMirror(Device):
         return self._checked().limit(command)
 
     @final
+    def obeys(self, command: NDArray[np.float64]) -> bool:
+        """Whether a shape ``(n_act,)`` would pass :meth:`send` as it is; sends nothing."""
+        return self._checked().obeys(command)
+
+    @final
     def allowed_share(self, command: ArrayLike) -> float:
         """Largest factor, at most 1, with which a shape breaks no limit by itself (slew apart).
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult
     from escape_hw.bench import Bench
     from escape_hw.calibration.checkpoint import Checkpoint
+    from escape_hw.io.fits import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
 
@@ -152,7 +153,7 @@ def calibrate(
                 used = None if closing is None else closing.result
                 result, stop = one.attempt(request.procedure(bench, used, keep))
             with one.saving(stop):
-                _finish(one, folder, record, result, request)
+                _finish(one, folder, record, result, request, closing)
             if stop is not None:
                 raise stop
             keep.done()
@@ -210,7 +211,12 @@ def _with_modes(one: Session, choice: options.Choice, modes: int) -> options.Cho
 
 
 def _finish(
-    one: Session, folder: RunFolder, record: BenchRecord, result: CalibrationResult, request: _Request
+    one: Session,
+    folder: RunFolder,
+    record: BenchRecord,
+    result: CalibrationResult,
+    request: _Request,
+    closing: MatrixProduct | None,
 ) -> None:
     """Save, judge, report and show a calibration."""
     from escape_hw.io.documents import calibration_document
@@ -220,9 +226,9 @@ def _finish(
 
     measured = measured_part(result)
     labels: dict[str, Any] = {"im": {"measured": "DO-CRIME", "column": ""}}
-    parents = {}
+    parents = {} if closing is None else {"closing": closing.path}
     if measured is not None:
-        parents = {"docrime": keep_calibration(folder, record, "docrime", measured)}
+        parents = {"docrime": keep_calibration(folder, record, "docrime", measured, parents)}
         labels["docrime"] = {"label": "DO-CRIME"}
     keep_calibration(folder, record, "im", result, parents)
     checks = []

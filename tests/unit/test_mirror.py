@@ -310,3 +310,15 @@ def test_guard_report_reaches_the_counters() -> None:
     dm.open()
     assert (dm.clipped_count, dm.sent_count, dm.rejected_count) == (0, 0, 0)
     dm.close()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(-1.2, 1.2), min_size=N, max_size=N), st.floats(0.05, 1.0))
+def test_what_obeys_is_sent_as_it_is_and_nothing_else_is(values: list[float], slew: float) -> None:
+    with RecordingMirror("dm", MirrorLimits(max_stroke=0.9, max_slew=slew, max_mean=0.3)) as dm:
+        shape = np.array(values)
+        obeys = dm.obeys(shape)
+        assert dm.sent_count == 0
+        report = dm.send(shape)
+        assert obeys == report.guard.untouched
+        assert not obeys or np.array_equal(report.sent, shape)
