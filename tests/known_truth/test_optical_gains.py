@@ -102,7 +102,7 @@ def test_bootstrap_converges_from_any_scale_to_the_same_matrix(
                 accuracy=0.03,
                 frames=5000,
                 beside={"baseline": baseline.matrix},
-            )  # fmt: skip
+            )
         )
         result = run.result
         assert result.converged, result.notes
