@@ -122,8 +122,8 @@ def _require_agreement(gains: MeasuredGains) -> None:
     if wrong > _WRONG * value.size or scatter > float(np.mean(value)):
         raise CalibrationError(
             f"the loop cannot be closed: {wrong} of {value.size} modes answer with the opposite sign, and "
-            f"the modes' gains scatter by {scatter:.2g} about {np.mean(value):.2g}. The matrix does not "
-            "belong to this state of the bench (registration, flip or rotation of the pupil); measure it again"
+            f"the modes' gains scatter by {scatter:.2g} about {np.mean(value):.2g}. The matrix belongs to "
+            "another state of the bench (registration, flip or rotation of the pupil); measure it again"
         )
 
 

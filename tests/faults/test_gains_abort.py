@@ -25,13 +25,15 @@ class StopAt:
 
 
 @pytest.mark.parametrize(
-    ("stage", "frames", "rounds"), [("open loop", 50, 0), ("first closure", 10, 0), ("round 2", 900, 2)]
+    ("stage", "frames", "rounds"), [("open loop", 50, 0), ("first closure", 10, 0), ("round 2", 700, 2)]
 )
 def test_stopped(bench, good, tmp_path, stage, frames, rounds):
     stop = StopAt(stage, frames)
     with pytest.raises(Aborted) as caught:
         bench.run(
-            bootstrap_gains(bench, good.run.result, accuracy=0.001), observers=(stop,), abort=stop.abort
+            bootstrap_gains(bench, good.run.result, accuracy=0.001, frames=1200),
+            observers=(stop,),
+            abort=stop.abort,
         )
     assert_flat(bench)
     run = caught.value.partial

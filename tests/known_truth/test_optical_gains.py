@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from small_pyramid import small
+from small_pyramid import SMALL, small
 
 from escape_hw.api.gains import OpticalGains
 from escape_hw.api.results import CalibrationResult
@@ -16,6 +18,7 @@ from escape_hw.calibration.gain_loop import GainLoop, Stretch
 from escape_hw.calibration.optical_gain import projector, slope_weights
 from escape_hw.calibration.push_pull import push_pull
 from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
+from escape_hw.io.fits import load_matrix, save_matrix
 from escape_hw.runtime.records import without_turbulence
 from escape_hw.runtime.system import System
 from escape_sim.local_response import FrozenWavefronts, local_gains, twin_behind
@@ -157,3 +160,31 @@ def test_numbers_that_mean_nothing_and_strangers_are_refused(
     )
     with pytest.raises(IncompatibleProduct, match="pp was measured on other"):
         bench.run(bootstrap_gains(bench, baseline, beside={"pp": stranger}))
+
+
+def test_the_command_keeps_gains_and_matrix(
+    bench: System, baseline: CalibrationResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from escape_hw.cli.app import run
+    from escape_hw.report.content import read_run
+    from escape_hw.runtime.records import BenchRecord
+
+    im = save_matrix(tmp_path / "pp.fits", baseline, BenchRecord.of(bench).origin())
+    words = [word for one in (*SMALL, DIM) for word in ("--set", one)]
+    out = tmp_path / "run"
+    options = ["--frames", "900", "--accuracy", "0.2", "--no-strehl", "--out", out, "--beside", im, "--json"]
+    with pytest.raises(SystemExit) as ended:
+        run([str(word) for word in ("gains", "razor-pywfs", "--im", im, *options, *words)])
+    document = json.loads(capsys.readouterr().out)
+    assert ended.value.code == 0, document
+    assert document["converged"] is True
+    assert len(document["optical_gain"]) == len(document["sigma"]) == 20
+    assert document["rounds"][-1]["poke"] <= POKE
+    # The same matrix beside itself has the same gains.
+    assert document["beside"]["pp"]["optical_gain"] == pytest.approx(document["optical_gain"])
+    found = load_matrix(out / "im.fits").matrix.data / baseline.matrix.data
+    assert np.median(found, axis=0) == pytest.approx(document["optical_gain"], rel=1e-3)
+    content = read_run(out)
+    assert content.gains["push-pull"].converged
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Optical gains" in page
