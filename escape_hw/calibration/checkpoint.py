@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -17,8 +18,6 @@ from escape_hw.bench import Bench
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.io.state_file import RunState, load_state, save_state
 
-#: Seconds between two states, wall clock.
-EVERY_S = 5.0
 #: Differences that a refusal names.
 _NAMED = 5
 
@@ -32,13 +31,15 @@ class Checkpoint:
         File to keep the state in.
     resume
         File with the state to go on from; ``None`` for a run from the beginning.
-    every_s
-        Seconds between two states.
+    request
+        Plain values kept beside the state for whoever goes on with it: how the run was asked for.
     """
 
-    def __init__(self, path: Path, resume: Path | None = None, every_s: float = EVERY_S) -> None:
-        self.path, self._source, self._every = path, resume, every_s
-        self._next = time.monotonic() + every_s
+    def __init__(
+        self, path: Path, resume: Path | None = None, request: Mapping[str, Any] | None = None
+    ) -> None:
+        self.path, self._source, self._request = path, resume, dict(request or {})
+        self._next = self._every = math.inf
         self._identity: Mapping[str, Any] = {}
         self._bench: Bench | None = None
 
@@ -67,7 +68,8 @@ class Checkpoint:
         ProductError
             It cannot be read.
         """
-        self._bench = bench
+        self._bench, self._every = bench, bench.config.calibration.checkpoint_s
+        self._next = time.monotonic() + self._every
         self._identity = {
             "system": bench.config.system.name,
             "simulated": bench.simulated,
@@ -99,7 +101,7 @@ class Checkpoint:
         """
         if self._bench is None:
             raise RuntimeError("a checkpoint was saved before its run began")
-        values = {**values, "rng": self._bench.rng.bit_generator.state}
+        values = {**values, "request": self._request, "rng": self._bench.rng.bit_generator.state}
         state = RunState(self._identity, values, arrays, grid)
         save_state(self.path, state, self._bench.config.system.name, self._bench.simulated)
         self._next = time.monotonic() + self._every

@@ -26,9 +26,9 @@ from escape_hw.calibration.sensor_setup import (
     modal_basis,
     poke_amplitudes,
 )
-from escape_hw.calibration.stopping import Judge, Looks, Target
+from escape_hw.calibration.stopping import Judge, Looks, Target, no_accuracy
 from escape_hw.config.models import CalibrationSection
-from escape_hw.errors import Aborted, ConfigError, TooFewFrames
+from escape_hw.errors import Aborted, TooFewFrames
 
 #: Slopes up to which the correlation of their noise is followed.
 MOST_CORRELATED = 3000
@@ -143,10 +143,9 @@ def snr_judge(bench: Bench, m2c: NDArray[np.float64], until: Target | None, meth
     ConfigError
         A registration's accuracy is asked for, too: a matrix alone has none.
     """
+    no_accuracy(until)
     if until is None:
         return None
-    if until.accuracy is not None:
-        raise ConfigError("an accuracy is that of a registration; ask the method 'escape' for it")
 
     def judge(solution: DocrimeSolution, grid: SensorGeometry) -> Procedure[bool]:
         yield from ()

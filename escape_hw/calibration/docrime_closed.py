@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +30,6 @@ from escape_hw.calibration.poke_patterns import Pattern, RandomPokes
 from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepare_sensor
 from escape_hw.calibration.stopping import Judge, Looks, Target
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
-
-T = TypeVar("T")
 
 #: Frames after which a running loop asks whether the estimate will do.
 _STRETCH = 500
@@ -65,7 +61,7 @@ class ClosedLoopPokes:
         self._bench, self._grid, self._looks, self._estimator = bench, grid, looks, estimator
         control = integrator_for(bench, matrix, grid)
         self._loop = RunningLoop(bench, matrix.m2c, extractor(bench, grid), control)
-        self._enough = False
+        self._enough = self._stopped = False
         #: Frames that the estimate lost because its sums were behind.
         self.skipped = 0
 
@@ -103,20 +99,33 @@ class ClosedLoopPokes:
                         done += stretch
                         beside.catch_up()
                 except Aborted:
-                    partial = True
+                    # At once: the sums may have a while to go.
+                    bench.dm.flatten()
+                    partial = self._stopped = True
                 beside.finish()
                 self.skipped = beside.skipped
         finally:
             bench.dm.flatten()
         self._require_closed()
         if partial:
-            _drained(self._looks.look(self._estimator, self._grid, 0, {}, {}, always=True))
+            self._drained(self._looks.look(self._estimator, self._grid, 0, {}, {}, always=True))
         return partial
 
     def _look(self, estimator: DocrimeEstimator) -> None:
         """Keep the state and judge the estimate, as far as either is due; in the estimator's thread."""
-        if not self._enough and self._looks.due(estimator.taken):
-            self._enough = _drained(self._looks.look(estimator, self._grid, estimator.taken, {}, {}))
+        if not self._enough and not self._stopped and self._looks.due(estimator.taken):
+            self._enough = self._drained(self._looks.look(estimator, self._grid, estimator.taken, {}, {}))
+
+    def _drained(self, procedure: Procedure[bool]) -> bool:
+        """What a procedure returns; its progress is nobody's. False if the run is stopped meanwhile."""
+        while True:
+            try:
+                next(procedure)
+            except StopIteration as done:
+                return bool(done.value)
+            if self._stopped:
+                procedure.close()
+                return False
 
     def _require_closed(self) -> None:
         record = self._loop.record
@@ -126,16 +135,6 @@ class ClosedLoopPokes:
                 "their limits. Lower loop.gain or raise loop.dropped_modes; if that does not help, the "
                 "matrix does not belong to this state of the bench, or the delay is longer than thought"
             )
-
-
-def _drained(procedure: Generator[Any, None, T]) -> T:
-    """What a procedure returns; its progress is nobody's."""
-    while True:
-        try:
-            next(procedure)
-        except StopIteration as done:
-            value: T = done.value
-            return value
 
 
 def docrime_closed_run(
@@ -161,13 +160,13 @@ def docrime_closed_run(
         grid.n_slopes, m2c.shape[1], order=c.whiten_order, lags=c.lags, closed=True,
         correlations=correlations and grid.n_slopes <= MOST_CORRELATED,
     )  # fmt: skip
-    prepare_sensor(bench)
-    loop = ClosedLoopPokes(bench, closing.matrix, grid, estimator, Looks(keep, judge))
     method = _method(pattern)
     settings = {"poke": poke, "correlations": correlations, "closed with": fingerprint(closing.matrix.data)}
     state = None if keep is None else keep.begin(bench, method, m2c, settings)
     if state is not None:
         estimator.restore(state.values, state.arrays)
+    prepare_sensor(bench)
+    loop = ClosedLoopPokes(bench, closing.matrix, grid, estimator, Looks(keep, judge))
     stage = f"{pattern.title} in closed loop"
     partial = yield from loop.poke(n_frames, pattern(amplitude, bench.rng), stage)
     try:

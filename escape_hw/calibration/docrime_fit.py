@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from escape_hw.api.results import TemporalResponse
+from escape_hw.calibration.late_response import require_whole_response
 from escape_hw.calibration.regression import InstrumentSums, RegressionSums
 from escape_hw.calibration.response import SLOPES, Filtered, filtered, fit_response, usable_rows
 from escape_hw.calibration.significance import require_response, spread
@@ -71,7 +72,8 @@ def first_fit(data: Telemetry, order: int, lags: int) -> FirstFit | None:
     Raises
     ------
     CalibrationError
-        The pokes do not span the modes, or (plain estimator) the mirror does not respond.
+        The pokes do not span the modes, the response goes on after its last lag, or (plain estimator)
+        the mirror does not respond.
     """
     if usable_rows(data, max(order, 1), lags).size < data.n_modes + lags + MIN_FREEDOM:
         return None
@@ -83,6 +85,7 @@ def first_fit(data: Telemetry, order: int, lags: int) -> FirstFit | None:
         return FirstFit(np.ones(1), response, covariance, _plain_spread(few, difference, response, lags))
     residuals, usable = _residuals(few, difference, response, lags)
     whitener = prediction_error_filter(residuals, usable, order)
+    require_whole_response(data, whitener, lags)
     return FirstFit(whitener, *fit_response(data, whitener, lags), 1.0)
 
 

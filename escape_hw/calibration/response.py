@@ -146,27 +146,57 @@ def fit_response(
     covariance : ndarray, ``(lags, lags)``
         Of its weights; their errors sum to zero.
     """
-    few = filtered(data.thinned(SLOPES), whitener, lags)
-    slopes, commands, now = (
-        few.slopes - few.slopes.mean(axis=0),
-        few.commands - few.commands.mean(axis=0),
-        few.now,
-    )
-    pokes = few.pokes - few.pokes.mean(axis=0) if few.closed else commands
+    weights, covariances = [], []
+    for part in halves(filtered(data.thinned(SLOPES), whitener, lags), lags):
+        total = part.weights.sum()
+        weights.append(part.weights / total)
+        # Scaled to sum 1, a weight errs with all others: d(w / sum) = (1 - w 1^T) dw / sum.
+        scaled = (np.eye(lags) - weights[-1][:, None]) / total
+        covariances.append(scaled @ part.covariance @ scaled.T)
+    mean = np.mean(weights, axis=0)
+    covariance = np.sum(covariances, axis=0) / 4
+    return TemporalResponse(mean, np.sqrt(np.diag(covariance))), covariance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Half:
+    """One half of a stretch of frames, and what the matrix of the other half makes of it.
+
+    Parameters
+    ----------
+    slopes
+        Slopes of the half's rows ``(n, n_slopes)``.
+    predicted, instrument
+        What the other half's matrix makes of the commands and of the pokes alone, of all rows
+        ``(n_rows, n_slopes)``.
+    now
+        Where the half's rows stand among all ``(n,)``.
+    weights, covariance
+        Weights of the lags as regressed, not scaled ``(lags,)``, and their covariance.
+    """
+
+    slopes: NDArray[np.float32]
+    predicted: NDArray[np.float32]
+    instrument: NDArray[np.float32]
+    now: NDArray[np.intp]
+    weights: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+def halves(few: Filtered, lags: int) -> list[Half]:
+    """Both halves of some filtered frames, each seen with the matrix of the other."""
+    slopes, commands = few.slopes - few.slopes.mean(axis=0), few.commands - few.commands.mean(axis=0)
+    pokes, now = few.pokes - few.pokes.mean(axis=0) if few.closed else commands, few.now
     best = _strongest_lag(slopes, pokes, now, lags)
     middle = now.size // 2
     parts = [slice(0, middle), slice(middle, now.size)]
-    weights, covariances = [], []
+    found = []
     for here, there in (parts, parts[::-1]):
         matrix = _matrix(slopes[here], shifted(commands, now[here], best), shifted(pokes, now[here], best))
         predicted = commands @ matrix
         instrument = pokes @ matrix if few.closed else predicted
-        w, c = _regress(slopes, predicted, instrument, now, lags, there)
-        weights.append(w)
-        covariances.append(c)
-    mean = np.mean(weights, axis=0)
-    covariance = np.sum(covariances, axis=0) / 4
-    return TemporalResponse(mean, np.sqrt(np.diag(covariance))), covariance
+        found.append(_regress(slopes[there], predicted, instrument, now[there], lags))
+    return found
 
 
 def _strongest_lag(
@@ -187,32 +217,25 @@ def _matrix(
 
 
 def _regress(
-    slopes: NDArray[np.float32],
+    y: NDArray[np.float32],
     predicted: NDArray[np.float32],
     instrument: NDArray[np.float32],
-    now: NDArray[np.intp],
+    at: NDArray[np.intp],
     lags: int,
-    part: slice,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weights of the lags, scaled to sum 1, and their covariance, on a part of the rows.
-
-    ``predicted`` is what the matrix makes of the commands, ``instrument`` of the pokes alone.
-    """
-    at, y = now[part], slopes[part]
+) -> Half:
+    """Regress slopes on what the matrix makes of the commands, the pokes being the instruments."""
     x = np.stack([shifted(predicted, at, lag) for lag in range(lags)])
     z = x if instrument is predicted else np.stack([shifted(instrument, at, lag) for lag in range(lags)])
     flat = z.reshape(lags, -1)
     normal = (flat @ x.reshape(lags, -1).T).astype(np.float64)
-    weights = np.linalg.solve(normal, (flat @ y.ravel()).astype(np.float64))
+    right = (flat @ y.ravel()).astype(np.float64)
+    weights = np.asarray(np.linalg.solve(normal, right), np.float64)
     error = y - np.tensordot(weights.astype(np.float32), x, axes=1)
     # One score per frame: neighbouring slopes err together, frames (whitened) do not.
     scores = np.einsum("lts,ts->lt", z, error).astype(np.float64)
     bread = np.linalg.inv(normal)
-    total = weights.sum()
-    weights = weights / total
-    # Scaled to sum 1, a weight errs with all others: d(w / sum) = (1 - w 1^T) dw / sum.
-    scaled = (np.eye(lags) - weights[:, None]) @ bread / total
-    return weights, scaled @ (scores @ scores.T) @ scaled.T
+    covariance = np.asarray(bread @ (scores @ scores.T) @ bread.T, np.float64)
+    return Half(y, predicted, instrument, at, weights, covariance)
 
 
 class ResponseTracker:

@@ -53,6 +53,18 @@ class Target:
         return self.snr is None or float(matrix.snr().min()) >= self.snr
 
 
+def no_accuracy(until: Target | None) -> None:
+    """Refuse to stop a measurement of a matrix by the registration behind it.
+
+    Raises
+    ------
+    ConfigError
+        The target asks for a registration's accuracy.
+    """
+    if until is not None and until.accuracy is not None:
+        raise ConfigError("an accuracy is that of a registration; ask the method 'escape' for it")
+
+
 #: Looks at a solution on the way; true when it will do.
 Judge = Callable[[DocrimeSolution, SensorGeometry], Procedure[bool]]
 

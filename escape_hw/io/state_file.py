@@ -18,7 +18,7 @@ from escape_hw.io.provenance import Provenance
 
 KIND_STATE = "STATE"
 #: Name of the file in a run's folder.
-STATE = "state.fits"
+STATE = "run.state"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
