@@ -139,7 +139,7 @@ def _salvage(loop: GainLoop, state: _State) -> None:
     if state.applied is None or measured is None:
         return
     found = _smooth(measured, 0)
-    change = found.best / _positive(state.applied) - 1
+    change = found.best / usable(state.applied) - 1
     state.rounds.append(
         GainRound(found, state.amplitude, measured.frames, _rms(change), math.nan, math.nan, math.nan, False)
     )
@@ -167,7 +167,7 @@ def _apply(loop: GainLoop, state: _State) -> None:
     """Scale the matrix by the gains; then the loop's own gain is the one wanted."""
     if state.applied is None:
         raise RuntimeError("no gains were measured yet")
-    loop.scale(_positive(state.applied))
+    loop.scale(usable(state.applied))
     loop.control.set_gain(state.gain)
 
 
@@ -239,7 +239,7 @@ def _book(
     found, old = _smooth(measured, 0), state.applied
     if old is None:
         raise RuntimeError("the loop was never closed")
-    change = found.best / _positive(old) - 1
+    change = found.best / usable(old) - 1
     expected = np.hypot(found.best_sigma / found.best, old.best_sigma / old.best)
     expected = np.hypot(expected, math.hypot(found.common_sigma, old.common_sigma))
     state.rounds.append(
@@ -280,7 +280,7 @@ def _error(gains: OpticalGains) -> float:
     return math.hypot(_rms(gains.best_sigma / gains.best), gains.common_sigma)
 
 
-def _positive(gains: OpticalGains) -> NDArray[np.float64]:
+def usable(gains: OpticalGains) -> NDArray[np.float64]:
     """Gains to scale by: one mode's noise must not turn its sign, nor raise its gain many times."""
     least = 0.3 * float(np.median(gains.trend))
     if not least > 0:
@@ -309,7 +309,7 @@ def _run_of(loop: GainLoop, calibration: CalibrationResult, state: _State, lost:
     rescaled, notes = calibration, list(state.notes)
     if state.rounds and state.applied is not None:
         sigma = np.hypot(state.applied.best_sigma, state.applied.best * state.applied.common_sigma)
-        matrix = scaled_matrix(calibration.matrix, _positive(state.applied), sigma)
+        matrix = scaled_matrix(calibration.matrix, usable(state.applied), sigma)
         rescaled = replace(calibration, matrix=matrix, measured=None, partial=state.partial)
         if not state.rounds[-1].reached:
             notes.append("the last round ended at its number of frames, before the accuracy asked for")

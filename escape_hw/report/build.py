@@ -94,15 +94,7 @@ def _facts(run: RunContent) -> dict[str, str]:
 
 
 def _verdict(document: dict[str, Any]) -> str:
-    checks = document.get("criteria") or []
-    if not checks:
-        return ""
-    items = "".join(
-        f'<li class="{"good" if check["met"] else "bad"}">{"✓" if check["met"] else "✗"} '
-        f"{html.escape(check['text'])}</li>"
-        for check in checks
-    )
-    return html.section("Criteria", f'<ul class="checks">{items}</ul>')
+    return html.section("Criteria", html.checks(document.get("criteria") or []))
 
 
 def _registration(run: RunContent) -> str:

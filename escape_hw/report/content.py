@@ -31,6 +31,7 @@ METHOD_LABELS = {
     "push-pull-fast": "fast push-pull",
     "push-pull-fast-closed": "fast push-pull, closed loop",
     "escape": "ESCAPE",
+    "simulated": "simulation",
 }
 
 

@@ -78,21 +78,29 @@ def agree(short: RegistrationEstimate, long: RegistrationEstimate) -> list[dict[
 
 
 def loops(results: Mapping[str, LoopResult]) -> list[dict[str, Any]]:
-    """Every loop is stable; ESCAPE is not below push-pull beyond the error bar."""
+    """Every loop is stable; ESCAPE is not below the measured baseline beyond the error bar.
+
+    The baseline is push-pull or, where there is no source for it, DO-CRIME.
+    """
     checks = [check(f"{label}: loop stable", loop.stable) for label, loop in results.items()]
-    escape, baseline = results.get("ESCAPE"), results.get("push-pull")
+    ours_name = "ESCAPE + OG" if "ESCAPE + OG" in results else "ESCAPE"
+    escape, name = results.get(ours_name), "push-pull" if "push-pull" in results else "DO-CRIME"
+    baseline = results.get(name)
     if escape is None or baseline is None or escape.model_psf is None or baseline.model_psf is None:
         return checks
     if escape.strehl is None or baseline.strehl is None or not math.isfinite(escape.strehl.peak.sigma):
-        return [*checks, check("Strehl of ESCAPE and push-pull compared: their loops were too short", False)]
-    for way, name in (("peak", "peak"), ("otf", "OTF"), ("encircled", "encircled")):
+        return [
+            *checks,
+            check(f"Strehl of {ours_name} and {name} compared: their loops were too short", False),
+        ]
+    for way, what in (("peak", "peak"), ("otf", "OTF"), ("encircled", "encircled")):
         ours, theirs = getattr(escape.strehl, way), getattr(baseline.strehl, way)
         error = math.hypot(ours.sigma, theirs.sigma)
         difference = ours.value - theirs.value
         checks.append(
             check(
-                f"Strehl ({name}) of ESCAPE minus push-pull: {100 * difference:+.1f} ± {100 * error:.1f} %, "
-                "not below zero by more than two standard errors",
+                f"Strehl ({what}) of {ours_name} minus {name}: {100 * difference:+.1f} ± "
+                f"{100 * error:.1f} %, not below zero by more than two standard errors",
                 difference >= -2 * error,
             )
         )
