@@ -114,3 +114,12 @@ def test_the_bootstrap_is_drawn_and_tabled_with_and_without_rounds():
     row = rounds_table(result()).rows[1]
     assert row[1:3] == ("0.04", "9000")
     assert row[-1] == "30.0 ± 1.0"
+
+
+def test_the_product_is_shown(escape, document, tmp_path):
+    path = save_gains(tmp_path / "gains.fits", result(), "razor-pywfs", True)
+    code, found, _ = document("show", path)
+    assert code == 0
+    assert found["converged"] is True
+    assert len(found["optical_gain"]) == N
+    assert "30.0 ± 1.0" in escape("show", path)[1]
