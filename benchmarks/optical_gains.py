@@ -67,12 +67,17 @@ def gains(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     best = smoothed(stretch.gains.value[0], stretch.gains.sigma[0], stretch.gains.common_sigma)
     weights = sigma**-2.0
     off = float(np.average(value / mean - 1, weights=weights))
+    # All modes of a wavefront are weak or strong together, so the few wavefronts' level is uncertain, too.
+    level = true.mean(axis=1)
+    level_sigma = float(level.std(ddof=1) / level.mean() / np.sqrt(len(level)))
+    own = float(weights.sum() ** -0.5 / mean.mean())
     noise = np.hypot(sigma, error)
     return {
         "frames": stretch.frames,
         "truth": [float(mean.min()), float(np.median(mean)), float(mean.max())],
         "bias": off,
-        "bias_sigma": float(np.hypot(weights.sum() ** -0.5 / mean.mean(), stretch.gains.common_sigma)),
+        "bias_sigma": float(np.linalg.norm([own, stretch.gains.common_sigma, level_sigma])),
+        "truth_level_sigma": level_sigma,
         "chi2_beside_bias": float(np.mean(np.square((value - mean * (1 + off)) / noise))),
         "rms_error": float(np.sqrt(np.mean(np.square(value / mean - 1)))),
         "rms_error_best": float(np.sqrt(np.mean(np.square(best.best[every] / mean - 1)))),
@@ -119,10 +124,12 @@ def loops(bench: System, options: argparse.Namespace) -> dict[str, Any]:
         "docrime": (docrime, shares[1]),
     }
     for name, (matrix, share) in matrices.items():
-        # Each around the gain that is the usual one for its scale, as a sweep would find it.
-        document[name] = [
-            _judged(bench, matrix, usual * share * factor, options.loop, psf) for factor in options.factors
-        ]
+        # Each around the gain that is the usual one for its scale, as a sweep would find it, and each on
+        # a bench of its own with the same seed: the same turbulence from the first frame on.
+        document[name] = []
+        for factor in options.factors:
+            with open_system(options.system, seed=bench.config.system.seed, set=options.set) as fresh:
+                document[name].append(_judged(fresh, matrix, usual * share * factor, options.loop, psf))
     return document
 
 
