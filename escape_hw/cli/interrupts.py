@@ -28,8 +28,6 @@ class Interrupts:
 
     def __init__(self, tell: Callable[[str], None]) -> None:
         # Imported here: it brings numpy along, which no help text needs.
-        from escape_hw.api.procedure import Flag
-
         self.abort = Flag()
         self._tell = tell
         self._in_procedure = False
