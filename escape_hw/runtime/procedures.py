@@ -94,7 +94,7 @@ def model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32
     CalibrationError
         The system has no science camera.
     """
-    from escape_hw.calibration.closed_loop import measure_model_psf
+    from escape_hw.calibration.model_psf import measure_model_psf
 
     with without_turbulence(bench):
         return (yield from measure_model_psf(bench, frames=frames))

@@ -117,7 +117,8 @@ def _calibrate(bench: Bench, frames: int, result: ShwfsResult) -> Procedure[None
 
 
 def _close_loops(bench: Bench, loop_frames: int, result: ShwfsResult) -> Procedure[None]:
-    from escape_hw.calibration.closed_loop import best_gain, closed_loop
+    from escape_hw.calibration.closed_loop import closed_loop
+    from escape_hw.calibration.gain_search import best_gain
 
     model = yield from model_psf(bench)
     for label, calibration in result.calibrations.items():

@@ -290,7 +290,7 @@ class System(Bench):
         Aborted
             Stopped by Ctrl-C.
         """
-        from escape_hw.calibration.closed_loop import best_gain
+        from escape_hw.calibration.gain_search import best_gain
 
         procedure = best_gain(self, matrix, grid, gains=gains, frames=frames, model_psf=model_psf)
         return self.run(procedure, progress=progress)

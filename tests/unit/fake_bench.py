@@ -115,7 +115,9 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         "docrime": ("docrime",),
         "escape": ("escape",),
         "sprint": ("sprint",),
-        "closed_loop": ("closed_loop", "best_gain", "measure_model_psf"),
+        "closed_loop": ("closed_loop",),
+        "gain_search": ("best_gain",),
+        "model_psf": ("measure_model_psf",),
     }
     for module, names in homes.items():
         stand_in = types.ModuleType(f"escape_hw.calibration.{module}")
