@@ -29,6 +29,8 @@ class Priors:
         x slopes of a column and to the y slopes of a row, which fall on the pixels alike.
     width, shape
         Common width of the influence functions, and the share of a broad pedestal in them.
+    mean_width
+        Width to expect beyond nominal: zero, unless an earlier fit has told it.
     """
 
     actuator_gain: float = 0.1
@@ -37,6 +39,7 @@ class Priors:
     width: float = 0.2
     shape: float = 0.2
     sampling: float = 0.5
+    mean_width: float = 0.0
 
 
 @dataclass(slots=True, eq=False)

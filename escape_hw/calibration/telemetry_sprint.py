@@ -187,7 +187,7 @@ def telemetry_sprint(
         unit = modal_matrix(model, start, frame.m2c, estimate.width.value)
         matrix = estimate.gain.value * unit
         if order:
-            whitener = _whitener(data, matrix, response, order, lags)
+            whitener = fitted_whitener(data, matrix, response, order, lags)
     return TelemetryFit(estimate, response, whitener, covariance, len(block.now))
 
 
@@ -226,10 +226,22 @@ def _shrunk(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(share * covariance + (1 - share) * np.diag(np.diag(covariance)))
 
 
-def _whitener(
+def fitted_whitener(
     data: Telemetry, matrix: NDArray[np.float64], response: TemporalResponse, order: int, lags: int
 ) -> NDArray[np.float64]:
-    """Prediction-error filter of what the pokes do not explain."""
+    """Prediction-error filter of what the pokes do not explain.
+
+    Parameters
+    ----------
+    data
+        Slopes and pokes (or, in closed loop, total commands).
+    matrix
+        ``(n_slopes, n_modes)``.
+    response
+        Temporal response.
+    order, lags
+        Past frames that the filter uses, and frames of the response.
+    """
     at = np.arange(lags - 1, data.present.size)
     explained = apply_filter(data.rows, response.weights, at, data.n_slopes) @ matrix.T.astype(np.float32)
     return prediction_error_filter(data.slopes[at] - explained, data.present[at], order)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,7 +49,7 @@ class Flexure:
         """The registration at a time of the twin's clock, in seconds."""
         moved = self._rate * time_s + self._swing * math.sin(self._turn * time_s)
         there = self._start.to_array() + moved
-        return Registration(*(float(v) for v in there), self._start.anamorphosis_angle)
+        return replace(Registration.from_array(there), anamorphosis_angle=self._start.anamorphosis_angle)
 
 
 class FlexingSurface:

@@ -1,0 +1,294 @@
+"""The tracker: closed loop for hours while the registration, the seeing and the optical gains change.
+
+Small pokes run beside the integrator all the time. Once a second the frames of that second go to a
+thread of their own, which makes the live registration (:mod:`~.live_registration`) and holds the
+pseudo-synthetic matrix that follows from it against the one in use; the loop takes the answer up a
+second later and never waits open. An exchange keeps the integrator's state, so the mirror does not jump.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.procedure import Procedure, Progress, Reporter
+from escape_hw.api.results import RegistrationEstimate, TemporalResponse
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquire import next_frame
+from escape_hw.calibration.closed_loop import integrator_for
+from escape_hw.calibration.gain_curve import SCATTER
+from escape_hw.calibration.live_registration import LiveEstimate, LiveRegistration
+from escape_hw.calibration.loop_run import RunningLoop
+from escape_hw.calibration.loop_tape import LoopTape
+from escape_hw.calibration.pseudo_synthetic import synthesise
+from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepare_sensor
+from escape_hw.calibration.sprint import sprint
+from escape_hw.calibration.telemetry import Telemetry
+from escape_hw.calibration.track_proposal import InUse, Proposal, inverted, propose, taken
+from escape_hw.calibration.track_record import Alarm, TrackResult
+from escape_hw.calibration.track_watch import TrackWatch
+from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
+from escape_hw.pipeline.frame_stack import FrameStack
+from escape_hw.pipeline.standard_error import LEAST
+from escape_hw.pipeline.strehl import strehl
+
+#: Seconds between two looks at the registration.
+STEP_S = 1.0
+#: Seconds of closed loop before the pokes begin.
+_CLOSING_S = 0.3
+#: Updates before the first exchange: the memory must hold something first.
+_FIRST_EXCHANGE = 3
+#: Updates over which a Strehl ratio is taken.
+_STREHL_EVERY = 5
+
+#: When the frames ended, what they say, and the matrix that follows; ``None``: too few of them.
+_Answer = tuple[float, LiveEstimate, Proposal] | None
+
+
+def track(
+    bench: Bench,
+    matrix: InteractionMatrix,
+    grid: SensorGeometry,
+    *,
+    seconds: float = 60.0,
+    registration: RegistrationEstimate | None = None,
+    response: TemporalResponse | None = None,
+    poke: float | None = None,
+    memory_s: float | None = None,
+    exchange: bool = True,
+    gain: float | None = None,
+    model_psf: NDArray[np.float32] | None = None,
+) -> Procedure[TrackResult]:
+    """Run the loop and follow what drifts.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    matrix, grid
+        The matrix to begin with, and its grid.
+    seconds
+        How long.
+    registration
+        The registration behind the matrix; found from the matrix itself by default.
+    response
+        Temporal response, where it is known.
+    poke
+        Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke; as configured.
+    memory_s
+        Time in which old frames fade; as configured by default.
+    exchange
+        Whether a new matrix may be taken into use without asking, within the configured limits; false:
+        new matrices are only proposed.
+    gain
+        Gain of the integrator; as configured by default.
+    model_psf
+        PSF without turbulence; with it the Strehl ratio is followed, too.
+
+    Returns
+    -------
+    TrackResult
+        ``partial`` when stopped early; ``stable`` false when the loop was lost.
+
+    Raises
+    ------
+    ConfigError
+        A time, poke or memory that means nothing; nothing moved.
+    IncompatibleProduct, CalibrationError
+        The matrix does not fit, cannot be inverted, or shows no registration; nothing moved.
+    """
+    t = bench.config.tracking
+    poke = t.poke if poke is None else poke
+    memory = t.memory_s if memory_s is None else memory_s
+    if not (STEP_S <= seconds < math.inf and 0 < poke < math.inf and 0 < memory < math.inf):
+        raise ConfigError(
+            f"seconds is {seconds}, poke {poke} and memory_s {memory}; the first must be at least "
+            f"{STEP_S:g}, the others positive"
+        )
+    tracker = _Tracker(bench, matrix, grid, registration, response, poke, memory, exchange, gain, model_psf)
+    return (yield from tracker.run(seconds))
+
+
+class _Tracker:
+    """State of a run."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        matrix: InteractionMatrix,
+        grid: SensorGeometry,
+        registration: RegistrationEstimate | None,
+        response: TemporalResponse | None,
+        poke: float,
+        memory_s: float,
+        exchange: bool,
+        gain: float | None,
+        model_psf: NDArray[np.float32] | None,
+    ) -> None:
+        c, t = bench.config.calibration, bench.config.tracking
+        self.bench, self.grid, self.exchange, self.psf = bench, grid, exchange, model_psf
+        self.control = integrator_for(bench, matrix, grid, gain=gain)
+        model = bench.model(grid)
+        start = registration or sprint(matrix, model, learning_rate=c.learning_rate)
+        if not start.converged:
+            raise CalibrationError(f"no registration to begin with: {'; '.join(start.warnings)}")
+        self.amplitude = poke_amplitudes(bench, matrix.m2c, poke)
+        self.live = LiveRegistration(
+            matrix, model, start, order=c.whiten_order, lags=c.lags,
+            memory=memory_s / STEP_S, step_s=STEP_S, response=response,
+            curved=len(SCATTER) if bench.config.sensor.kind == "pyramid" else 0,
+        )  # fmt: skip
+        self.begun = np.full(matrix.n_modes, start.gain.value)
+        self.dropped = bench.config.loop.dropped_modes
+        self.used = InUse(matrix, inverted(matrix, self.dropped), start, start.gain.value)
+        self.watch = TrackWatch(start.registration, t.largest_shift)
+        self.result = TrackResult(poke=poke)
+        self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
+        self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, self.live.memory_rows)
+        self.updates, self.strehl_frames, self.residual_at = 0, FrameStack(), 0
+
+    def run(self, seconds: float) -> Procedure[TrackResult]:
+        """Close the loop, track, open the loop."""
+        bench, result = self.bench, self.result
+        prepare_sensor(bench)
+        bench.dm.flatten()
+        next_frame(bench)
+        lost, began = bench.wfs.status().lost, bench.wfs.now_ns()
+        science = bench.science if self.psf is not None else None
+        if science is not None:
+            science.stop()
+        slopes_of = extractor(bench, self.grid)
+        loop = RunningLoop(bench, self.used.matrix.m2c, slopes_of, self.control, science=science is not None)
+        report = Reporter("tracking", math.ceil(seconds / STEP_S), "s")
+        with ThreadPoolExecutor(1, thread_name_prefix="live registration") as pool:
+            try:
+                yield from self._track(loop, report, pool)
+            except Aborted:
+                result.partial = True
+            except CalibrationError as error:
+                result.alarms.append(Alarm(self._now(loop), "dark", str(error)))
+                result.stable = False
+            finally:
+                bench.dm.flatten()
+                if science is not None:
+                    science.stop()
+        result.frames, result.lost_frames = loop.record.frames, bench.wfs.status().lost - lost
+        result.rate_hz = loop.record.frames / max((bench.wfs.now_ns() - began) * 1e-9, 1e-9)
+        return result
+
+    def _track(self, loop: RunningLoop, report: Reporter, pool: ThreadPoolExecutor) -> Procedure[None]:
+        """Second after second; the answer of each is taken up at the end of the next."""
+        closing = max(1, round(_CLOSING_S * self.bench.wfs.settings.frame_rate_hz))
+        yield from _passed(loop.run(closing), report, 0)
+        pending: Future[_Answer] | None = None
+        try:
+            for second in range(report.total):
+                steps = loop.run(self.frames, inject=self._poke, observe=[self.tape])
+                yield from _passed(steps, report, second)
+                if loop.record.diverged:
+                    self._lose(loop)
+                    return
+                if pending is not None and (pending.done() or self.bench.simulated):
+                    self._take_up(pending.result(), loop)
+                    pending = None
+                if pending is None:
+                    pending = pool.submit(self._look, *self.tape.handover(), self._now(loop))
+        finally:
+            if pending is not None:
+                self._take_up(pending.result(), loop)
+
+    def _poke(self) -> NDArray[np.float64]:
+        return self.amplitude * self.bench.rng.uniform(-1.0, 1.0, self.amplitude.size)
+
+    def _now(self, loop: RunningLoop) -> float:
+        """Seconds of closed loop."""
+        return loop.record.frames / self.bench.wfs.settings.frame_rate_hz
+
+    def _look(self, data: Telemetry, start: int, seconds: float) -> _Answer:
+        """What a block of frames says; in the thread."""
+        try:
+            live = self.live.update(data, start)
+        except TooFewFrames:
+            return None
+        made = synthesise(self.bench, self.grid, live.registration, self.used.matrix.m2c)
+        worth = self.bench.config.tracking.worth
+        return seconds, live, propose(made.matrix, live, self.used, self.dropped, seconds, worth)
+
+    def _take_up(self, answer: _Answer, loop: RunningLoop) -> None:
+        """Book an answer, raise alarms, exchange the matrix."""
+        if answer is None:
+            return
+        seconds, live, proposal = answer
+        self.updates += 1
+        alarms = self.watch.look(live, seconds)
+        self.result.alarms += alarms
+        exchanged = proposal.worthwhile and self.watch.calm and self.updates >= _FIRST_EXCHANGE
+        if exchanged:
+            self._exchange(proposal)
+        self._book(seconds, live, proposal, loop, exchanged and self.exchange)
+        if any(alarm.kind == "jump" for alarm in alarms):
+            self.live.restart()
+
+    def _exchange(self, proposal: Proposal) -> None:
+        """Take a matrix into use, or only propose it."""
+        limit = self.bench.config.tracking.limit
+        within = self.exchange and proposal.evidence.mismatch <= limit
+        self.result.exchanges.append(taken(proposal) if within else proposal.evidence)
+        if within:
+            self.control.set_reconstructor(proposal.to_use.reconstructor)
+            self.used = proposal.to_use
+
+    def _book(
+        self, seconds: float, live: LiveEstimate, proposal: Proposal, loop: RunningLoop, exchanged: bool
+    ) -> None:
+        result, found = self.result, live.registration.measured()
+        relative, relative_sigma = live.gains / self.begun, live.gains_sigma / self.begun
+        result.optical_gain, result.optical_gain_sigma = relative, relative_sigma
+        result.latest = synthesise(self.bench, self.grid, live.registration, self.used.matrix.m2c)
+        result.latest = replace(result.latest, matrix=proposal.to_use.matrix, response=live.response)
+        residual = np.asarray(loop.record.residual[self.residual_at :])
+        self.residual_at = len(loop.record.residual)
+        ratio = self._strehl(loop)
+        result.add(
+            seconds=seconds,
+            **{name: one.value for name, one in found.items()},
+            **{f"{name}_sigma": one.sigma for name, one in found.items()},
+            optical_gain=float(relative.mean()), optical_gain_sigma=float(relative_sigma.mean()),
+            misfit=live.misfit, surprise=live.surprise, noise=live.noise,
+            mismatch=proposal.evidence.mismatch,
+            residual_nm=float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
+            strehl=ratio[0], strehl_sigma=ratio[1], exchanged=float(exchanged),
+        )  # fmt: skip
+
+    def _strehl(self, loop: RunningLoop) -> tuple[float, float]:
+        """Strehl ratio of the science frames since the last one, every few updates."""
+        if self.psf is None or self.updates % _STREHL_EVERY or loop.record.science.count < LEAST:
+            return math.nan, math.nan
+        images = loop.record.science.images()
+        loop.record.science = FrameStack()
+        try:
+            peak = strehl(images, self.psf).peak
+        except CalibrationError:
+            # The image has left the middle of the camera: there is no ratio to book.
+            return math.nan, math.nan
+        return peak.value, peak.sigma
+
+    def _lose(self, loop: RunningLoop) -> None:
+        """The loop diverged."""
+        self.result.stable = False
+        self.result.alarms.append(
+            Alarm(self._now(loop), "diverged", "the loop diverged and was opened; calibrate anew")
+        )
+
+
+def _passed(steps: Procedure[object], report: Reporter, done: int) -> Iterator[Progress]:
+    """Progress of the whole in place of a stretch's own."""
+    for step in steps:
+        yield report(done, **step.metrics)
