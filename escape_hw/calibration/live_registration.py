@@ -52,8 +52,10 @@ class LiveEstimate:
     ----------
     registration
         Registration and gain, freed of the memory's lag, with errors.
+    change
+        Covariance of the registration ``(5, 5)`` without what errs alike at all times: that of a change.
     gains, gains_sigma
-        Gain of every mode relative to the synthetic model ``(n_modes,)``.
+        Gain of every mode relative to the synthetic model, and its error as a change ``(n_modes,)``.
     rate
         Drift per second ``(6,)``: gain, then the registration.
     surprise
@@ -72,6 +74,7 @@ class LiveEstimate:
     """
 
     registration: RegistrationEstimate
+    change: NDArray[np.float64]
     gains: NDArray[np.float64]
     gains_sigma: NDArray[np.float64]
     rate: NDArray[np.float64]
@@ -129,7 +132,8 @@ class LiveRegistration:
         self._keep = float(np.exp(-1 / memory))
         fastest = np.concatenate([_FASTEST, np.full(curved, _FASTEST_BEND)])
         self._line = StraightLine(self._keep if self._keep < 1 else 1 - 1e-9, step_s, fastest)
-        self._matrix = frame.data.astype(np.float64)
+        # At the mean age of the sums, and now.
+        self._matrix = self._now = frame.data.astype(np.float64)
         self.restart()
 
     def restart(self) -> None:
@@ -171,12 +175,11 @@ class LiveRegistration:
             self._whiten(data, start)
         block = self._filtered(data, start)
         n_modes = self._frame.n_modes
-        self._weights.add(block, self._matrix, n_modes)
+        self._weights.add(block, self._now, n_modes)
         response = self._weights.response(self._response)
         seen = block.pokes_through(response.weights)
         own = InstrumentSums.zeros(*self._frame.data.shape)
-        thin = self._matrix.astype(np.float32)
-        own.add(block.slopes, seen[:, :n_modes], seen[:, n_modes:], thin)
+        own.add(block.slopes, seen[:, :n_modes], seen[:, n_modes:], self._now.astype(np.float32))
         self._sums.forget(self._keep)
         self._sums.merge(own)
         problem, system, state = self._step()
@@ -191,12 +194,12 @@ class LiveRegistration:
         n_modes = self._frame.n_modes
         if first and self._response is None:
             sums = ResponseSums(self._lags)
-            sums.add(self._filtered(data, start), self._matrix, n_modes)
+            sums.add(self._filtered(data, start), self._now, n_modes)
             self._response = sums.response(None)
         if self._order:
             response = self._weights.response(self._response)
             commands = Telemetry(data.rows[:, :-n_modes], data.present, data.n_slopes)
-            self._whitener = fitted_whitener(commands, self._matrix, response, self._order, self._lags)
+            self._whitener = fitted_whitener(commands, self._now, response, self._order, self._lags)
 
     def _filtered(self, data: Telemetry, start: int) -> Filtered:
         if self._whitener is None:
@@ -234,14 +237,18 @@ class LiveRegistration:
         own: InstrumentSums,
         response: TemporalResponse,
     ) -> LiveEstimate:
-        weighted = problem.weighted
-        present = self._present(weighted, system, state, len(problem.variants))
+        variants = len(problem.variants)
+        present = self._present(problem, system, state)
+        value = present.value
+        here = np.concatenate([state.variant[:variants], value[6:]])
+        there = replace(state, gain=float(value[GAIN]), alpha=value[1:6], variant=here)
+        self._now = problem.matrix(there, self._frame.m2c)
         columns = turned(self._frame, own.cross, own.mixed, own.gram, self._sums.variance)
-        left = columns.data - self._matrix @ np.linalg.lstsq(self._frame.m2c, columns.m2c)[0]
+        left = columns.data - self._now @ np.linalg.lstsq(self._frame.m2c, columns.m2c)[0]
         left /= columns.sigma
-        gain, gain_sigma = present.value[GAIN], float(np.sqrt(present.covariance[GAIN, GAIN]))
-        gain_sigma = float(np.hypot(gain_sigma, gain * self._weights.gain_sigma(response)))
-        gains, gains_sigma = self._curve(present, gain_sigma)
+        gain, timing = present.value[GAIN], value[GAIN] * self._weights.gain_sigma(response)
+        gain_sigma = float(np.hypot(np.sqrt(present.covariance[GAIN, GAIN]), timing))
+        gains, gains_sigma = self._curve(present, timing)
         width_sigma = float(np.sqrt(np.linalg.inv(system.information())[WIDTH, WIDTH]))
         estimate = RegistrationEstimate(
             Registration.from_array(present.value[1:6]),
@@ -253,34 +260,33 @@ class LiveRegistration:
             float(np.mean(np.square(system.residual))),
         )
         return LiveEstimate(
-            estimate, gains, gains_sigma, present.rate[:6], float(np.abs(present.surprise).max()),
+            estimate, present.moving[1:6, 1:6], gains, gains_sigma, present.rate[:6],
+            float(np.abs(present.surprise).max()),
             float(np.mean(np.square(left))), float(np.sqrt(own.variance.mean())),
-            state.actuator_gain.copy(), self._matrix, response,
+            state.actuator_gain.copy(), self._now, response,
         )  # fmt: skip
 
-    def _present(
-        self, weighted: WeightedMatrix, system: NormalEquations, state: State, n_variants: int
-    ) -> Present:
+    def _present(self, problem: Problem, system: NormalEquations, state: State) -> Present:
         """Gain, registration and curve now, without the memory's lag."""
+        n_variants = len(problem.variants)
         after = WIDTH + 2 + n_variants
         picked = np.r_[0:6, after : after + len(self._bends)]
-        whole = sandwich(weighted, system, self._sums.covariance)[np.ix_(picked, picked)]
-        noise = np.linalg.inv(system.information())[np.ix_(picked, picked)]
+        whole = sandwich(problem.weighted, system, self._sums.covariance)[np.ix_(picked, picked)]
+        noise = system.noise(problem.precision)[np.ix_(picked, picked)]
         if isinstance(self._model, DoubtfulModel):
             whole[np.arange(1, 6), np.arange(1, 6)] += np.square(self._model.registration_doubt)
         shares, directions = np.linalg.eigh(whole - noise)
         static = (directions * np.maximum(shares, 0.0)) @ directions.T
         values = np.concatenate([[state.gain], state.alpha, state.variant[n_variants:]])
-        # The gain's drift is relative, so it is followed in units of where it was first found.
         return self._line.update(values, noise, static)
 
-    def _curve(self, present: Present, gain_sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _curve(self, present: Present, timing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Gain of every mode and its error."""
         gain = present.value[GAIN]
         relative = 1 + present.value[6:] @ self._basis
         jacobian = np.concatenate([relative[None], np.zeros((5, relative.size)), gain * self._basis])
-        covariance = present.covariance.copy()
-        covariance[GAIN, GAIN] = gain_sigma**2
+        covariance = present.moving.copy()
+        covariance[GAIN, GAIN] += timing**2
         variance = np.einsum("pm,pq,qm->m", jacobian, covariance, jacobian)
         return gain * relative, np.sqrt(np.maximum(variance, 0.0))
 

@@ -102,6 +102,23 @@ class NormalEquations:
         k, whole = self.n_common, self.whole
         return np.asarray(whole[:k, :k] - whole[:k, k:] @ np.linalg.solve(whole[k:, k:], whole[k:, :k]))
 
+    def noise(self, precision: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Covariance that the data's noise alone gives the common parameters ``(n_common, n_common)``.
+
+        The inverse of :meth:`information` holds besides what the priors leave open, which is the same
+        in every repetition.
+
+        Parameters
+        ----------
+        precision
+            Prior precision of every unknown, as handed to :func:`normal_equations`.
+        """
+        k, n = self.n_common, len(self.inner)
+        answers = np.linalg.inv(self.whole)[:, :k]
+        by_slope = self.across @ answers / self.diagonal[:, None]
+        believed = answers.T @ (precision[:n, None] * answers) + by_slope.T @ (precision[n:, None] * by_slope)
+        return np.asarray(answers[:k] - believed)
+
     def efficient(self) -> NDArray[np.float64]:
         """Derivatives by the common parameters, less what the random effects can imitate.
 

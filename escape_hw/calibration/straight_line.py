@@ -25,8 +25,8 @@ class Present:
     ----------
     value, rate
         Level ``(n,)`` and change per second ``(n,)``.
-    covariance
-        Of the level ``(n, n)``.
+    covariance, moving
+        Of the level ``(n, n)``: the whole, and the part of it that differs from update to update.
     surprise
         By how many standard errors the last update's own data missed what was expected ``(n,)``.
     """
@@ -34,6 +34,7 @@ class Present:
     value: NDArray[np.float64]
     rate: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    moving: NDArray[np.float64]
     surprise: NDArray[np.float64]
 
 
@@ -99,7 +100,7 @@ class StraightLine:
             shares = first + (believed * here / (older - here))[:, None] * (first - second)
             variance = np.square(here * self._fastest * (1 - believed))
         moving = one * (shares @ shares.T) + np.diag(variance)
-        present = Present(value, rate, static + moving, self._surprise(own, one))
+        present = Present(value, rate, static + moving, moving, self._surprise(own, one))
         self._expected = value + self._step * rate, np.diag(moving)
         self._trim()
         return present

@@ -135,13 +135,13 @@ class _Tracker:
         c, t = bench.config.calibration, bench.config.tracking
         self.bench, self.grid, self.exchange, self.psf = bench, grid, exchange, model_psf
         self.control = integrator_for(bench, matrix, grid, gain=gain)
-        model = bench.model(grid)
-        start = registration or sprint(matrix, model, learning_rate=c.learning_rate)
+        self.model = bench.model(grid)
+        start = registration or sprint(matrix, self.model, learning_rate=c.learning_rate)
         if not start.converged:
             raise CalibrationError(f"no registration to begin with: {'; '.join(start.warnings)}")
         self.amplitude = poke_amplitudes(bench, matrix.m2c, poke)
         self.live = LiveRegistration(
-            matrix, model, start, order=c.whiten_order, lags=c.lags,
+            matrix, self.model, start, order=c.whiten_order, lags=c.lags,
             memory=memory_s / STEP_S, step_s=STEP_S, response=response,
             curved=len(SCATTER) if bench.config.sensor.kind == "pyramid" else 0,
         )  # fmt: skip
@@ -219,7 +219,8 @@ class _Tracker:
             return None
         made = synthesise(self.bench, self.grid, live.registration, self.used.matrix.m2c)
         worth = self.bench.config.tracking.worth
-        return seconds, live, propose(made.matrix, live, self.used, self.dropped, seconds, worth)
+        found = propose(made.matrix, self.model, live, self.used, self.dropped, seconds, worth)
+        return seconds, live, found
 
     def _take_up(self, answer: _Answer, loop: RunningLoop) -> None:
         """Book an answer, raise alarms, exchange the matrix."""

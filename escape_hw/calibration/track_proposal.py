@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import PARAMETERS
-from escape_hw.api.results import RegistrationEstimate
+from escape_hw.api.results import Measured, RegistrationEstimate
 from escape_hw.calibration.live_registration import LiveEstimate, scaled_by_curve
+from escape_hw.calibration.pseudo_synthetic import pseudo_synthetic
 from escape_hw.calibration.track_record import Exchange
 from escape_hw.pipeline.reconstructor import reconstructor
 
@@ -54,7 +56,13 @@ def inverted(matrix: InteractionMatrix, dropped: int) -> NDArray[np.float32]:
 
 
 def propose(
-    made: InteractionMatrix, live: LiveEstimate, used: InUse, dropped: int, seconds: float, worth: float
+    made: InteractionMatrix,
+    model: SyntheticModel,
+    live: LiveEstimate,
+    used: InUse,
+    dropped: int,
+    seconds: float,
+    worth: float,
 ) -> Proposal:
     """Hold a matrix of the live registration against the one in use.
 
@@ -62,6 +70,8 @@ def propose(
     ----------
     made
         Pseudo-synthetic, at the live registration and the live common gain.
+    model
+        The model that it comes from.
     live
         The live registration.
     used
@@ -76,13 +86,15 @@ def propose(
     new = scaled_by_curve(made, live)
     scale = float(np.linalg.norm(new.data))
     mismatch = float(np.linalg.norm(new.data - used.matrix.data)) / scale
-    sigma = float(np.linalg.norm(new.sigma)) / scale
+    change = Measured(live.registration.gain.value, float(live.gains_sigma.mean()))
+    only = replace(live.registration, covariance=live.change, gain=change)
+    sigma = float(np.linalg.norm(pseudo_synthetic(model, only, made.m2c)[1])) / scale
     loop = np.linalg.eigvals(used.reconstructor.astype(float) @ new.data.astype(float))
     # Dropped eigenmodes are left alone by every matrix.
     kept = np.sort(np.abs(loop))[dropped:]
     now, then = live.registration, used.registration
     moved = now.registration.to_array() - then.registration.to_array()
-    errors = np.hypot(now.sigma, then.sigma)
+    errors = np.sqrt(np.diag(live.change))
     gain = float(live.gains.mean())
     evidence = Exchange(
         seconds, False,
