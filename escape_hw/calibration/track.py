@@ -21,8 +21,9 @@ from escape_hw.api.procedure import Procedure, Progress, Reporter
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import next_frame
+from escape_hw.calibration.acquire import Motion, next_frame
 from escape_hw.calibration.closed_loop import integrator_for
+from escape_hw.calibration.derivatives import modal_matrix
 from escape_hw.calibration.gain_curve import SCATTER
 from escape_hw.calibration.live_registration import LiveEstimate, LiveRegistration
 from escape_hw.calibration.loop_run import RunningLoop
@@ -41,8 +42,8 @@ from escape_hw.pipeline.strehl import strehl
 
 #: Seconds between two looks at the registration.
 STEP_S = 1.0
-#: Seconds of closed loop before the pokes begin.
-_CLOSING_S = 0.3
+#: Seconds in which the loop closes, and then those in which the slopes' motion is measured.
+_CLOSING_S, _MOTION_S = 0.3, 1.0
 #: Updates before the first exchange: the memory must hold something first.
 _FIRST_EXCHANGE = 3
 #: Updates over which a Strehl ratio is taken.
@@ -135,24 +136,41 @@ class _Tracker:
         c, t = bench.config.calibration, bench.config.tracking
         self.bench, self.grid, self.exchange, self.psf = bench, grid, exchange, model_psf
         self.control = integrator_for(bench, matrix, grid, gain=gain)
-        self.model = bench.model(grid)
-        start = registration or sprint(matrix, self.model, learning_rate=c.learning_rate)
+        start = registration or sprint(matrix, bench.model(grid), learning_rate=c.learning_rate)
         if not start.converged:
             raise CalibrationError(f"no registration to begin with: {'; '.join(start.warnings)}")
         self.amplitude = poke_amplitudes(bench, matrix.m2c, poke)
-        self.live = LiveRegistration(
-            matrix, self.model, start, order=c.whiten_order, lags=c.lags,
-            memory=memory_s / STEP_S, step_s=STEP_S, response=response,
-            curved=len(SCATTER) if bench.config.sensor.kind == "pyramid" else 0,
-        )  # fmt: skip
-        self.begun = np.full(matrix.n_modes, start.gain.value)
+        self.response, self.memory = response, memory_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
-        self.used = InUse(matrix, inverted(matrix, self.dropped), start, start.gain.value)
+        self.used = InUse(matrix, inverted(matrix, self.dropped), start, 1.0)
         self.watch = TrackWatch(start.registration, t.largest_shift)
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
-        self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, self.live.memory_rows)
-        self.updates, self.strehl_frames, self.residual_at = 0, FrameStack(), 0
+        self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
+        self.updates, self.residual_at = 0, 0
+
+    def prepare(self, motion: Motion) -> None:
+        """Build the model for the light that the closed loop leaves, and start on it; in the thread.
+
+        How a sensor answers depends on how much its light moves, and in closed loop that is less than
+        while the matrix was measured.
+        """
+        bench, c, matrix, start = (
+            self.bench,
+            self.bench.config.calibration,
+            self.used.matrix,
+            self.used.registration,
+        )
+        self.grid = motion.of(self.grid)
+        self.model = bench.model(self.grid)
+        self.live = LiveRegistration(
+            matrix, self.model, start, order=c.whiten_order, lags=c.lags,
+            memory=self.memory, step_s=STEP_S, response=self.response,
+            curved=len(SCATTER) if bench.config.sensor.kind == "pyramid" else 0,
+        )  # fmt: skip
+        unit = modal_matrix(self.model, start.registration, matrix.m2c, start.width.value)
+        self.begun = np.square(matrix.data).sum(axis=0) / (unit * matrix.data).sum(axis=0)
+        self.used = replace(self.used, gain=float(self.begun.mean()))
 
     def run(self, seconds: float) -> Procedure[TrackResult]:
         """Close the loop, track, open the loop."""
@@ -185,8 +203,18 @@ class _Tracker:
 
     def _track(self, loop: RunningLoop, report: Reporter, pool: ThreadPoolExecutor) -> Procedure[None]:
         """Second after second; the answer of each is taken up at the end of the next."""
-        closing = max(1, round(_CLOSING_S * self.bench.wfs.settings.frame_rate_hz))
-        yield from _passed(loop.run(closing), report, 0)
+        motion = Motion(self.grid.n_slopes)
+        rate = self.bench.wfs.settings.frame_rate_hz
+        yield from _passed(loop.run(max(1, round(_CLOSING_S * rate))), report, 0)
+        yield from _passed(
+            loop.run(max(2, round(_MOTION_S * rate)), observe=[lambda *frame: motion.add(frame[1])]),
+            report,
+            0,
+        )
+        ready = pool.submit(self.prepare, motion)
+        while not (self.bench.simulated or ready.done()):
+            yield from _passed(loop.run(self.frames), report, 0)
+        ready.result()
         pending: Future[_Answer] | None = None
         try:
             for second in range(report.total):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,8 +13,8 @@ from escape_hw.calibration.track_record import Alarm
 
 #: Standard errors that an update may miss what was expected by.
 JUMP = 6.0
-#: Mean square misfit of an update's own frames, in units of their noise, from which on the model does not
-#: hold; and how loud they may be beside the usual.
+#: Mean square misfit of an update's own frames beside the usual from which on the model does not hold; and
+#: how loud they may be beside the usual.
 MISFIT, LOUD = 1.3, 2.0
 #: An actuator that answers by less or more than this beside the others is not what the model takes it for.
 STRANGE_ACTUATOR = 0.5
@@ -37,6 +38,7 @@ class TrackWatch:
     def __init__(self, start: Registration, largest_shift: float) -> None:
         self._start, self._largest = start.to_array(), largest_shift
         self._noise: deque[float] = deque(maxlen=_USUAL)
+        self._misfit: deque[float] = deque(maxlen=_USUAL)
         self._last: dict[str, int] = {}
         self._updates = 0
 
@@ -55,6 +57,7 @@ class TrackWatch:
             self._last[kind] = self._updates
         if not found:
             self._noise.append(live.noise)
+            self._misfit.append(live.misfit)
         return found
 
     def _findings(self, live: LiveEstimate) -> dict[str, str]:
@@ -64,12 +67,13 @@ class TrackWatch:
                 f"registration or gain jumped by {live.surprise:.1f} standard errors within one update; "
                 "the live registration starts anew"
             )
-        if live.misfit > MISFIT:
+        misfit = _usual(self._misfit)
+        if live.misfit > MISFIT * max(misfit, 1.0):
             found["misfit"] = (
                 f"the slopes do not follow the pokes as any registration would have it (mean square misfit "
-                f"{live.misfit:.2f} of the noise); look for dead actuators, a changed flip, lost light"
+                f"{live.misfit:.2f} of the noise, usually {misfit:.2f}); look for dead actuators, a changed flip, lost light"
             )
-        usual = float(np.median(self._noise)) if len(self._noise) >= QUIET else np.inf
+        usual = _usual(self._noise)
         if live.noise > LOUD * usual:
             found["noise"] = (
                 f"the slopes move {live.noise / usual:.1f} times as much as usual beyond what the mirror "
@@ -88,3 +92,8 @@ class TrackWatch:
                 f"tracking.largest_shift ({self._largest:g}); calibrate anew"
             )
         return found
+
+
+def _usual(values: Sequence[float]) -> float:
+    """Median of what was seen lately; infinite before there is enough of it."""
+    return float(np.median(values)) if len(values) >= QUIET else float(np.inf)
