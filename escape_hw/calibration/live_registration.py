@@ -1,6 +1,6 @@
 """A registration every second, from small pokes in a loop that keeps running.
 
-Sums over the whitened telemetry fade with a memory of some seconds (:mod:`~.instruments`); every update
+Sums over the whitened telemetry fade with a memory of some seconds (:mod:`~.instrument_sums`); every update
 is one Gauss-Newton step of SPRINT on them from the last estimate, with the same unknowns as a full fit:
 gain, registration, what the model does not know, and on a pyramid the optical gains as a smooth curve
 over the modes. A straight line through the estimates (:mod:`~.straight_line`) takes out their lag.
@@ -20,7 +20,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, TemporalResponse
 from escape_hw.calibration.covariance import sandwich
 from escape_hw.calibration.gain_curve import bends_of, curve_basis
-from escape_hw.calibration.instruments import InstrumentSums, turned
+from escape_hw.calibration.instrument_sums import InstrumentSums, turned
 from escape_hw.calibration.linearisation import GAIN, WIDTH, Problem, State
 from escape_hw.calibration.live_response import ResponseSums
 from escape_hw.calibration.misfit import NormalEquations, Priors

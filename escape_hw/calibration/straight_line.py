@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-#: Updates before which nothing is a surprise.
-_SETTLED = 4
+#: Updates before which nothing is a surprise, and what each adds to what is known of surprises.
+_SETTLED, _LEARNING = 4, 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +64,7 @@ class StraightLine:
         # Shares of each update's own noise in both means, the oldest first.
         self._first_shares, self._second_shares = np.zeros(0), np.zeros(0)
         self._expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._strain = np.ones(n)
 
     def update(
         self, mean: NDArray[np.float64], noise: NDArray[np.float64], static: NDArray[np.float64]
@@ -100,7 +101,12 @@ class StraightLine:
             shares = first + (believed * here / (older - here))[:, None] * (first - second)
             variance = np.square(here * self._fastest * (1 - believed))
         moving = one * (shares @ shares.T) + np.diag(variance)
-        present = Present(value, rate, static + moving, moving, self._surprise(own, one))
+        surprise = self._surprise(own, one)
+        # What bends more than a line within the memory misses what was expected, again and again.
+        self._strain += _LEARNING * (np.square(surprise) - self._strain)
+        stretch = np.sqrt(np.maximum(self._strain, 1.0))
+        moving = moving * np.outer(stretch, stretch)
+        present = Present(value, rate, static + moving, moving, surprise)
         self._expected = value + self._step * rate, np.diag(moving)
         self._trim()
         return present

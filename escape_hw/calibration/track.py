@@ -147,7 +147,7 @@ class _Tracker:
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
-        self.updates, self.residual_at = 0, 0
+        self.updates, self.residual_at, self.began_ns = 0, 0, 0
 
     def prepare(self, motion: Motion) -> None:
         """Build the model for the light that the closed loop leaves, and start on it; in the thread.
@@ -155,12 +155,8 @@ class _Tracker:
         How a sensor answers depends on how much its light moves, and in closed loop that is less than
         while the matrix was measured.
         """
-        bench, c, matrix, start = (
-            self.bench,
-            self.bench.config.calibration,
-            self.used.matrix,
-            self.used.registration,
-        )
+        bench, matrix, start = self.bench, self.used.matrix, self.used.registration
+        c = bench.config.calibration
         self.grid = motion.of(self.grid)
         self.model = bench.model(self.grid)
         self.live = LiveRegistration(
@@ -178,7 +174,7 @@ class _Tracker:
         prepare_sensor(bench)
         bench.dm.flatten()
         next_frame(bench)
-        lost, began = bench.wfs.status().lost, bench.wfs.now_ns()
+        lost, self.began_ns = bench.wfs.status().lost, bench.wfs.now_ns()
         science = bench.science if self.psf is not None else None
         if science is not None:
             science.stop()
@@ -191,14 +187,14 @@ class _Tracker:
             except Aborted:
                 result.partial = True
             except CalibrationError as error:
-                result.alarms.append(Alarm(self._now(loop), "dark", str(error)))
+                result.alarms.append(Alarm(self._now(), "dark", str(error)))
                 result.stable = False
             finally:
                 bench.dm.flatten()
                 if science is not None:
                     science.stop()
         result.frames, result.lost_frames = loop.record.frames, bench.wfs.status().lost - lost
-        result.rate_hz = loop.record.frames / max((bench.wfs.now_ns() - began) * 1e-9, 1e-9)
+        result.rate_hz = loop.record.frames / max(self._now(), 1e-9)
         return result
 
     def _track(self, loop: RunningLoop, report: Reporter, pool: ThreadPoolExecutor) -> Procedure[None]:
@@ -206,11 +202,8 @@ class _Tracker:
         motion = Motion(self.grid.n_slopes)
         rate = self.bench.wfs.settings.frame_rate_hz
         yield from _passed(loop.run(max(1, round(_CLOSING_S * rate))), report, 0)
-        yield from _passed(
-            loop.run(max(2, round(_MOTION_S * rate)), observe=[lambda *frame: motion.add(frame[1])]),
-            report,
-            0,
-        )
+        watching = [lambda *frame: motion.add(frame[1])]
+        yield from _passed(loop.run(max(2, round(_MOTION_S * rate)), observe=watching), report, 0)
         ready = pool.submit(self.prepare, motion)
         while not (self.bench.simulated or ready.done()):
             yield from _passed(loop.run(self.frames), report, 0)
@@ -221,13 +214,13 @@ class _Tracker:
                 steps = loop.run(self.frames, inject=self._poke, observe=[self.tape])
                 yield from _passed(steps, report, second)
                 if loop.record.diverged:
-                    self._lose(loop)
+                    self._lose()
                     return
                 if pending is not None and (pending.done() or self.bench.simulated):
                     self._take_up(pending.result(), loop)
                     pending = None
                 if pending is None:
-                    pending = pool.submit(self._look, *self.tape.handover(), self._now(loop))
+                    pending = pool.submit(self._look, *self.tape.handover(), self._now())
         finally:
             if pending is not None:
                 self._take_up(pending.result(), loop)
@@ -235,9 +228,9 @@ class _Tracker:
     def _poke(self) -> NDArray[np.float64]:
         return self.amplitude * self.bench.rng.uniform(-1.0, 1.0, self.amplitude.size)
 
-    def _now(self, loop: RunningLoop) -> float:
-        """Seconds of closed loop."""
-        return loop.record.frames / self.bench.wfs.settings.frame_rate_hz
+    def _now(self) -> float:
+        """Seconds since the loop was closed."""
+        return (self.bench.wfs.now_ns() - self.began_ns) * 1e-9
 
     def _look(self, data: Telemetry, start: int, seconds: float) -> _Answer:
         """What a block of frames says; in the thread."""
@@ -309,11 +302,11 @@ class _Tracker:
             return math.nan, math.nan
         return peak.value, peak.sigma
 
-    def _lose(self, loop: RunningLoop) -> None:
+    def _lose(self) -> None:
         """The loop diverged."""
         self.result.stable = False
         self.result.alarms.append(
-            Alarm(self._now(loop), "diverged", "the loop diverged and was opened; calibrate anew")
+            Alarm(self._now(), "diverged", "the loop diverged and was opened; calibrate anew")
         )
 
 

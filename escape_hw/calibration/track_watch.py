@@ -71,7 +71,8 @@ class TrackWatch:
         if live.misfit > MISFIT * max(misfit, 1.0):
             found["misfit"] = (
                 f"the slopes do not follow the pokes as any registration would have it (mean square misfit "
-                f"{live.misfit:.2f} of the noise, usually {misfit:.2f}); look for dead actuators, a changed flip, lost light"
+                f"{live.misfit:.2f} of the noise, usually {misfit:.2f}); look for dead actuators, a changed "
+                "flip, lost light"
             )
         usual = _usual(self._noise)
         if live.noise > LOUD * usual:
