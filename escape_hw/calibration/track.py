@@ -20,6 +20,7 @@ from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Progress, Reporter
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.api.tracking import Alarm, TrackResult
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import Motion, next_frame
 from escape_hw.calibration.closed_loop import integrator_for
@@ -33,7 +34,6 @@ from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepa
 from escape_hw.calibration.sprint import sprint
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.track_proposal import InUse, Proposal, inverted, propose, taken
-from escape_hw.calibration.track_record import Alarm, TrackResult
 from escape_hw.calibration.track_watch import TrackWatch
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
 from escape_hw.pipeline.frame_stack import FrameStack

@@ -11,9 +11,9 @@ from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Measured, RegistrationEstimate
+from escape_hw.api.tracking import Exchange
 from escape_hw.calibration.live_registration import LiveEstimate, scaled_by_curve
 from escape_hw.calibration.pseudo_synthetic import pseudo_synthetic
-from escape_hw.calibration.track_record import Exchange
 from escape_hw.pipeline.reconstructor import reconstructor
 
 #: A change counts when it is this many times what errors let one expect.

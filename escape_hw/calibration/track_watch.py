@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from escape_hw.api.registration import Registration
+from escape_hw.api.tracking import Alarm
 from escape_hw.calibration.live_registration import LiveEstimate
-from escape_hw.calibration.track_record import Alarm
 
 #: Standard errors that an update may miss what was expected by.
 JUMP = 6.0

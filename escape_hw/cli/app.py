@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli import calibrate, loop, perf, products, reproduce, systems
+from escape_hw.cli import calibrate, loop, perf, products, reproduce, systems, track
 
 app = typer.Typer(
     name="escape",
@@ -25,6 +25,7 @@ app.add_typer(systems.config_app, name="config")
 app.command("calibrate")(calibrate.calibrate)
 app.command("sprint")(calibrate.sprint)
 app.command("loop")(loop.loop)
+app.command("track")(track.track)
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
 app.command("compare")(products.compare)
