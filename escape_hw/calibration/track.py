@@ -148,6 +148,7 @@ class _Tracker:
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
         self.updates, self.residual_at, self.began_ns = 0, 0, 0
+        self.pending: Future[_Answer] | None = None
 
     def prepare(self, motion: Motion) -> None:
         """Build the model for the light that the closed loop leaves, and start on it; in the thread.
@@ -193,6 +194,7 @@ class _Tracker:
                 bench.dm.flatten()
                 if science is not None:
                     science.stop()
+            self._take_up(loop, running=False)
         result.frames, result.lost_frames = loop.record.frames, bench.wfs.status().lost - lost
         result.rate_hz = loop.record.frames / max(self._now(), 1e-9)
         return result
@@ -208,22 +210,17 @@ class _Tracker:
         while not (self.bench.simulated or ready.done()):
             yield from _passed(loop.run(self.frames), report, 0)
         ready.result()
-        pending: Future[_Answer] | None = None
-        try:
-            for second in range(report.total):
-                steps = loop.run(self.frames, inject=self._poke, observe=[self.tape])
-                yield from _passed(steps, report, second)
-                if loop.record.diverged:
-                    self._lose()
-                    return
-                if pending is not None and (pending.done() or self.bench.simulated):
-                    self._take_up(pending.result(), loop)
-                    pending = None
-                if pending is None:
-                    pending = pool.submit(self._look, *self.tape.handover(), self._now())
-        finally:
-            if pending is not None:
-                self._take_up(pending.result(), loop)
+        for second in range(report.total):
+            steps = loop.run(self.frames, inject=self._poke, observe=[self.tape])
+            yield from _passed(steps, report, second)
+            if loop.record.diverged:
+                self._lose()
+                return
+            # A twin's clock stands still meanwhile; at a real bench the loop does not wait.
+            if self.pending is not None and (self.pending.done() or self.bench.simulated):
+                self._take_up(loop)
+            if self.pending is None:
+                self.pending = pool.submit(self._look, *self.tape.handover(), self._now())
 
     def _poke(self) -> NDArray[np.float64]:
         return self.amplitude * self.bench.rng.uniform(-1.0, 1.0, self.amplitude.size)
@@ -243,8 +240,10 @@ class _Tracker:
         found = propose(made.matrix, self.model, live, self.used, self.dropped, seconds, worth)
         return seconds, live, found
 
-    def _take_up(self, answer: _Answer, loop: RunningLoop) -> None:
-        """Book an answer, raise alarms, exchange the matrix."""
+    def _take_up(self, loop: RunningLoop, running: bool = True) -> None:
+        """Book the answer that is waited for, raise alarms, exchange the matrix if the loop still runs."""
+        answer = None if self.pending is None else self.pending.result()
+        self.pending = None
         if answer is None:
             return
         seconds, live, proposal = answer
@@ -252,20 +251,20 @@ class _Tracker:
         alarms = self.watch.look(live, seconds)
         self.result.alarms += alarms
         exchanged = proposal.worthwhile and self.watch.calm and self.updates >= _FIRST_EXCHANGE
-        if exchanged:
-            self._exchange(proposal)
-        self._book(seconds, live, proposal, loop, exchanged and self.exchange)
+        accepted = exchanged and self._exchange(proposal, running)
+        self._book(seconds, live, proposal, loop, accepted)
         if any(alarm.kind == "jump" for alarm in alarms):
             self.live.restart()
 
-    def _exchange(self, proposal: Proposal) -> None:
+    def _exchange(self, proposal: Proposal, running: bool) -> bool:
         """Take a matrix into use, or only propose it."""
         limit = self.bench.config.tracking.limit
-        within = self.exchange and proposal.evidence.mismatch <= limit
+        within = running and self.exchange and proposal.evidence.mismatch <= limit
         self.result.exchanges.append(taken(proposal) if within else proposal.evidence)
         if within:
             self.control.set_reconstructor(proposal.to_use.reconstructor)
             self.used = proposal.to_use
+        return within
 
     def _book(
         self, seconds: float, live: LiveEstimate, proposal: Proposal, loop: RunningLoop, exchanged: bool
