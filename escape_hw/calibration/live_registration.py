@@ -32,7 +32,7 @@ from escape_hw.calibration.weighted import WeightedMatrix
 from escape_hw.errors import TooFewFrames
 
 #: Drift per second that is nothing unusual: relative gain, registration, coefficients of the gains' curve.
-_FASTEST = np.array([0.02, 0.5, 0.5, 0.02, 0.1, 0.1])
+_FASTEST = np.array([0.05, 0.5, 0.5, 0.02, 0.1, 0.1])
 _FASTEST_BEND = 0.1
 #: Gauss-Newton steps of the first update, and largest step in standard deviations of what is usual.
 _FIRST_STEPS, _LARGEST = 5, np.array([60.0, 60.0, 2.0, 4.0, 4.0])

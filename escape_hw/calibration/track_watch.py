@@ -15,7 +15,7 @@ from escape_hw.calibration.live_registration import LiveEstimate
 JUMP = 6.0
 #: Mean square misfit of an update's own frames beside the usual from which on the model does not hold; and
 #: how loud they may be beside the usual.
-MISFIT, LOUD = 1.3, 2.0
+MISFIT, LOUD = 2.5, 2.0
 #: An actuator that answers by less or more than this beside the others is not what the model takes it for.
 STRANGE_ACTUATOR = 0.5
 #: Updates after an alarm in which nothing is exchanged, and which alarms of one kind are one.
