@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeVar
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.procedure import Observer, Procedure
+from escape_hw.api.procedure import Observer, Procedure, Stop
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
@@ -39,7 +38,7 @@ class System(Bench):
         procedure: Procedure[T],
         *,
         observers: tuple[Observer, ...] = (),
-        abort: threading.Event | None = None,
+        abort: Stop | None = None,
         progress: bool = False,
     ) -> T:
         """Drive a procedure to its end and return its result.
