@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import threading
 
 import numpy as np
 import pytest
 from small_bench import assert_flat, small
+from small_system import configuration
 
-from escape_hw.api.registration import Registration
+from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.calibration.track import track
 from escape_hw.calibration.track_proposal import inverted
+from escape_hw.cli import main
 from escape_hw.errors import Aborted, CalibrationError, ConfigError
+from escape_hw.io.fits import load_matrix, save_matrix
+from escape_hw.io.provenance import Provenance
 from escape_hw.pipeline.integrator import LeakyIntegrator
 from escape_sim.flexure import FlexingSurface, Flexure
 
@@ -165,6 +170,29 @@ def test_stopped_it_keeps_what_it_has(start):
     assert len(found.rows["seconds"]) >= 3
     assert found.latest is not None
     assert found.to_csv().count("\n") == len(found.rows["seconds"]) + 1
+
+
+def test_the_command_leaves_table_matrix_and_report(start, tmp_path, capsys):
+    system, im = tmp_path / "small.toml", tmp_path / "im.fits"
+    system.write_text(configuration(QUIET).to_toml())
+    save_matrix(im, start, Provenance(system.read_text(), "kl", 1))
+    with pytest.raises(SystemExit) as ended:
+        main(["track", str(system), "--im", str(im), "--seconds", "3", "--no-strehl", "--json",
+              "--out", str(tmp_path / "run"), "--poke", "0.003"])  # fmt: skip
+    assert not ended.value.code
+    document = json.loads(capsys.readouterr().out)
+    assert document["command"] == "track"
+    assert document["poke"] == 0.003
+    assert document["alarms"] == []
+    assert set(document["registration"]) == set(PARAMETERS)
+    assert len(document["track"]["seconds"]) == 3
+    assert len(document["optical_gain"]) == start.matrix.n_modes
+    lines = (tmp_path / "run" / "track.csv").read_text().splitlines()
+    assert lines[0].split(",")[:2] == ["seconds", "shift_x"]
+    assert len(lines) == 4
+    saved = load_matrix(tmp_path / "run" / "im.fits")
+    assert saved.registration.registration.shift_x == pytest.approx(float(lines[-1].split(",")[1]), abs=1e-3)
+    assert "Tracking" in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_what_it_refuses(start):

@@ -24,7 +24,8 @@ def test_help_is_quick_and_light():
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     for command in (
-        "systems", "config", "calibrate", "sprint", "loop", "reproduce", "show", "compare", "report", "perf",
+        "systems", "config", "calibrate", "sprint", "loop", "track", "reproduce", "show", "compare", "report",
+        "perf",
     ):  # fmt: skip
         assert command in done.stdout
 
