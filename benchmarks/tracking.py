@@ -173,9 +173,9 @@ def compare(options: argparse.Namespace) -> None:
     """
     tracked = json.loads((options.out / "track.json").read_text())
     rows = {name: np.array(tracked["rows"][name], float) for name in ("seconds", "strehl")}
-    # A ratio holds the science frames of the five updates before, and of the second in which it was made.
+    # A ratio holds the science frames of the five updates before.
     ends = rows["seconds"][np.isfinite(rows["strehl"])][1:]
-    ends = ends[:: max(1, round(EVERY_S / LOOK_S * options.seconds / 600))] + 1.0
+    ends = ends[:: max(1, round(EVERY_S / LOOK_S * options.seconds / 600))]
     looks = [[end - LOOK_S] for end in ends]
     for knows in (True, False):
         bench, result, psf, twin = started(options)
@@ -214,7 +214,7 @@ def draw(options: argparse.Namespace) -> None:
     rms = np.sqrt(np.mean(np.square(said - gains[:, 1])))
     print(f"optical gain: rms error {rms:.4f} of {gains[:, 1].mean():.3f}")
     ratio = np.isfinite(rows["strehl"]) & settled
-    here = np.interp(looks[:, 0] + LOOK_S - 1.0, t[ratio], rows["strehl"][ratio])
+    here = np.interp(looks[:, 0] + LOOK_S, t[ratio], rows["strehl"][ratio])
     print(
         f"Strehl: tracked {here.mean():.4f}, truth {looks[:, 1].mean():.4f}, never {looks[:, 3].mean():.4f}"
     )

@@ -8,7 +8,6 @@ over the modes. A straight line through the estimates (:mod:`~.straight_line`) t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -145,11 +144,6 @@ class LiveRegistration:
         self._updates = 0
         self._line.restart()
 
-    def move_to(self, start: Registration) -> None:
-        """Restart elsewhere, as after a jump."""
-        self._start = start
-        self.restart()
-
     @property
     def memory_rows(self) -> int:
         """Rows before a block's first new one that its filtered rows are made of."""
@@ -243,6 +237,7 @@ class LiveRegistration:
         here = np.concatenate([state.variant[:variants], value[6:]])
         there = replace(state, gain=float(value[GAIN]), alpha=value[1:6], variant=here)
         self._now = problem.matrix(there, self._frame.m2c)
+        self._start = Registration.from_array(value[1:6])
         columns = turned(self._frame, own.cross, own.mixed, own.gram, self._sums.variance)
         left = columns.data - self._now @ np.linalg.lstsq(self._frame.m2c, columns.m2c)[0]
         left /= columns.sigma
@@ -289,13 +284,6 @@ class LiveRegistration:
         covariance[GAIN, GAIN] += timing**2
         variance = np.einsum("pm,pq,qm->m", jacobian, covariance, jacobian)
         return gain * relative, np.sqrt(np.maximum(variance, 0.0))
-
-
-def live_data(rows: Sequence[NDArray[np.floating]], present: NDArray[np.bool_]) -> Telemetry:
-    """Slopes ``(n, n_slopes)``, commands and pokes ``(n, n_modes)`` on one time line."""
-    slopes, command, poke = rows
-    joined = np.concatenate([slopes, command, poke], axis=1).astype(np.float32)
-    return Telemetry(joined, present, slopes.shape[1])
 
 
 def scaled_by_curve(matrix: InteractionMatrix, live: LiveEstimate) -> InteractionMatrix:

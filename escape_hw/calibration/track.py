@@ -8,17 +8,18 @@ second later and never waits open. An exchange keeps the integrator's state, so 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Progress, Reporter
-from escape_hw.api.results import RegistrationEstimate, TemporalResponse
+from escape_hw.api.results import CalibrationResult, RegistrationEstimate, TemporalResponse
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.tracking import Alarm, TrackResult
 from escape_hw.bench import Bench
@@ -40,6 +41,8 @@ from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.standard_error import LEAST
 from escape_hw.pipeline.strehl import strehl
 
+log = logging.getLogger(__name__)
+
 #: Seconds between two looks at the registration.
 STEP_S = 1.0
 #: Seconds in which the loop closes, and then those in which the slopes' motion is measured.
@@ -48,9 +51,20 @@ _CLOSING_S, _MOTION_S = 0.3, 1.0
 _FIRST_EXCHANGE = 3
 #: Updates over which a Strehl ratio is taken.
 _STREHL_EVERY = 5
+#: What progress reports tell of the last look.
+_SHOWN = ("shift_x", "shift_x_sigma", "shift_y", "shift_y_sigma", "rotation", "rotation_sigma",
+          "optical_gain", "optical_gain_sigma", "misfit")  # fmt: skip
 
-#: When the frames ended, what they say, and the matrix that follows; ``None``: too few of them.
-_Answer = tuple[float, LiveEstimate, Proposal] | None
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Answer:
+    """What the frames up to a moment say, the matrix that follows, and the latest Strehl ratio."""
+
+    seconds: float
+    live: LiveEstimate
+    made: CalibrationResult
+    proposal: Proposal
+    ratio: tuple[float, float]
 
 
 def track(
@@ -148,7 +162,8 @@ class _Tracker:
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
         self.updates, self.residual_at, self.began_ns = 0, 0, 0
-        self.pending: Future[_Answer] | None = None
+        self.pending: Future[_Answer | None] | None = None
+        self.metrics: dict[str, float] = {}
 
     def prepare(self, motion: Motion) -> None:
         """Build the model for the light that the closed loop leaves, and start on it; in the thread.
@@ -203,16 +218,16 @@ class _Tracker:
         """Second after second; the answer of each is taken up at the end of the next."""
         motion = Motion(self.grid.n_slopes)
         rate = self.bench.wfs.settings.frame_rate_hz
-        yield from _passed(loop.run(max(1, round(_CLOSING_S * rate))), report, 0)
+        yield from self._passed(loop.run(max(1, round(_CLOSING_S * rate))), report, 0)
         watching = [lambda *frame: motion.add(frame[1])]
-        yield from _passed(loop.run(max(2, round(_MOTION_S * rate)), observe=watching), report, 0)
+        yield from self._passed(loop.run(max(2, round(_MOTION_S * rate)), observe=watching), report, 0)
         ready = pool.submit(self.prepare, motion)
         while not (self.bench.simulated or ready.done()):
-            yield from _passed(loop.run(self.frames), report, 0)
+            yield from self._passed(loop.run(self.frames), report, 0)
         ready.result()
         for second in range(report.total):
             steps = loop.run(self.frames, inject=self._poke, observe=[self.tape])
-            yield from _passed(steps, report, second)
+            yield from self._passed(steps, report, second)
             if loop.record.diverged:
                 self._lose()
                 return
@@ -220,7 +235,13 @@ class _Tracker:
             if self.pending is not None and (self.pending.done() or self.bench.simulated):
                 self._take_up(loop)
             if self.pending is None:
-                self.pending = pool.submit(self._look, *self.tape.handover(), self._now())
+                images = self._images(loop)
+                self.pending = pool.submit(self._look, *self.tape.handover(), self._now(), images)
+
+    def _passed(self, steps: Procedure[object], report: Reporter, done: int) -> Iterator[Progress]:
+        """Progress of the whole in place of a stretch's own, with what the last look said."""
+        for step in steps:
+            yield report(done, **step.metrics, **self.metrics)
 
     def _poke(self) -> NDArray[np.float64]:
         return self.amplitude * self.bench.rng.uniform(-1.0, 1.0, self.amplitude.size)
@@ -229,8 +250,15 @@ class _Tracker:
         """Seconds since the loop was closed."""
         return (self.bench.wfs.now_ns() - self.began_ns) * 1e-9
 
-    def _look(self, data: Telemetry, start: int, seconds: float) -> _Answer:
-        """What a block of frames says; in the thread."""
+    def _images(self, loop: RunningLoop) -> FrameStack | None:
+        """The science frames since the last ones, every few updates."""
+        if self.psf is None or self.updates % _STREHL_EVERY or loop.record.science.count < LEAST:
+            return None
+        images, loop.record.science = loop.record.science, FrameStack()
+        return images
+
+    def _look(self, data: Telemetry, start: int, seconds: float, images: FrameStack | None) -> _Answer | None:
+        """What a block of frames says, if there are enough of them; in the thread."""
         try:
             live = self.live.update(data, start)
         except TooFewFrames:
@@ -238,7 +266,18 @@ class _Tracker:
         made = synthesise(self.bench, self.grid, live.registration, self.used.matrix.m2c)
         worth = self.bench.config.tracking.worth
         found = propose(made.matrix, self.model, live, self.used, self.dropped, seconds, worth)
-        return seconds, live, found
+        return _Answer(seconds, live, made, found, self._strehl(images))
+
+    def _strehl(self, images: FrameStack | None) -> tuple[float, float]:
+        """Strehl ratio and its error; NaN without images, or when they are off the middle of the camera."""
+        if images is None or self.psf is None:
+            return math.nan, math.nan
+        try:
+            peak = strehl(images.images(), self.psf).peak
+        except CalibrationError as error:
+            log.warning("no Strehl ratio: %s", error)
+            return math.nan, math.nan
+        return peak.value, peak.sigma
 
     def _take_up(self, loop: RunningLoop, running: bool = True) -> None:
         """Book the answer that is waited for, raise alarms, exchange the matrix if the loop still runs."""
@@ -246,13 +285,11 @@ class _Tracker:
         self.pending = None
         if answer is None:
             return
-        seconds, live, proposal = answer
         self.updates += 1
-        alarms = self.watch.look(live, seconds)
+        alarms = self.watch.look(answer.live, answer.seconds)
         self.result.alarms += alarms
-        exchanged = proposal.worthwhile and self.watch.calm and self.updates >= _FIRST_EXCHANGE
-        accepted = exchanged and self._exchange(proposal, running)
-        self._book(seconds, live, proposal, loop, accepted)
+        wanted = answer.proposal.worthwhile and self.watch.calm and self.updates >= _FIRST_EXCHANGE
+        self._book(answer, loop, wanted and self._exchange(answer.proposal, running))
         if any(alarm.kind == "jump" for alarm in alarms):
             self.live.restart()
 
@@ -266,40 +303,27 @@ class _Tracker:
             self.used = proposal.to_use
         return within
 
-    def _book(
-        self, seconds: float, live: LiveEstimate, proposal: Proposal, loop: RunningLoop, exchanged: bool
-    ) -> None:
-        result, found = self.result, live.registration.measured()
+    def _book(self, answer: _Answer, loop: RunningLoop, exchanged: bool) -> None:
+        """Append a row, and keep the latest matrix."""
+        result, live, proposal = self.result, answer.live, answer.proposal
+        found = live.registration.measured()
         relative, relative_sigma = live.gains / self.begun, live.gains_sigma / self.begun
         result.optical_gain, result.optical_gain_sigma = relative, relative_sigma
-        result.latest = synthesise(self.bench, self.grid, live.registration, self.used.matrix.m2c)
-        result.latest = replace(result.latest, matrix=proposal.to_use.matrix, response=live.response)
+        result.latest = replace(answer.made, matrix=proposal.to_use.matrix, response=live.response)
         residual = np.asarray(loop.record.residual[self.residual_at :])
         self.residual_at = len(loop.record.residual)
-        ratio = self._strehl(loop)
-        result.add(
-            seconds=seconds,
+        row = {
+            "seconds": answer.seconds,
             **{name: one.value for name, one in found.items()},
             **{f"{name}_sigma": one.sigma for name, one in found.items()},
-            optical_gain=float(relative.mean()), optical_gain_sigma=float(relative_sigma.mean()),
-            misfit=live.misfit, surprise=live.surprise, noise=live.noise,
-            mismatch=proposal.evidence.mismatch,
-            residual_nm=float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
-            strehl=ratio[0], strehl_sigma=ratio[1], exchanged=float(exchanged),
-        )  # fmt: skip
-
-    def _strehl(self, loop: RunningLoop) -> tuple[float, float]:
-        """Strehl ratio of the science frames since the last one, every few updates."""
-        if self.psf is None or self.updates % _STREHL_EVERY or loop.record.science.count < LEAST:
-            return math.nan, math.nan
-        images = loop.record.science.images()
-        loop.record.science = FrameStack()
-        try:
-            peak = strehl(images, self.psf).peak
-        except CalibrationError:
-            # The image has left the middle of the camera: there is no ratio to book.
-            return math.nan, math.nan
-        return peak.value, peak.sigma
+            "optical_gain": float(relative.mean()), "optical_gain_sigma": float(relative_sigma.mean()),
+            "misfit": live.misfit, "surprise": live.surprise, "noise": live.noise,
+            "mismatch": proposal.evidence.mismatch,
+            "residual_nm": float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
+            "strehl": answer.ratio[0], "strehl_sigma": answer.ratio[1], "exchanged": float(exchanged),
+        }  # fmt: skip
+        result.add(**row)
+        self.metrics = {name: row[name] for name in _SHOWN}
 
     def _lose(self) -> None:
         """The loop diverged."""
@@ -307,9 +331,3 @@ class _Tracker:
         self.result.alarms.append(
             Alarm(self._now(), "diverged", "the loop diverged and was opened; calibrate anew")
         )
-
-
-def _passed(steps: Procedure[object], report: Reporter, done: int) -> Iterator[Progress]:
-    """Progress of the whole in place of a stretch's own."""
-    for step in steps:
-        yield report(done, **step.metrics)
