@@ -36,8 +36,8 @@ from escape_hw.report import style
 from escape_hw.runtime.system import System, open_system
 from escape_sim.sim_bench import SimBench
 
-#: Seconds between two looks at the other loops, and how long each of them lasts after closing.
-EVERY_S, LOOK_S, CLOSE_S = 50.0, 5.0, 1.0
+#: Seconds of a look at the other loops, and how long they close before.
+LOOK_S, CLOSE_S = 5.0, 1.0
 #: Modes and wavefronts that the true optical gain is found on; size of the poke in strokes.
 GAIN_MODES, WAVEFRONTS, GAIN_POKE = 12, 4, 1e-3
 
@@ -131,7 +131,7 @@ def follow(options: argparse.Namespace) -> None:
         seconds = origin + found.column("seconds")
         truth = np.array([twin.flexure.at(t).to_array() for t in seconds])
         gains = []
-        for start in np.arange(origin + 2, origin + options.seconds, EVERY_S / 2 * options.seconds / 600):
+        for start in np.linspace(origin + 2, origin + options.seconds, 2 * options.looks):
             near = [one for one in frozen.kept if start <= one[0] < start + 4 * 0.4 + 0.2][:WAVEFRONTS]
             if near:
                 gains.append([near[0][0] - origin, true_gain(bench, twin, result, near)])
@@ -175,7 +175,7 @@ def compare(options: argparse.Namespace) -> None:
     rows = {name: np.array(tracked["rows"][name], float) for name in ("seconds", "strehl")}
     # A ratio holds the science frames of the five updates before.
     ends = rows["seconds"][np.isfinite(rows["strehl"])][1:]
-    ends = ends[:: max(1, round(EVERY_S / LOOK_S * options.seconds / 600))]
+    ends = ends[:: max(1, len(ends) // options.looks)]
     looks = [[end - LOOK_S] for end in ends]
     for knows in (True, False):
         bench, result, psf, twin = started(options)
@@ -272,6 +272,7 @@ def main() -> None:
     parser.add_argument("--seeing", type=float, default=0.2, help="swing of r0, fraction")
     parser.add_argument("--memory", type=float, default=10.0)
     parser.add_argument("--frames", type=int, default=2000, help="frames of the calibration before")
+    parser.add_argument("--looks", type=int, default=11, help="how often the other loops are closed")
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", type=Path, default=Path("."))
