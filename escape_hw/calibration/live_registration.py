@@ -165,20 +165,31 @@ class LiveRegistration:
         TooFewFrames
             Hardly a frame whose past is known.
         """
-        if self._whitener is None or self._updates % _WHITEN_EVERY == 0:
+        if self._updates < 2 or self._updates % _WHITEN_EVERY == 0:
             self._whiten(data, start)
         block = self._filtered(data, start)
         n_modes = self._frame.n_modes
         self._weights.add(block, self._now, n_modes)
         response = self._weights.response(self._response)
         seen = block.pokes_through(response.weights)
+        if self._state is None:
+            # The residual by the matrix in use is not the noise yet: fit once for a better one.
+            self._take(block, seen)
+            self._state = self._step()[2]
+            self._now, self._sums = self._matrix, InstrumentSums.zeros(*self._frame.data.shape)
+        own = self._take(block, seen)
+        problem, system, self._state = self._step()
+        self._updates += 1
+        return self._estimate(problem, system, self._state, own, response)
+
+    def _take(self, block: Filtered, seen: NDArray[np.float32]) -> InstrumentSums:
+        """Let the sums fade and add a block; the block's own sums."""
+        n_modes = self._frame.n_modes
         own = InstrumentSums.zeros(*self._frame.data.shape)
         own.add(block.slopes, seen[:, :n_modes], seen[:, n_modes:], self._now.astype(np.float32))
         self._sums.forget(self._keep)
         self._sums.merge(own)
-        problem, system, state = self._step()
-        self._state, self._updates = state, self._updates + 1
-        return self._estimate(problem, system, state, own, response)
+        return own
 
     def _whiten(self, data: Telemetry, start: int) -> None:
         """Find the filter, and the first time the response as well, on a block."""

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 #: Updates before which nothing is a surprise, and what each adds to what is known of surprises.
 _SETTLED, _LEARNING = 4, 0.15
+#: A single surprise, squared, teaches no more than this: a jump is not what is usual.
+_MOST = 36.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +30,8 @@ class Present:
     covariance, moving
         Of the level ``(n, n)``: the whole, and the part of it that differs from update to update.
     surprise
-        By how many standard errors the last update's own data missed what was expected ``(n,)``.
+        By how many standard errors the last update's own data missed what was expected ``(n,)``, as
+        errors have been of late.
     """
 
     value: NDArray[np.float64]
@@ -54,6 +57,8 @@ class StraightLine:
 
     def __init__(self, forgetting: float, step_s: float, fastest: NDArray[np.float64]) -> None:
         self._keep, self._step, self._fastest = forgetting, step_s, np.asarray(fastest, float)
+        # What surprises usually are, squared: known for good, whatever is forgotten.
+        self._strain = np.ones(len(self._fastest))
         self.restart()
 
     def restart(self) -> None:
@@ -64,7 +69,6 @@ class StraightLine:
         # Shares of each update's own noise in both means, the oldest first.
         self._first_shares, self._second_shares = np.zeros(0), np.zeros(0)
         self._expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        self._strain = np.ones(n)
 
     def update(
         self, mean: NDArray[np.float64], noise: NDArray[np.float64], static: NDArray[np.float64]
@@ -101,9 +105,10 @@ class StraightLine:
             shares = first + (believed * here / (older - here))[:, None] * (first - second)
             variance = np.square(here * self._fastest * (1 - believed))
         moving = one * (shares @ shares.T) + np.diag(variance)
-        surprise = self._surprise(own, one)
+        missed = self._surprise(own, one)
+        surprise = missed / np.sqrt(np.maximum(self._strain, 1.0))
         # What bends more than a line within the memory misses what was expected, again and again.
-        self._strain += _LEARNING * (np.square(surprise) - self._strain)
+        self._strain += _LEARNING * (np.minimum(np.square(missed), _MOST) - self._strain)
         stretch = np.sqrt(np.maximum(self._strain, 1.0))
         moving = moving * np.outer(stretch, stretch)
         present = Present(value, rate, static + moving, moving, surprise)

@@ -12,7 +12,7 @@ from escape_hw.api.tracking import Alarm
 from escape_hw.calibration.live_registration import LiveEstimate
 
 #: Standard errors that an update may miss what was expected by.
-JUMP = 6.0
+JUMP = 8.0
 #: Mean square misfit of an update's own frames beside the usual from which on the model does not hold; and
 #: how loud they may be beside the usual.
 MISFIT, LOUD = 2.5, 2.0
