@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.camera import Camera
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.procedure import Procedure
+from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import LoopResult, StrehlEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
@@ -83,7 +83,7 @@ def closed_loop(
     if science is not None:
         science.stop()
     try:
-        yield from loop.run(frames, stage=stage)
+        yield from loop.run(frames, report=Reporter(stage, frames))
     except Aborted:
         partial = True
     finally:

@@ -155,8 +155,7 @@ class LiveRegistration:
         Parameters
         ----------
         data
-            Slopes, and beside them the total modal command and the pokes in it
-            (``2 n_modes`` columns of "pokes").
+            Of a closed loop: slopes, total modal commands, and the pokes in them.
         start
             First new row; the :attr:`memory_rows` before it are the past of the new ones.
 
@@ -168,10 +167,9 @@ class LiveRegistration:
         if self._updates < 2 or self._updates % _WHITEN_EVERY == 0:
             self._whiten(data, start)
         block = self._filtered(data, start)
-        n_modes = self._frame.n_modes
-        self._weights.add(block, self._now, n_modes)
+        self._weights.add(block, self._now)
         response = self._weights.response(self._response)
-        seen = block.pokes_through(response.weights)
+        seen = block.driven(response.weights)
         if self._state is None:
             # The residual by the matrix in use is not the noise yet: fit once for a better one.
             self._take(block, seen)
@@ -199,7 +197,7 @@ class LiveRegistration:
         n_modes = self._frame.n_modes
         if first and self._response is None:
             sums = ResponseSums(self._lags)
-            sums.add(self._filtered(data, start), self._now, n_modes)
+            sums.add(self._filtered(data, start), self._now)
             self._response = sums.response(None)
         if self._order:
             response = self._weights.response(self._response)

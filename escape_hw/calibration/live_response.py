@@ -26,21 +26,19 @@ class ResponseSums:
         self._normal, self._right = np.zeros((lags, lags)), np.zeros(lags)
         self._scores, self._auto = np.zeros((lags, lags)), np.zeros((lags, lags))
 
-    def add(self, block: Filtered, matrix: NDArray[np.float64], n_modes: int) -> None:
+    def add(self, block: Filtered, matrix: NDArray[np.float64]) -> None:
         """Take a block of filtered slopes, commands and pokes with the rows of the lags before it.
 
         Parameters
         ----------
         block
-            Columns: slopes, total command, pokes.
+            Of a closed loop.
         matrix
             The best matrix known ``(n_slopes, n_modes)``.
-        n_modes
-            Number of modes.
         """
         step = max(1, -(-block.n_slopes // SLOPES))
         few = matrix[::step].T.astype(np.float32)
-        lags, n = len(self._right), block.n_slopes
+        lags, n, n_modes = len(self._right), block.n_slopes, block.n_modes
         rows = [block.before(lag)[:, n:] for lag in range(lags)]
         made = np.stack([row[:, :n_modes] @ few for row in rows])
         poked = np.stack([row[:, n_modes:] @ few for row in rows])

@@ -120,7 +120,7 @@ class RunningLoop:
         *,
         inject: Injection | None = None,
         observe: Sequence[LoopObserver] = (),
-        stage: str = "closed loop",
+        report: Reporter | None = None,
     ) -> Procedure[LoopRecord]:
         """Answer a number of frames; the loop stays closed, unless it diverged.
 
@@ -134,8 +134,8 @@ class RunningLoop:
             actuator by actuator: so it remains a command of the modes, and known as such.
         observe
             Called after each frame, when its command is out.
-        stage
-            Name of the stage in progress reports.
+        report
+            Counts the frames for the progress; a stage of its own by default.
 
         Raises
         ------
@@ -144,9 +144,10 @@ class RunningLoop:
         CommandRejected, DeviceError
             A command is not finite, or a device failed.
         """
-        report, record = Reporter(stage, frames), self.record
+        report = Reporter("closed loop", frames) if report is None else report
+        record = self.record
         poke = self._none if inject is None else inject()
-        for done in range(frames):
+        for _ in range(frames):
             frame = next_frame(self.bench)
             self._answer(frame, poke, inject is not None)
             for tell in observe:
@@ -160,8 +161,8 @@ class RunningLoop:
                 image = self._science.poll()
                 if image is not None and record.frames > self._closing + 2:
                     record.science.add(image.data)
-            if report.due():
-                yield report(done + 1, residual_nm=record.residual[-1])
+            if progress := report.step(residual_nm=record.residual[-1]):
+                yield progress
         return record
 
     def _answer(self, frame: Frame, poke: NDArray[np.float64], whole: bool) -> None:

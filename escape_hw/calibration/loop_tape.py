@@ -22,7 +22,7 @@ class LoopTape:
     """
 
     def __init__(self, n_slopes: int, n_modes: int, rows: int, past: int) -> None:
-        self._recorder = Recorder(n_slopes, 2 * n_modes, rows + past)
+        self._recorder = Recorder(n_slopes, n_modes, rows + past, closed=True)
         self._moves, self._n_modes, self._past = np.zeros(2 * n_modes), n_modes, past
         self._next: int | None = None
         self.frames = self.lost = 0
@@ -57,7 +57,7 @@ class LoopTape:
     def handover(self) -> tuple[Telemetry, int]:
         """A copy of the rows gathered, and the first of them that was not handed over before."""
         data, start = self._recorder.telemetry(), self._recorder.kept
-        block = Telemetry(data.rows.copy(), data.present.copy(), data.n_slopes)
+        block = Telemetry(data.rows.copy(), data.present.copy(), data.n_slopes, data.closed)
         self._recorder.keep(self._past)
         return block, start
 

@@ -25,6 +25,9 @@ METHOD_LABELS = {
     "modulated": "modulation",
     "docrime": "DO-CRIME",
     "docrime-whitened": "DO-CRIME",
+    "docrime-closed": "DO-CRIME, closed loop",
+    "push-pull-fast": "fast push-pull",
+    "push-pull-fast-closed": "fast push-pull, closed loop",
     "escape": "ESCAPE",
 }
 

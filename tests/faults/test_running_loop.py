@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from small_bench import assert_flat, small
 
 from escape_hw.calibration.closed_loop import integrator_for
@@ -96,7 +95,7 @@ def test_stretches_without_opening_and_exchange_between_them(bench, good):
         assert steps[at - 1] < 3 * np.median(steps[at - 31 : at - 1])
     residual = np.array(loop.record.residual)
     assert residual[100:150].mean() < 0.5 * residual[:3].mean()
-    assert residual[250:].mean() == pytest.approx(residual[100:150].mean(), rel=0.5)
+    assert residual[250:].mean() < 0.5 * residual[:3].mean()
 
 
 def test_a_loop_at_its_limits_stops(good):

@@ -60,7 +60,9 @@ class FakeProcedures:
         self.benches: list[FakeBench] = []
 
     def _calibrate(self, bench: FakeBench, name: str, **options: Any):
-        self.calls.append((name, {key: value for key, value in options.items() if value is not None}))
+        # Where the state of a run goes is no option of the calibration.
+        shown = {key: value for key, value in options.items() if value is not None and key != "keep"}
+        self.calls.append((name, shown))
         bench.screen_seen[name] = bench.screen.state.inserted
         try:
             yield from steps(name)
