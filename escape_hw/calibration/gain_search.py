@@ -16,8 +16,9 @@ from escape_hw.pipeline.integrator import gain_limit
 
 #: Shares of the stable limit that the search for the best gain tries.
 GAIN_SHARES = (0.25, 0.35, 0.45, 0.55, 0.65, 0.75)
-#: Gains tried beyond those while the loop gets better and better, each this much above the last.
-_MORE_GAINS, _MORE_STEP = 4, 1.2
+#: Gains tried beyond those while the loop gets better and better towards one end, and the factors
+#: between them: on the way up small, because the loop's limit is near.
+_MORE_GAINS, _STEP_UP, _STEP_DOWN = 4, 1.2, 1 / 1.5
 #: Delay assumed for the gain's limit when the matrix does not carry a measured one.
 _USUAL_DELAY = 2.0
 
@@ -69,10 +70,11 @@ def best_gain(
         if run.partial:
             return gain, runs
         if sum(not r.stable for r in runs) > 1:
-            break
-        if not waiting and more and _rises_to_its_end(runs):
+            waiting = []
+        further = _beyond(runs) if more and not waiting else None
+        if further is not None:
             # The top is not passed yet: a best gain at the edge of the scan is none.
-            waiting, more = [gain * _MORE_STEP], more - 1
+            waiting, more = [further], more - 1
     stable = [run for run in runs if run.stable]
     if not stable:
         raise CalibrationError(
@@ -82,9 +84,14 @@ def best_gain(
     return _peak(stable), runs
 
 
-def _rises_to_its_end(runs: list[LoopResult]) -> bool:
-    """Whether every loop was stable and the last gain is the best so far."""
-    return all(run.stable for run in runs) and int(np.argmax(_merits(runs))) == len(runs) - 1
+def _beyond(runs: list[LoopResult]) -> float | None:
+    """A gain beyond the end of the scan at which the best loop lies; ``None`` if it lies within."""
+    tried = sorted(runs, key=lambda run: run.gain)
+    stable = [run for run in tried if run.stable]
+    best = stable[int(np.argmax(_merits(stable)))] if stable else None
+    if best is None or best is tried[0]:
+        return tried[0].gain * _STEP_DOWN
+    return best.gain * _STEP_UP if best is tried[-1] else None
 
 
 def _peak(runs: list[LoopResult]) -> float:

@@ -101,6 +101,10 @@ class FakeProcedures:
         yield from steps("gain")
         return 0.35, [replace(fake.loop(matrix.method), gain=g) for g in (0.25, 0.35, 0.45)]
 
+    def simulated(self, bench: FakeBench, grid: Any, m2c: Any):
+        self.calls.append(("simulated", {}))
+        return fake.calibration("simulated")
+
     def measure_model_psf(self, bench: FakeBench, **options: Any):
         bench.screen_seen["model_psf"] = bench.screen.state.inserted
         yield from steps("model PSF")
@@ -120,6 +124,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         "closed_loop": ("closed_loop",),
         "gain_search": ("best_gain",),
         "model_psf": ("measure_model_psf",),
+        "pseudo_synthetic": ("simulated",),
     }
     for module, names in homes.items():
         stand_in = types.ModuleType(f"escape_hw.calibration.{module}")
