@@ -1,6 +1,6 @@
 """A registration every second, from small pokes in a loop that keeps running.
 
-Sums over the whitened telemetry fade with a memory of some seconds (:mod:`~.instrument_sums`); every update
+Sums over the whitened telemetry fade with a memory of some seconds (:mod:`~.fading_sums`); every update
 is one Gauss-Newton step of SPRINT on them from the last estimate, with the same unknowns as a full fit:
 gain, registration, what the model does not know, and on a pyramid the optical gains as a smooth curve
 over the modes. A straight line through the estimates (:mod:`~.straight_line`) takes out their lag.
@@ -18,8 +18,8 @@ from escape_hw.api.model import DoubtfulModel, SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, TemporalResponse
 from escape_hw.calibration.covariance import sandwich
+from escape_hw.calibration.fading_sums import FadingSums, turned
 from escape_hw.calibration.gain_curve import bends_of, curve_basis
-from escape_hw.calibration.instrument_sums import InstrumentSums, turned
 from escape_hw.calibration.linearisation import GAIN, WIDTH, Problem, State
 from escape_hw.calibration.live_response import ResponseSums
 from escape_hw.calibration.misfit import NormalEquations, Priors
@@ -137,7 +137,7 @@ class LiveRegistration:
 
     def restart(self) -> None:
         """Forget all frames; the last estimate is where the next one starts from."""
-        self._sums = InstrumentSums.zeros(*self._frame.data.shape)
+        self._sums = FadingSums.zeros(*self._frame.data.shape)
         self._weights = ResponseSums(self._lags)
         self._whitener: NDArray[np.float64] | None = None
         self._state: State | None = None
@@ -174,16 +174,16 @@ class LiveRegistration:
             # The residual by the matrix in use is not the noise yet: fit once for a better one.
             self._take(block, seen)
             self._state = self._step()[2]
-            self._now, self._sums = self._matrix, InstrumentSums.zeros(*self._frame.data.shape)
+            self._now, self._sums = self._matrix, FadingSums.zeros(*self._frame.data.shape)
         own = self._take(block, seen)
         problem, system, self._state = self._step()
         self._updates += 1
         return self._estimate(problem, system, self._state, own, response)
 
-    def _take(self, block: Filtered, seen: NDArray[np.float32]) -> InstrumentSums:
+    def _take(self, block: Filtered, seen: NDArray[np.float32]) -> FadingSums:
         """Let the sums fade and add a block; the block's own sums."""
         n_modes = self._frame.n_modes
-        own = InstrumentSums.zeros(*self._frame.data.shape)
+        own = FadingSums.zeros(*self._frame.data.shape)
         own.add(block.slopes, seen[:, :n_modes], seen[:, n_modes:], self._now.astype(np.float32))
         self._sums.forget(self._keep)
         self._sums.merge(own)
@@ -237,7 +237,7 @@ class LiveRegistration:
         problem: Problem,
         system: NormalEquations,
         state: State,
-        own: InstrumentSums,
+        own: FadingSums,
         response: TemporalResponse,
     ) -> LiveEstimate:
         variants = len(problem.variants)

@@ -14,7 +14,7 @@ class ResponseSums:
 
     Slopes are regressed on what the matrix makes of the commands, with what it makes of the pokes as
     instruments, because the controller's part of a command answers to the turbulence
-    (:mod:`~.instrument_sums`).
+    (:mod:`~.fading_sums`).
 
     Parameters
     ----------

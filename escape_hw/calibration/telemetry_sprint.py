@@ -22,7 +22,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.calibration.derivatives import modal_matrix
 from escape_hw.calibration.docrime import MOST_CORRELATED
-from escape_hw.calibration.instrument_sums import LEAST, turned
+from escape_hw.calibration.fading_sums import LEAST, turned
 from escape_hw.calibration.response import Filtered, filtered
 from escape_hw.calibration.sprint import sprint_steps
 from escape_hw.calibration.telemetry import Telemetry

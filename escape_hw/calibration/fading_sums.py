@@ -33,7 +33,7 @@ LEAST = 1e-9
 
 
 @dataclass(slots=True, eq=False)
-class InstrumentSums:
+class FadingSums:
     """Exponentially forgotten sums over frames; ``w`` is a frame's weight.
 
     Parameters
@@ -61,7 +61,7 @@ class InstrumentSums:
     weight: float = 0.0
 
     @classmethod
-    def zeros(cls, n_slopes: int, n_modes: int) -> InstrumentSums:
+    def zeros(cls, n_slopes: int, n_modes: int) -> FadingSums:
         """Empty sums."""
         square = (n_slopes, n_slopes) if n_slopes <= MOST_CORRELATED else (n_slopes,)
         mixed, pokes, gram = np.zeros((3, n_modes, n_modes))
@@ -103,7 +103,7 @@ class InstrumentSums:
         self.left += left.T @ left if self.left.ndim == 2 else np.einsum("ts,ts->s", left, left)
         self.weight += len(y)
 
-    def merge(self, other: InstrumentSums) -> None:
+    def merge(self, other: FadingSums) -> None:
         """Add the sums of other frames."""
         self.cross += other.cross
         self.mixed += other.mixed
@@ -158,7 +158,7 @@ def turned(
     frame
         Gives basis, mask and provenance.
     cross, mixed, gram
-        As for :class:`InstrumentSums`.
+        As for :class:`FadingSums`.
     variance
         Variance of each slope's whitened noise in one frame ``(n_slopes,)``.
     """
