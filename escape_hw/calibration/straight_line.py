@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 #: Updates before which nothing is a surprise, and what each adds to what is known of surprises.
 _SETTLED, _LEARNING = 4, 0.15
+#: A mean miss counts from this many times its noise's variance on.
+_MORE = 3.0
 #: A single surprise, squared, teaches no more than this: a jump is not what is usual.
 _MOST = 36.0
 
@@ -69,6 +71,7 @@ class StraightLine:
         # Shares of each update's own noise in both means, the oldest first.
         self._first_shares, self._second_shares = np.zeros(0), np.zeros(0)
         self._expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._miss, self._bend = np.zeros(n), np.zeros(n)
 
     def update(
         self, mean: NDArray[np.float64], noise: NDArray[np.float64], static: NDArray[np.float64]
@@ -105,25 +108,35 @@ class StraightLine:
             shares = first + (believed * here / (older - here))[:, None] * (first - second)
             variance = np.square(here * self._fastest * (1 - believed))
         moving = one * (shares @ shares.T) + np.diag(variance)
-        missed = self._surprise(own, one)
+        missed, bend = self._surprise(own, one)
         surprise = missed / np.sqrt(np.maximum(self._strain, 1.0))
-        # What bends more than a line within the memory misses what was expected, again and again.
         self._strain += _LEARNING * (np.minimum(np.square(missed), _MOST) - self._strain)
         stretch = np.sqrt(np.maximum(self._strain, 1.0))
-        moving = moving * np.outer(stretch, stretch)
+        moving = moving * np.outer(stretch, stretch) + np.diag(bend)
         present = Present(value, rate, static + moving, moving, surprise)
-        self._expected = value + self._step * rate, np.diag(moving)
+        # The next update's own data are, in the mean, half a step old.
+        self._expected = value + 0.5 * self._step * rate, np.diag(moving)
         self._trim()
         return present
 
-    def _surprise(self, own: NDArray[np.float64], one: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance of one update's own data from the line so far, in standard errors."""
+    def _surprise(
+        self, own: NDArray[np.float64], one: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Distance of one update's own data from the line so far, in standard errors, and the line's bend.
+
+        What bends more than a line within the memory misses what was expected again and again to the same
+        side: the square of the mean miss, where it is more than noise makes of it, is variance that a line
+        leaves out, and is forgotten slowly, for a swing turns round.
+        """
         if self._expected is None or len(self._first_shares) < _SETTLED:
-            return np.zeros_like(own)
+            return np.zeros_like(own), np.zeros_like(own)
         value, variance = self._expected
-        return np.asarray(
-            (own - value) / np.sqrt(np.diag(one) + np.square(self._step * self._fastest) + variance)
-        )
+        noise = np.diag(one) + variance
+        missed = own - value
+        self._miss += _LEARNING * (missed - self._miss)
+        more = np.square(self._miss) - _MORE * noise * _LEARNING / (2 - _LEARNING)
+        self._bend = np.maximum(more, self._bend * (1 - _LEARNING / 2))
+        return missed / np.sqrt(noise + np.square(self._step * self._fastest)), self._bend
 
     def _trim(self) -> None:
         """Drop the oldest shares once they weigh nothing."""
