@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,19 +34,49 @@ class State:
     actuator_width: NDArray[np.float64]
     slope_gain: NDArray[np.float64]
 
-    def offset(self) -> NDArray[np.float64]:
+    def offset(self, mean_width: float = 0.0) -> NDArray[np.float64]:
         """Distance from the priors' means, in the order of the unknowns."""
-        head = np.concatenate([[0.0], np.zeros(5), [self.width, self.shape]])
+        head = np.concatenate([[0.0], np.zeros(5), [self.width - mean_width, self.shape]])
         return np.concatenate(
             [head, self.variant, self.sampling, self.actuator_gain, self.actuator_width, self.slope_gain]
         )
 
 
-class Problem:
-    """One matrix, one model, and the weights between them."""
+@dataclass(slots=True, eq=False)
+class _Shapes:
+    """Zonal matrices at a state, in standard errors: derivatives, variants, and the whole."""
 
-    def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, priors: Priors) -> None:
-        self.weighted = weighted
+    moved: NDArray[np.float64]
+    by_width: NDArray[np.float64]
+    by_shape: NDArray[np.float64]
+    variants: list[NDArray[np.float64]]
+    shaped: NDArray[np.float64]
+
+
+class Problem:
+    """One matrix, one model, and the weights between them.
+
+    Parameters
+    ----------
+    weighted
+        The measured matrix.
+    model
+        The synthetic model.
+    priors
+        Scatter of what it does not know.
+    bends
+        What commands may be multiplied with by one standard deviation ``(n_act, n_act)`` each, such as
+        optical gains that differ between modes; fitted beside the model's own variants.
+    """
+
+    def __init__(
+        self,
+        weighted: WeightedMatrix,
+        model: SyntheticModel,
+        priors: Priors,
+        bends: Sequence[NDArray[np.float64]] = (),
+    ) -> None:
+        self.weighted, self.bends, self.mean_width = weighted, tuple(bends), priors.mean_width
         self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
         rows, cols = np.nonzero(weighted.valid)
@@ -56,7 +87,7 @@ class Problem:
             [
                 np.zeros(6),
                 [priors.width**-2, priors.shape**-2],
-                np.ones(len(self.variants)),
+                np.ones(self.n_variants),
                 np.full(self.n_lines, priors.sampling**-2),
                 np.full(model.n_act, priors.actuator_gain**-2),
                 np.full(model.n_act, priors.actuator_width**-2),
@@ -73,26 +104,56 @@ class Problem:
         return State(
             gain,
             registration.to_array(),
+            self.mean_width,
             0.0,
-            0.0,
-            np.zeros(len(self.variants)),
+            np.zeros(self.n_variants),
             np.zeros(self.n_lines),
             zeros,
             zeros.copy(),
             np.zeros(n_slopes),
         )
 
-    def linearise(self, state: State) -> NormalEquations:
-        """Model and derivatives about a state."""
+    @property
+    def n_variants(self) -> int:
+        """Shares of variants and bends among the unknowns."""
+        return len(self.variants) + len(self.bends)
+
+    def _shapes(self, state: State) -> _Shapes:
+        """The zonal matrix of a state and what it is made of, weighted."""
         here, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
         zonal, moved = (weigh(part) for part in zonal_jacobian(self.model, here, w))
         by_width = moved[5] * w
         by_shape = weigh(self.model.zonal_matrix(here, w * _PEDESTAL)) - zonal
         variants = [weigh(v.zonal_matrix(here, w)) - zonal for v in self.variants]
-        rows, acting = (1 + state.slope_gain)[:, None], 1 + state.actuator_gain
+        variants += [zonal @ bend for bend in self.bends]
         shaped = zonal + state.shape * by_shape + state.actuator_width * by_width
         for share, difference in zip(state.variant, variants, strict=True):
             shaped = shaped + share * difference
+        return _Shapes(moved, by_width, by_shape, variants, shaped)
+
+    def matrix(self, state: State, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Slopes per unit of any modes ``(n_slopes, n)`` at a state, random effects included.
+
+        Parameters
+        ----------
+        state
+            Where.
+        m2c
+            Modes ``(n_act, n)``.
+        """
+        zonal = self._shapes(state)
+        acted = (1 + state.actuator_gain)[:, None] * m2c
+        half = len(zonal.shaped) // 2
+        sampled = np.concatenate([zonal.moved[0, :half], zonal.moved[1, half:]])
+        whole = zonal.shaped + state.sampling[self.lines, None] * sampled
+        scale = state.gain * (1 + state.slope_gain) * self.weighted.by_slope
+        return np.asarray(scale[:, None] * (whole @ acted))
+
+    def linearise(self, state: State) -> NormalEquations:
+        """Model and derivatives about a state."""
+        z = self._shapes(state)
+        moved, by_width, by_shape, variants, shaped = z.moved, z.by_width, z.by_shape, z.variants, z.shaped
+        rows, acting = (1 + state.slope_gain)[:, None], 1 + state.actuator_gain
         acted = acting[:, None] * self.modes
 
         def modal(z: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -112,7 +173,7 @@ class Problem:
             state.gain * (shaped @ acted),
             self.weighted.data - model,
             self.precision,
-            state.offset(),
+            state.offset(self.mean_width),
             sampled,
             self.lines,
         )
@@ -120,7 +181,7 @@ class Problem:
     def move(self, state: State, step: NDArray[np.floating]) -> State:
         """The state after a step, in the order of the unknowns."""
         n_act = self.model.n_act
-        v, n = len(self.variants), len(self.variants) + self.n_lines
+        v, n = self.n_variants, self.n_variants + self.n_lines
         variant, sampling, gains, widths, slopes = np.split(step[8:], [v, n, n + n_act, n + 2 * n_act])
         return State(
             state.gain + step[GAIN],

@@ -22,6 +22,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.calibration.derivatives import modal_matrix
 from escape_hw.calibration.docrime import MOST_CORRELATED
+from escape_hw.calibration.fading_sums import LEAST, turned
 from escape_hw.calibration.response import Filtered, filtered
 from escape_hw.calibration.sprint import sprint_steps
 from escape_hw.calibration.telemetry import Telemetry
@@ -30,8 +31,6 @@ from escape_hw.errors import TooFewFrames
 
 #: Rounds of response, whitener and registration; the third changes nothing that matters.
 _ROUNDS = 3
-#: Directions that the pokes took less than this share of the strongest tell nothing.
-_LEAST = 1e-9
 #: Whitened frames without which no noise level is worth stating.
 MIN_ROWS = 12
 #: Whitened frames at which the measured correlation of the slopes' noise counts half.
@@ -83,16 +82,7 @@ def independent_columns(
     InteractionMatrix
         ``(n_slopes, rank)``, with the modes turned alike; its modes have no unit rms any more.
     """
-    power, directions = np.linalg.eigh(gram)
-    taken = power > _LEAST * power.max()
-    turn = directions[:, taken] * np.sqrt(power[taken])
-    sigma = np.repeat(np.sqrt(variance)[:, None], turn.shape[1], axis=1)
-    return replace(
-        matrix,
-        data=(matrix.data @ turn).astype(np.float32),
-        sigma=sigma.astype(np.float32),
-        m2c=matrix.m2c @ turn,
-    )
+    return turned(matrix, matrix.data @ gram, gram, gram, variance)
 
 
 def time_line(
@@ -175,7 +165,7 @@ def telemetry_sprint(
         gram = seen.T @ seen
         measured = replace(
             frame,
-            data=(slopes.T @ seen @ np.linalg.pinv(gram, rcond=_LEAST, hermitian=True)).astype(np.float32),
+            data=(slopes.T @ seen @ np.linalg.pinv(gram, rcond=LEAST, hermitian=True)).astype(np.float32),
             sigma=np.zeros(frame.data.shape, np.float32),
         )
         columns = independent_columns(measured, gram, variance)
@@ -187,7 +177,7 @@ def telemetry_sprint(
         unit = modal_matrix(model, start, frame.m2c, estimate.width.value)
         matrix = estimate.gain.value * unit
         if order:
-            whitener = _whitener(data, matrix, response, order, lags)
+            whitener = fitted_whitener(data, matrix, response, order, lags)
     return TelemetryFit(estimate, response, whitener, covariance, len(block.now))
 
 
@@ -226,10 +216,22 @@ def _shrunk(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(share * covariance + (1 - share) * np.diag(np.diag(covariance)))
 
 
-def _whitener(
+def fitted_whitener(
     data: Telemetry, matrix: NDArray[np.float64], response: TemporalResponse, order: int, lags: int
 ) -> NDArray[np.float64]:
-    """Prediction-error filter of what the pokes do not explain."""
+    """Prediction-error filter of what the pokes do not explain.
+
+    Parameters
+    ----------
+    data
+        Slopes and pokes (or, in closed loop, total commands).
+    matrix
+        ``(n_slopes, n_modes)``.
+    response
+        Temporal response.
+    order, lags
+        Past frames that the filter uses, and frames of the response.
+    """
     at = np.arange(lags - 1, data.present.size)
     explained = apply_filter(data.rows, response.weights, at, data.n_slopes) @ matrix.T.astype(np.float32)
     return prediction_error_filter(data.slopes[at] - explained, data.present[at], order)

@@ -24,6 +24,7 @@ from escape_hw.cli import (
     rehearse,
     reproduce,
     systems,
+    track,
     udev,
 )
 
@@ -43,6 +44,7 @@ app.command("calibrate")(calibrate.calibrate)
 app.command("sprint")(calibrate.sprint)
 app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
+app.command("track")(track.track)
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
 app.command("compare")(products.compare)

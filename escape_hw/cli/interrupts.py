@@ -27,7 +27,6 @@ class Interrupts:
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        # Imported here: it brings numpy along, which no help text needs.
         self.abort = Flag()
         self._tell = tell
         self._in_procedure = False

@@ -13,6 +13,7 @@ from escape_hw.config.section import Breach, Section, enforce
 from escape_hw.config.sensor_models import AnySensor, PyramidSection, SensorSection
 from escape_hw.config.telescope_models import TelescopeSection
 from escape_hw.config.toml_text import dump_toml
+from escape_hw.config.tracking_models import TrackingSection
 from escape_hw.config.twin_models import TwinConfig
 from escape_hw.errors import ConfigError
 
@@ -128,6 +129,7 @@ class SystemConfig(Section):
     calibration: CalibrationSection = Field(
         default_factory=CalibrationSection, description="defaults of the calibration procedures"
     )
+    tracking: TrackingSection = Field(default_factory=TrackingSection, description="the tracker")
     twin: TwinConfig = Field(default_factory=TwinConfig, description="the simulated bench")
 
     @model_validator(mode="before")

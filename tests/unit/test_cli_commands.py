@@ -24,8 +24,8 @@ def test_help_is_quick_and_light():
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     for command in (
-        "systems", "config", "calibrate", "sprint", "gains", "loop", "reproduce", "show", "compare", "report",
-        "perf", "dm", "camera", "asm", "doctor", "discover", "udev", "emulate",
+        "systems", "config", "calibrate", "sprint", "gains", "loop", "track", "reproduce", "show", "compare",
+        "report", "perf", "dm", "camera", "asm", "doctor", "discover", "udev", "emulate",
     ):  # fmt: skip
         assert command in done.stdout
 
