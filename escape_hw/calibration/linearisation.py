@@ -117,6 +117,18 @@ class Problem:
             self.lines,
         )
 
+    def zonal(self, state: State) -> NDArray[np.float64]:
+        """Slopes per unit command ``(n_slopes, n_act)`` at a state, random effects included."""
+        here, w = Registration.from_array(state.alpha), 1.0 + state.width
+        zonal, moved = zonal_jacobian(self.model, here, w)
+        shaped = zonal + state.actuator_width * moved[5] * w
+        shaped += state.shape * (self.model.zonal_matrix(here, w * _PEDESTAL) - zonal)
+        for share, variant in zip(state.variant, self.variants, strict=True):
+            shaped += share * (variant.zonal_matrix(here, w) - zonal)
+        half = len(zonal) // 2
+        shaped += state.sampling[self.lines, None] * np.concatenate([moved[0, :half], moved[1, half:]])
+        return np.asarray(state.gain * (1 + state.slope_gain)[:, None] * shaped * (1 + state.actuator_gain))
+
     def move(self, state: State, step: NDArray[np.floating]) -> State:
         """The state after a step, in the order of the unknowns."""
         n_act = self.model.n_act

@@ -21,6 +21,15 @@ S = TypeVar("S", bound=SensorSection)
 Estimator = Literal["auto", "matrix", "telemetry"]
 #: What SPRINT can fit within ESCAPE.
 ESTIMATORS: tuple[str, ...] = get_args(Estimator)
+Solver = Literal["effects", "light", "frozen", "batches", "diagonal"]
+#: How SPRINT solves.
+SOLVERS: tuple[str, ...] = get_args(Solver)
+ModesChoice = Literal["snr", "first", "d-optimal", "a-optimal"]
+#: How SPRINT chooses its modes.
+MODES_CHOICES: tuple[str, ...] = get_args(ModesChoice)
+Loss = Literal["squares", "huber"]
+#: What SPRINT minimises.
+LOSSES: tuple[str, ...] = get_args(Loss)
 
 
 class SystemSection(Section):
@@ -103,6 +112,20 @@ class CalibrationSection(Section):
         description="what SPRINT fits: the 'matrix' or the whitened 'telemetry'; 'auto': the telemetry",
     )
     sprint_modes: int = Field(50, ge=1, le=10000, description="SPRINT: largest number of modes used")
+    modes_choice: ModesChoice = Field(
+        "snr",
+        description="SPRINT: which modes: 'snr' (best measured), 'first', or those that tell most of the "
+        "registration, 'd-optimal' or 'a-optimal'",
+    )
+    solver: Solver = Field(
+        "effects",
+        description="SPRINT: 'effects' (with what the model does not know), 'light' (gain and registration), "
+        "'frozen' (the same, derivatives of the start), 'batches' (the paper's, few modes at a time), "
+        "'diagonal' (a gain for every mode)",
+    )
+    loss: Loss = Field(
+        "squares", description="SPRINT: 'squares', or 'huber' where some sub-apertures are not to be trusted"
+    )
     learning_rate: float = Field(1.0, gt=0, le=1, description="SPRINT: share of each step that is taken")
     model: str = Field(
         "fast", min_length=1, description="SPRINT: synthetic model (entry point in escape.models)"
