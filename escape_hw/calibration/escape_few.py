@@ -17,8 +17,8 @@ from escape_hw.calibration.sensor_setup import SETUP_FRAMES, modal_basis, poke_a
 from escape_hw.calibration.telemetry_sprint import MIN_ROWS, telemetry_sprint, time_line
 from escape_hw.errors import Aborted, TooFewFrames
 
-#: Frames per past frame of the whitening filter: with few frames, each past one costs a good share of them.
-_FRAMES_PER_ORDER = 16
+#: Frames per past frame of the whitening filter, so that there are enough to find it on.
+_FRAMES_PER_ORDER = 3
 
 
 def escape_from_few(
@@ -53,10 +53,9 @@ def escape_from_few(
     """
     c = bench.config.calibration
     order = min(c.whiten_order, max(1, some_frames(frames) // _FRAMES_PER_ORDER))
-    if frames < MIN_ROWS + order:
-        raise TooFewFrames(
-            f"{frames} frames are too few for a registration; ask for at least {MIN_ROWS + order} frames"
-        )
+    least = MIN_ROWS + min(order, 1)
+    if frames < least:
+        raise TooFewFrames(f"{frames} frames are too few for a registration; ask for at least {least} frames")
     poke = c.poke if poke is None else poke
     m2c = modal_basis(bench)
     amplitude = poke_amplitudes(bench, m2c, poke)
@@ -73,7 +72,7 @@ def escape_from_few(
     frame = measured_matrix(bench, found, m2c, np.zeros(shape), np.zeros(shape), "telemetry")
     fit = yield from telemetry_sprint(
         time_line(*record, before=2 * c.whiten_order + c.lags), frame, bench.model(found),
-        order=order, lags=c.lags, learning_rate=c.learning_rate,
+        order=order, lags=c.lags, learning_rate=c.learning_rate, solver=c.solver, loss=c.loss,
     )  # fmt: skip
     lost = int(record[0][-1] - record[0][0]) + 1 - record[0].size
     made = synthesise(bench, found, fit.estimate, m2c)
@@ -92,6 +91,7 @@ def escape_from_few(
         mean_frame=session.mean_frame,
         notes=(
             *fit.estimate.warnings,
+            *fit.estimate.notes,
             "too few frames for a measured matrix: the registration comes straight from the telemetry",
             *session.notes(),
         ),

@@ -99,6 +99,13 @@ class NormalEquations:
         k, whole = self.n_common, self.whole
         return np.asarray(whole[:k, :k] - whole[:k, k:] @ np.linalg.solve(whole[k:, k:], whole[k:, :k]))
 
+    def posterior_variance(self) -> NDArray[np.float64]:
+        """Variance of every unknown given the data and the priors ``(n,)``, in the order of the unknowns."""
+        inverse = np.linalg.inv(self.whole)
+        coupled = self.across / self.diagonal[:, None]
+        of_slopes = 1 / self.diagonal + np.einsum("sp,sp->s", coupled @ inverse, coupled)
+        return np.concatenate([np.diag(inverse), of_slopes])
+
     def efficient(self) -> NDArray[np.float64]:
         """Derivatives by the common parameters, less what the random effects can imitate.
 

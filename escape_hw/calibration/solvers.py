@@ -19,7 +19,7 @@ from escape_hw.calibration.capture import capture, low_modes
 from escape_hw.calibration.covariance import Linearised
 from escape_hw.calibration.diagonal import DiagonalProblem
 from escape_hw.calibration.light import SMALL, LightFit, LightProblem
-from escape_hw.calibration.linearisation import Problem
+from escape_hw.calibration.linearisation import Learned, Problem
 from escape_hw.calibration.misfit import Priors
 from escape_hw.calibration.weighted import WeightedMatrix
 from escape_hw.config.models import Solver
@@ -62,8 +62,9 @@ class Descent:
 class Solution:
     """Where a descent ended, alike for every solver.
 
-    ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``; ``scatter`` is what is to be added to the
-    covariance of the registration ``(5, 5)``.
+    ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``, ``learned`` what the data say about the
+    scatter of the random effects, where there are any; ``scatter`` is what is to be added to the covariance
+    of the registration ``(5, 5)``.
     """
 
     system: Linearised
@@ -73,6 +74,7 @@ class Solution:
     settled: bool
     zonal: Callable[[], NDArray[np.float64]]
     scatter: NDArray[np.float64] | None = None
+    learned: Callable[[], Learned] | None = None
 
 
 def solve(
@@ -159,7 +161,10 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
         damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / LARGEST)))
         state = problem.move(state, step * damping * descent.learning_rate)
         system = problem.linearise(state)
-    return Solution(system, state.alpha, state.gain, 1 + state.width, settled, lambda: problem.zonal(state))
+    return Solution(
+        system, state.alpha, state.gain, 1 + state.width, settled,
+        lambda: problem.zonal(state), learned=lambda: problem.learned(state, system),
+    )  # fmt: skip
 
 
 def _record(

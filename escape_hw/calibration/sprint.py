@@ -26,7 +26,7 @@ from escape_hw.calibration.capture import EXPLAINED
 from escape_hw.calibration.covariance import sandwich
 from escape_hw.calibration.degeneracy import degeneracies
 from escape_hw.calibration.derivatives import modal_matrix
-from escape_hw.calibration.linearisation import GAIN, WIDTH
+from escape_hw.calibration.linearisation import GAIN, WIDTH, Learned
 from escape_hw.calibration.misfit import Priors
 from escape_hw.calibration.mode_choice import choose_modes
 from escape_hw.calibration.parity import parity_hint
@@ -53,10 +53,13 @@ class SprintFit:
     zonal
         Gives slopes per unit command ``(n_slopes, n_act)`` with all that was fitted, random effects
         included: of the mirror at hand rather than of the one of the drawing.
+    learned
+        Gives what the data say about the scatter of the random effects; ``None`` for a solver without.
     """
 
     estimate: RegistrationEstimate
     zonal: Callable[[], NDArray[np.float64]]
+    learned: Callable[[], Learned] | None = None
 
 
 def fit_steps(
@@ -145,7 +148,7 @@ def fit_steps(
             weighted = whole.trusting(shares)
             found = yield from solve(descent, weighted, found.alpha, False)
         estimate = _estimate(descent, weighted, found, covariance)
-    return SprintFit(estimate, found.zonal)
+    return SprintFit(estimate, found.zonal, found.learned)
 
 
 def _only_estimate(steps: Callable[P, Procedure[SprintFit]]) -> Callable[P, Procedure[RegistrationEstimate]]:
