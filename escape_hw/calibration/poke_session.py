@@ -15,6 +15,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, Motion, next_frame, reachable
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
 from escape_hw.calibration.mean_focus import MeanFocus
+from escape_hw.calibration.pokes import ALTERNATING, PokeSequence
 from escape_hw.calibration.sensor_kinds import kind_of
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, refined, setup_from_frames
 from escape_hw.errors import Aborted
@@ -77,7 +78,8 @@ class PokeSession:
         frames
             How many.
         amplitude
-            Pokes of each mode are uniform within plus and minus this ``(n_modes,)``.
+            Pokes of each mode are uniform within plus and minus this ``(n_modes,)``, or have the rms of
+            such pokes (``calibration.pokes``).
 
         Returns
         -------
@@ -85,6 +87,8 @@ class PokeSession:
             Whether it was stopped early.
         """
         bench, to_modes = self.bench, np.linalg.pinv(self.m2c)
+        alternating = ALTERNATING if bench.config.calibration.pokes == "shaped" else 0.0
+        pokes = PokeSequence(amplitude, alternating, bench.rng)
         self.planned = frames
         report = Reporter("DO-CRIME", frames)
         try:
@@ -93,7 +97,7 @@ class PokeSession:
             try:
                 for done in range(frames):
                     frame = next_frame(bench)
-                    wanted = self.m2c @ (amplitude * bench.rng.uniform(-1.0, 1.0, amplitude.size))
+                    wanted = self.m2c @ pokes()
                     allowed = reachable(bench.dm, wanted)
                     self.shortened += not np.array_equal(wanted, allowed)
                     # What was really sent, not what was asked for: a shortened poke is still a known poke.

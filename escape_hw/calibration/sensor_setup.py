@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import some_frames
+from escape_hw.calibration.derivatives import modal_matrix
 from escape_hw.calibration.modes import karhunen_loeve, unit_rms, zonal
+from escape_hw.calibration.pokes import equal_snr
 from escape_hw.calibration.sensor_kinds import kind_of
 from escape_hw.errors import CalibrationError, ConfigError
 
@@ -204,7 +207,9 @@ def poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDAr
     """Amplitude of each mode's poke ``(n_modes,)``, rms surface as fraction of full stroke.
 
     Modes that the mirror makes with large commands (those that live at the pupil's rim) are poked
-    less, so that no single mode takes more than ``calibration.poke_command`` of any actuator.
+    less, so that no single mode takes more than ``calibration.poke_command`` of any actuator. With
+    ``calibration.pokes = "equal-snr"`` the modes share the same Strehl budget by what they are seen of
+    (:func:`~.pokes.equal_snr`).
 
     Raises
     ------
@@ -213,4 +218,7 @@ def poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDAr
     """
     if not 0 < poke <= 1:
         raise ConfigError(f"poke is {poke}; it must lie in (0, 1], rms surface as fraction of full stroke")
-    return np.asarray(np.minimum(poke, bench.config.calibration.poke_command / np.abs(m2c).max(axis=0)))
+    most = bench.config.calibration.poke_command / np.abs(m2c).max(axis=0)
+    if bench.config.calibration.pokes == "equal-snr":
+        return equal_snr(modal_matrix(bench.model(), Registration(), m2c), most, poke)
+    return np.asarray(np.minimum(poke, most))

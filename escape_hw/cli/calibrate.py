@@ -43,6 +43,7 @@ def calibrate(
         str | None,
         typer.Option("--estimator", help="What ESCAPE fits: auto, matrix or telemetry (few frames)."),
     ] = None,
+    pokes: options.Pokes = None,
     solver: options.Solver = None,
     modes_choice: options.ModesChoice = None,
     loss: options.Loss = None,
@@ -55,7 +56,9 @@ def calibrate(
 ) -> None:
     """Measure an interaction matrix and, with ESCAPE, the registration behind it."""
     with session("calibrate", json=json, quiet=quiet) as one:
-        choice = options.Choice.of(system, set, seed, mode).fitting(solver, modes_choice, loss)
+        choice = options.Choice.of(system, set, seed, mode).calibrating(
+            pokes=pokes, solver=solver, modes_choice=modes_choice, loss=loss
+        )
         if modes is not None:
             choice = _with_modes(one, choice, modes)
         config = one.configured(choice)
@@ -180,7 +183,9 @@ def sprint(
 ) -> None:
     """Find the registration behind a measured interaction matrix; opens no device."""
     with session("sprint", json=json, quiet=quiet) as one:
-        choice = options.Choice.of(system, set, seed, mode).fitting(solver, modes_choice, loss)
+        choice = options.Choice.of(system, set, seed, mode).calibrating(
+            solver=solver, modes_choice=modes_choice, loss=loss
+        )
         config = one.configured(choice)
         with one.run_folder(config, "sprint", out) as folder:
             _sprint(one, folder, config, im)

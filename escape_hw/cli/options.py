@@ -22,6 +22,9 @@ Set = Annotated[
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")]
 Mode = Annotated[str | None, typer.Option("--mode", metavar="sim|hardware", help="Twins or real devices.")]
 Matrix = Annotated[Path, typer.Option("--im", metavar="FILE", help="Interaction matrix (FITS).")]
+Pokes = Annotated[
+    str | None, typer.Option("--pokes", help="DO-CRIME: white, shaped or equal-snr (default: configured).")
+]
 Solver = Annotated[
     str | None,
     typer.Option(
@@ -51,9 +54,8 @@ class Choice:
         """The same with further overrides, which go last."""
         return replace(self, set=(*self.set, *overrides))
 
-    def fitting(self, solver: str | None, modes_choice: str | None, loss: str | None) -> Choice:
-        """The same with what was asked of SPRINT."""
-        asked = {"solver": solver, "modes_choice": modes_choice, "loss": loss}
+    def calibrating(self, **asked: str | None) -> Choice:
+        """The same with what was asked of the calibration: values by key, ``None`` for as configured."""
         return self.plus(*(f"calibration.{key}={value}" for key, value in asked.items() if value is not None))
 
     @classmethod

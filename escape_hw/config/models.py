@@ -21,6 +21,7 @@ S = TypeVar("S", bound=SensorSection)
 Estimator = Literal["auto", "matrix", "telemetry"]
 #: What SPRINT can fit within ESCAPE.
 ESTIMATORS: tuple[str, ...] = get_args(Estimator)
+Pokes = Literal["white", "shaped", "equal-snr"]
 Solver = Literal["effects", "light", "frozen", "batches", "diagonal"]
 #: How SPRINT solves.
 SOLVERS: tuple[str, ...] = get_args(Solver)
@@ -92,6 +93,11 @@ class CalibrationSection(Section):
         gt=0,
         le=1,
         description="largest command of any actuator in the poke of one mode, fraction of full stroke",
+    )
+    pokes: Pokes = Field(
+        "white",
+        description="DO-CRIME: 'white' pokes, 'shaped' ones that change sign more often than not, or white "
+        "ones that share the same Strehl budget so that modes have 'equal-snr'",
     )
     frames: int = Field(10000, ge=1, le=100_000_000, description="DO-CRIME: number of frames")
     push_pull_poke: float = Field(
