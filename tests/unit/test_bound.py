@@ -1,0 +1,55 @@
+"""The hybrid bound's information against the Jacobian written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from escape_hw.calibration.bound import correlated_information
+from escape_hw.calibration.misfit import normal_equations
+
+N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES = 7, 10, 5, 4, 3
+
+
+@pytest.fixture(scope="module")
+def case():
+    rng = np.random.default_rng(0)
+    n = N_COMMON + N_LINES + 2 * N_ACT + N_SLOPES
+    return {
+        "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
+        "slopes_gain": rng.standard_normal((N_SLOPES, N_ACT)),
+        "slopes_width": rng.standard_normal((N_SLOPES, N_ACT)),
+        "modes": rng.standard_normal((N_ACT, N_MODES)),
+        "model": rng.standard_normal((N_SLOPES, N_MODES)),
+        "residual": rng.standard_normal((N_SLOPES, N_MODES)),
+        "precision": rng.uniform(0.5, 3, n),
+        "offset": np.zeros(n),
+        "sampled": rng.standard_normal((N_SLOPES, N_MODES)),
+        "lines": np.arange(N_SLOPES) % N_LINES,
+    }
+
+
+def jacobian(c):
+    """Derivatives of the matrix by every unknown ``(n_unknowns, n_slopes, n_modes)``."""
+    rows = list(c["common"])
+    rows += [np.where((c["lines"] == k)[:, None], c["sampled"], 0.0) for k in range(N_LINES)]
+    rows += [
+        np.outer(z[:, a], c["modes"][a]) for z in (c["slopes_gain"], c["slopes_width"]) for a in range(N_ACT)
+    ]
+    rows += [np.where((np.arange(N_SLOPES) == s)[:, None], c["model"], 0.0) for s in range(N_SLOPES)]
+    return np.stack(rows)
+
+
+def test_independent_slopes_give_the_solvers_own_system(case):
+    system = normal_equations(**case)
+    found = correlated_information(system, case["precision"], None)
+    np.testing.assert_allclose(found, system.matrix, atol=1e-10)
+
+
+def test_correlated_slopes_count_by_the_inverse_of_their_correlation(case):
+    half = np.random.default_rng(3).standard_normal((N_SLOPES, N_SLOPES))
+    inverse = np.linalg.inv(half @ half.T + np.eye(N_SLOPES))
+    j = jacobian(case)
+    want = np.einsum("psm,st,qtm->pq", j, inverse, j) + np.diag(case["precision"])
+    found = correlated_information(normal_equations(**case), case["precision"], inverse)
+    np.testing.assert_allclose(found, want, atol=1e-10)
