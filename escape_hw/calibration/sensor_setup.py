@@ -14,6 +14,7 @@ from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import some_frames
 from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.mode_shapes import fourier, zernike
 from escape_hw.calibration.modes import karhunen_loeve, unit_rms, zonal
 from escape_hw.calibration.pokes import equal_snr
 from escape_hw.calibration.sensor_kinds import kind_of
@@ -23,6 +24,8 @@ from escape_hw.errors import CalibrationError, ConfigError
 SETUP_FRAMES = 200
 #: Outer scale of the turbulence assumed for the modal basis, in pupil diameters.
 _OUTER_SCALE = 4.0
+#: Bases that need nothing but the influence functions.
+_OF_SURFACES = {"zonal": zonal, "zernike": zernike, "fourier": fourier}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,8 +178,8 @@ def modal_basis(bench: Bench) -> NDArray[np.float64]:
         raise ConfigError(f"the model has {surfaces.shape[0]} actuators, the mirror {bench.dm.info.n_act}")
     works = np.ones(surfaces.shape[0], dtype=bool)
     works[list(bench.dm.limits.disabled)] = False
-    if basis.kind == "zonal":
-        return _spread_over(works, zonal(surfaces[works], pupil, basis.n_modes))
+    if basis.kind in _OF_SURFACES:
+        return _spread_over(works, _OF_SURFACES[basis.kind](surfaces[works], pupil, basis.n_modes))
     if basis.kind == "file":
         # Imported here: astropy takes a second to load, and only this needs it.
         from escape_hw.io.fits import load_matrix

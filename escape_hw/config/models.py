@@ -54,8 +54,9 @@ class SystemSection(Section):
 class BasisSection(Section):
     """Modal basis of the calibration."""
 
-    kind: Literal["kl", "zonal", "file"] = Field(
-        "kl", description="'kl' (Karhunen-Loeve), 'zonal' (single actuators) or 'file'"
+    kind: Literal["kl", "zonal", "zernike", "fourier", "file"] = Field(
+        "kl",
+        description="'kl' (Karhunen-Loeve), 'zonal' (single actuators), 'zernike', 'fourier' or 'file'",
     )
     n_modes: int = Field(ge=1, le=10000, description="number of modes")
     file: str = Field("", description="FITS file of the mode-to-command matrix, for kind = 'file'")

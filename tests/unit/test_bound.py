@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.bound import correlated_information
+from escape_hw.calibration.bound import correlated_information, inverse_correlation
 from escape_hw.calibration.misfit import normal_equations
 
 N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES = 7, 10, 5, 4, 3
@@ -53,3 +53,22 @@ def test_correlated_slopes_count_by_the_inverse_of_their_correlation(case):
     want = np.einsum("psm,st,qtm->pq", j, inverse, j) + np.diag(case["precision"])
     found = correlated_information(normal_equations(**case), case["precision"], inverse)
     np.testing.assert_allclose(found, want, atol=1e-10)
+
+
+@pytest.mark.parametrize("n_rows", [130, 1000])
+def test_an_inverse_from_few_rows_is_that_of_the_truth(n_rows):
+    rng, p = np.random.default_rng(5), 120
+    together = np.linalg.qr(rng.standard_normal((p, 2)))[0]
+    # Two patterns on top of white noise; what they add to the diagonal is spread evenly enough.
+    truth = 0.8 * np.eye(p) + (together * [14.0, 9.0]) @ together.T
+    sample = rng.multivariate_normal(np.zeros(p), truth, n_rows)
+    found = inverse_correlation(sample.T @ sample / n_rows, n_rows)
+    trial = rng.standard_normal((p, 40))
+    want = np.einsum("pk,pk->k", trial, np.linalg.solve(truth, trial))
+    got = np.einsum("pk,pk->k", trial, found @ trial)
+    assert np.mean(got / want) == pytest.approx(1.0, abs=0.06)
+    # Along the patterns little is left of the information.
+    weak = np.einsum("pk,pk->k", together, found @ together)
+    assert (weak < 0.3).all()
+    naive = np.linalg.inv(sample.T @ sample / n_rows)
+    assert np.mean(np.einsum("pk,pk->k", trial, naive @ trial) / want) > 1.1
