@@ -91,8 +91,8 @@ def solved(case: Case, options: dict[str, Any]) -> tuple[NDArray[np.float64], ND
     return found.registration.to_array() - case.planted, found.sigma, seconds
 
 
-def table(system: str, plants: int, frames: int) -> Iterator[str]:
-    """Rows of the table, as soon as they are known."""
+def table(system: str, plants: int, frames: int, only: str = "") -> Iterator[str]:
+    """Rows of the table, as soon as they are known: the default and those whose names hold ``only``."""
     cases = [measure(system, number, frames) for number in range(plants)]
     rng = np.random.default_rng(1)
     worse = [spoiled(case, rng) for case in cases]
@@ -100,6 +100,8 @@ def table(system: str, plants: int, frames: int) -> Iterator[str]:
     solved(cases[0], {})
     usual = 0.0
     for name, options in {**VARIANTS, **SPOILED}.items():
+        if usual and only not in name:
+            continue
         tried = [solved(case, options) for case in (worse if name in SPOILED else cases)]
         errors, sigmas = (np.array([one[k] for one in tried]) for k in (0, 1))
         seconds = float(np.median([one[2] for one in tried]))
@@ -117,10 +119,11 @@ def main() -> None:
     parser.add_argument("--system", default="razor-shwfs")
     parser.add_argument("--plants", type=int, default=8)
     parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument("--only", default="", help="part of the names of the variants to try")
     options = parser.parse_args()
     print("| variant | shift x [%] | shift y [%] | rotation [deg] | radial [%] | tangential [%] | time |")
     print("|---|---|---|---|---|---|---|")
-    for row in table(options.system, options.plants, options.frames):
+    for row in table(options.system, options.plants, options.frames, options.only):
         print(row, flush=True)
 
 

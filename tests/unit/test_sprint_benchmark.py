@@ -99,7 +99,9 @@ def test_far_answers_count_as_found_only_when_right_and_vouched_for(monkeypatch,
             return Answer(Registration(), self.calls % 2 == 0)
 
     monkeypatch.setattr(
-        sprint.Ours, "solver", lambda self, **given: lambda data: Answer(Registration.from_array(data), True)
+        sprint.Ours,
+        "solver",
+        lambda self, how, **given: lambda data: Answer(Registration.from_array(data), True),
     )
     found, wrong = sprint._from_afar(alike, Lost(), "sprint")
     n = len(sprint.PITCHES) * len(sprint.DIRECTIONS)
