@@ -89,6 +89,7 @@ def escape(
             loss=c.loss,
             learning_rate=c.learning_rate,
             covariance=solution.covariance,
+            learn=True,
         )
     except Aborted:
         return replace(measured, partial=True)

@@ -75,6 +75,7 @@ def fit_steps(
     max_iterations: int = 25,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
+    learn: bool = False,
     reach: bool = True,
 ) -> Procedure[SprintFit]:
     """Registration, gain and their standard errors from an interaction matrix.
@@ -110,6 +111,9 @@ def fit_steps(
         learn of it from the scatter between modes, less precisely.
     priors
         Scatter of what the model does not know.
+    learn
+        Whether to take that scatter from the data and to solve once more with it, which is worth while
+        with few frames.
     reach
         Whether to come from afar first, low modes before high ones (:mod:`~.capture`). Without it the
         descent is from ``start`` alone, on all modes at once.
@@ -142,6 +146,9 @@ def fit_steps(
         descent = Descent(matrix, model, columns, solver, learning_rate, max_iterations, priors or Priors())
         weighted = WeightedMatrix.of(matrix, columns)
         found = yield from solve(descent, weighted, begin.to_array(), reach)
+        if learn and found.learned is not None:
+            descent.priors = found.learned().priors
+            found = yield from solve(descent, weighted, found.alpha, False)
         whole = weighted
         for _ in range(ROUNDS if loss == "huber" else 0):
             shares = trust(whole.data - _in_errors(whole, found))
