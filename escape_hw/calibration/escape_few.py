@@ -11,9 +11,10 @@ from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix, some_frames
+from escape_hw.calibration.poke_patterns import random_pattern
 from escape_hw.calibration.poke_session import PokeSession
 from escape_hw.calibration.pseudo_synthetic import synthesise
-from escape_hw.calibration.sensor_setup import SETUP_FRAMES, modal_basis, poke_amplitudes
+from escape_hw.calibration.sensor_setup import SETUP_FRAMES, modal_basis, random_amplitudes
 from escape_hw.calibration.telemetry_sprint import MIN_ROWS, telemetry_sprint, time_line
 from escape_hw.errors import Aborted, TooFewFrames
 
@@ -58,9 +59,9 @@ def escape_from_few(
         raise TooFewFrames(f"{frames} frames are too few for a registration; ask for at least {least} frames")
     poke = c.poke if poke is None else poke
     m2c = modal_basis(bench)
-    amplitude = poke_amplitudes(bench, m2c, poke)
+    amplitude = random_amplitudes(bench, m2c, poke)
     session = PokeSession(bench, m2c, grid, min(SETUP_FRAMES, frames), None, keep=True)
-    if (yield from session.poke(frames, amplitude)):
+    if (yield from session.poke(frames, random_pattern(c.pokes)(amplitude, bench.rng))):
         raise Aborted(f"aborted after {session.taken} of {frames} frames, too few for a registration")
     session.ready()
     record = session.record()

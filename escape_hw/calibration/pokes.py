@@ -1,40 +1,9 @@
-"""Random pokes for DO-CRIME: their spectrum over time, and how the modes share the Strehl budget."""
+"""What random pokes tell: by their spectrum over time, and by how the modes share the Strehl budget."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-
-#: How strongly shaped pokes alternate in sign: minus the correlation of each poke with the one before. More
-#: gains little (:func:`information_gain`) and asks the mirror for ever larger steps.
-ALTERNATING = 0.6
-
-
-class PokeSequence:
-    """Pokes of all modes, frame after frame, independent of each other and of the turbulence.
-
-    Parameters
-    ----------
-    amplitude
-        White pokes are uniform within plus and minus this ``(n_modes,)``; others have the same rms.
-    alternating
-        Minus the correlation of a poke with the one before, in [0, 1); 0: white.
-    rng
-        Where they come from.
-    """
-
-    def __init__(self, amplitude: NDArray[np.float64], alternating: float, rng: np.random.Generator) -> None:
-        self._amplitude, self._alternating, self._rng = amplitude, alternating, rng
-        self._fresh = float(np.sqrt(1 - alternating**2))
-        self._last: NDArray[np.float64] | None = None
-
-    def __call__(self) -> NDArray[np.float64]:
-        """The next poke ``(n_modes,)``."""
-        drawn = self._rng.uniform(-1.0, 1.0, self._amplitude.size)
-        if self._last is not None and self._alternating:
-            drawn = self._fresh * drawn - self._alternating * self._last
-        self._last = drawn
-        return np.asarray(self._amplitude * drawn)
 
 
 def information_gain(
@@ -52,7 +21,7 @@ def information_gain(
     whitener, response
         Weights by lag.
     alternating
-        ``r``, as for :class:`PokeSequence`.
+        ``r``, as for :class:`~.poke_patterns.AlternatingPokes`.
     """
     phasor = np.exp(-1j * np.linspace(0, np.pi, 2049))
     through = np.abs(np.polyval(whitener[::-1], phasor) * np.polyval(response[::-1], phasor)) ** 2

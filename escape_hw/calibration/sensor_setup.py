@@ -129,6 +129,39 @@ def find_sensor(
     return setup_from_frames(bench, (total / frames).astype(np.float32), references)
 
 
+def ready_sensor(
+    bench: Bench, grid: SensorGeometry | None, references: str = "design"
+) -> Procedure[tuple[SensorGeometry, NDArray[np.float32] | None]]:
+    """Flatten the mirror, make the sensor ready, and find its geometry unless it is known.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    grid
+        The geometry, when it is known.
+    references
+        As for :func:`find_sensor`.
+
+    Returns
+    -------
+    grid : SensorGeometry
+    mean_frame : ndarray or None
+        The mean frame it was found on; ``None`` if it was known.
+
+    Raises
+    ------
+    CalibrationError
+        No spots or pupil images where the design says there should be.
+    """
+    bench.dm.flatten()
+    prepare_sensor(bench)
+    if grid is not None:
+        return grid, None
+    setup = yield from find_sensor(bench, references=references)
+    return setup.grid, setup.mean_frame
+
+
 def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.float32]]:
     """Mean dark frame, with the beam stop in; kept as ``bench.dark``.
 
@@ -210,9 +243,7 @@ def poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDAr
     """Amplitude of each mode's poke ``(n_modes,)``, rms surface as fraction of full stroke.
 
     Modes that the mirror makes with large commands (those that live at the pupil's rim) are poked
-    less, so that no single mode takes more than ``calibration.poke_command`` of any actuator. With
-    ``calibration.pokes = "equal-snr"`` the modes share the same Strehl budget by what they are seen of
-    (:func:`~.pokes.equal_snr`).
+    less, so that no single mode takes more than ``calibration.poke_command`` of any actuator.
 
     Raises
     ------
@@ -221,7 +252,21 @@ def poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDAr
     """
     if not 0 < poke <= 1:
         raise ConfigError(f"poke is {poke}; it must lie in (0, 1], rms surface as fraction of full stroke")
-    most = bench.config.calibration.poke_command / np.abs(m2c).max(axis=0)
-    if bench.config.calibration.pokes == "equal-snr":
-        return equal_snr(modal_matrix(bench.model(), Registration(), m2c), most, poke)
-    return np.asarray(np.minimum(poke, most))
+    return np.asarray(np.minimum(poke, _most(bench, m2c)))
+
+
+def random_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDArray[np.float64]:
+    """As :func:`poke_amplitudes`, for random pokes on all modes at once.
+
+    With ``calibration.pokes = "equal-snr"`` the modes share the same Strehl budget by what is seen of
+    them (:func:`~.pokes.equal_snr`).
+    """
+    usual = poke_amplitudes(bench, m2c, poke)
+    if bench.config.calibration.pokes != "equal-snr":
+        return usual
+    return equal_snr(modal_matrix(bench.model(), Registration(), m2c), _most(bench, m2c), poke)
+
+
+def _most(bench: Bench, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Amplitude of each mode at which an actuator takes ``calibration.poke_command``."""
+    return np.asarray(bench.config.calibration.poke_command / np.abs(m2c).max(axis=0))

@@ -20,7 +20,8 @@ from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.calibration.acquire import measured_matrix
 from escape_hw.calibration.bound import registration_bound
 from escape_hw.calibration.docrime import docrime_run
-from escape_hw.calibration.docrime_estimator import DocrimeEstimator, DocrimeSolution
+from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.docrime_solution import DocrimeSolution
 from escape_hw.calibration.escape import escape
 from escape_hw.calibration.poke_session import Record
 from escape_hw.calibration.response import filtered
@@ -148,7 +149,7 @@ def _bounds(
     if fit.learned is None:
         raise RuntimeError("the solver fitted no random effects")
     data = time_line(*record, before=solution.whitener.size + lags)
-    pokes = filtered(data, solution.whitener, lags).pokes_through(solution.response.weights).astype(float)
+    pokes = filtered(data, solution.whitener, lags).driven(solution.response.weights).astype(float)
     noise = solution.variance if solution.covariance is None else solution.covariance
     rows = len(pokes) - matrix.n_modes
     out = np.empty((2, len(frames), 5))

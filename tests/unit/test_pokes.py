@@ -5,19 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.pokes import ALTERNATING, PokeSequence, equal_snr, information_gain
+from escape_hw.calibration.poke_patterns import ALTERNATING, RandomPokes, random_pattern
+from escape_hw.calibration.pokes import equal_snr, information_gain
 
 AMPLITUDE = np.array([0.02, 0.005, 0.01])
 
 
-def drawn(alternating: float, n: int = 20_000) -> np.ndarray:
-    pokes = PokeSequence(AMPLITUDE, alternating, np.random.default_rng(4))
+def drawn(kind: str, n: int = 20_000) -> np.ndarray:
+    pokes = random_pattern(kind)(AMPLITUDE, np.random.default_rng(4))
     return np.array([pokes() for _ in range(n)])
 
 
-@pytest.mark.parametrize("alternating", [0.0, ALTERNATING])
-def test_they_have_the_rms_asked_for_and_the_modes_are_independent(alternating):
-    pokes = drawn(alternating)
+@pytest.mark.parametrize("kind", ["white", "shaped"])
+def test_they_have_the_rms_asked_for_and_the_modes_are_independent(kind):
+    pokes = drawn(kind)
     np.testing.assert_allclose(pokes.std(axis=0), AMPLITUDE / np.sqrt(3), rtol=0.03)
     correlation = np.corrcoef(pokes.T) - np.eye(3)
     assert np.abs(correlation).max() < 5 / np.sqrt(len(pokes)) * 2
@@ -26,11 +27,12 @@ def test_they_have_the_rms_asked_for_and_the_modes_are_independent(alternating):
 def test_white_pokes_are_what_they_were():
     rng = np.random.default_rng(4)
     want = AMPLITUDE * rng.uniform(-1.0, 1.0, (50, 3))
-    np.testing.assert_array_equal(drawn(0.0, 50), want)
+    np.testing.assert_array_equal(drawn("white", 50), want)
+    assert random_pattern("equal-snr") is RandomPokes
 
 
 def test_shaped_pokes_alternate():
-    pokes = drawn(ALTERNATING) / AMPLITUDE
+    pokes = drawn("shaped") / AMPLITUDE
     by_lag = [np.mean(pokes[k:] * pokes[: len(pokes) - k]) / np.mean(pokes**2) for k in (1, 2)]
     assert by_lag == pytest.approx([-ALTERNATING, ALTERNATING**2], abs=0.03)
 
@@ -42,8 +44,8 @@ def test_information_gain_is_the_power_of_the_whitened_pokes():
         seen = np.apply_along_axis(np.convolve, 0, pokes / AMPLITUDE, np.convolve(whitener, response))
         return float(np.square(seen).mean())
 
-    found = power(drawn(0.5)) / power(drawn(0.0))
-    assert information_gain(whitener, response, 0.5) == pytest.approx(found, rel=0.05)
+    found = power(drawn("shaped")) / power(drawn("white"))
+    assert information_gain(whitener, response, ALTERNATING) == pytest.approx(found, rel=0.05)
     assert information_gain(whitener, response, 0.0) == 1.0
     # Without turbulence to whiten, a spectrum only loses what the response swallows.
     assert information_gain(np.ones(1), response, 0.5) < 1
