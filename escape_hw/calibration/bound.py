@@ -78,15 +78,14 @@ def registration_bound(
     columns = independent_columns(truth, gram, variance)
     problem = Problem(WeightedMatrix.of(columns, np.arange(columns.n_modes)), model, priors)
     system = problem.linearise(problem.start(registration))
-    inverse = None
     if covariance.ndim == 2:
         inverse = inverse_correlation(covariance / np.sqrt(np.outer(variance, variance)), rows)
-    whole = correlated_information(system, problem.precision, inverse)
-    known = np.linalg.inv(whole[:6, :6])
-    return Bound(
-        np.sqrt(np.diag(known)[1:6]),
-        np.sqrt(np.diag(np.linalg.inv(whole))[1:6] + np.square(FLOOR)),
-    )
+        whole = correlated_information(system, problem.precision, inverse)
+        hybrid = np.linalg.inv(whole)
+    else:
+        whole, hybrid = system.inner, np.linalg.inv(system.information())
+    exact = np.linalg.inv(whole[:6, :6])
+    return Bound(np.sqrt(np.diag(exact)[1:6]), np.sqrt(np.diag(hybrid)[1:6] + np.square(FLOOR)))
 
 
 def inverse_correlation(correlation: NDArray[np.float64], rows: int) -> NDArray[np.float64]:
@@ -118,7 +117,7 @@ def inverse_correlation(correlation: NDArray[np.float64], rows: int) -> NDArray[
 
 
 def correlated_information(
-    system: NormalEquations, precision: NDArray[np.float64], inverse: NDArray[np.float64] | None
+    system: NormalEquations, precision: NDArray[np.float64], inverse: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Information on all unknowns where neighbouring slopes err together.
 
@@ -132,8 +131,7 @@ def correlated_information(
     precision
         Prior precision of every unknown.
     inverse
-        Inverse of the correlation matrix of the slopes' noise ``(n_slopes, n_slopes)``; ``None`` where they
-        err independently.
+        Inverse of the correlation matrix of the slopes' noise ``(n_slopes, n_slopes)``.
 
     Returns
     -------
@@ -141,8 +139,7 @@ def correlated_information(
         In the order of the unknowns.
     """
     common, sampled, model, modes = system.common, system.sampled, system.model, system.modes
-    metric = np.eye(len(model)) if inverse is None else inverse
-    k = len(common)
+    metric, k = inverse, len(common)
     member = (system.lines[:, None] == np.arange(system.lines.max() + 1)).astype(float)
     zonal = np.concatenate([system.slopes_gain, system.slopes_width], axis=1)
     twice = np.concatenate([modes, modes])

@@ -5,10 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.bound import correlated_information, inverse_correlation
-from escape_hw.calibration.misfit import normal_equations
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.bound import correlated_information, inverse_correlation, registration_bound
+from escape_hw.calibration.misfit import Priors, normal_equations
+from escape_hw.config.load import load_system
+from escape_sim.model import make_model, nominal_grid
 
 N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES = 7, 10, 5, 4, 3
+
+
+#: 12 x 12 lenslets and 37 actuators.
+SMALL = (
+    "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
+    "devices.dm.pitches_across_pupil=5.0", "basis.n_modes=8", "loop.dropped_modes=0",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +53,7 @@ def jacobian(c):
 
 def test_independent_slopes_give_the_solvers_own_system(case):
     system = normal_equations(**case)
-    found = correlated_information(system, case["precision"], None)
+    found = correlated_information(system, case["precision"], np.eye(N_SLOPES))
     np.testing.assert_allclose(found, system.matrix, atol=1e-10)
 
 
@@ -72,3 +83,27 @@ def test_an_inverse_from_few_rows_is_that_of_the_truth(n_rows):
     assert (weak < 0.3).all()
     naive = np.linalg.inv(sample.T @ sample / n_rows)
     assert np.mean(np.einsum("pk,pk->k", trial, naive @ trial) / want) > 1.1
+
+
+def test_the_bound_of_uncorrelated_slopes_is_the_same_by_either_way():
+    config = load_system("razor-shwfs", overrides=SMALL)
+    model, grid = make_model(config, None), nominal_grid(config)
+    rng = np.random.default_rng(7)
+    m2c = np.linalg.qr(rng.standard_normal((model.n_act, 8)))[0]
+    matrix = InteractionMatrix(
+        (0.9 * model.zonal_matrix(Registration()) @ m2c).astype(np.float32),
+        np.zeros((grid.n_slopes, 8), np.float32), m2c, grid.valid, "razor-shwfs", "docrime", True,
+    )  # fmt: skip
+    pokes = 0.01 * rng.standard_normal((6, 8))
+    variance = rng.uniform(0.005, 0.01, grid.n_slopes)
+    simple, full = (
+        registration_bound(matrix, pokes.T @ pokes, noise, 10**9, model, Registration(), Priors())
+        for noise in (variance, np.diag(variance))
+    )
+    np.testing.assert_allclose(simple.exact, full.exact, rtol=1e-3)
+    np.testing.assert_allclose(simple.hybrid, full.hybrid, rtol=1e-3)
+    # What is not known costs something, and twice the frames halve the variance of what is.
+    assert (simple.hybrid > simple.exact).all()
+    twice = registration_bound(matrix, 2 * pokes.T @ pokes, variance, 10**9, model, Registration(), Priors())
+    np.testing.assert_allclose(simple.exact / twice.exact, np.sqrt(2), rtol=1e-6)
+    assert (simple.hybrid / twice.hybrid < np.sqrt(2)).all()
