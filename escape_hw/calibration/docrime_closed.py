@@ -26,8 +26,8 @@ from escape_hw.calibration.docrime import (
 )
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
 from escape_hw.calibration.loop_run import CLOSING_S, LoopRecord, RunningLoop
-from escape_hw.calibration.poke_patterns import Pattern, RandomPokes
-from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepare_sensor
+from escape_hw.calibration.poke_patterns import Pattern, RandomPokes, random_pattern
+from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, random_amplitudes
 from escape_hw.calibration.stopping import Judge, Looks, Target
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
 from escape_hw.io.state_file import RunState
@@ -169,9 +169,10 @@ def docrime_closed_run(
     c, m2c, grid = bench.config.calibration, closing.matrix.m2c, closing.grid
     n_frames = c.frames if frames is None else some_frames(frames)
     poke = c.poke if poke is None else poke
+    pattern = random_pattern(c.pokes) if pattern is RandomPokes else pattern
     if c.whiten_order == 0:
         raise ConfigError("calibration.whiten_order is 0; in closed loop the turbulence must be whitened")
-    amplitude = poke_amplitudes(bench, m2c, poke)
+    amplitude = random_amplitudes(bench, m2c, poke)
     require_frames(c, n_frames, m2c.shape[1])
     estimator = DocrimeEstimator(
         grid.n_slopes, m2c.shape[1], order=c.whiten_order, lags=c.lags, closed=True,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,20 @@ from escape_hw.calibration.weighted import WeightedMatrix
 _PEDESTAL = 1.7
 #: Places of the common parameters among the unknowns; the registration has places 1 to 5.
 GAIN, WIDTH, SHAPE = 0, 6, 7
+
+
+#: Random effects of which there are many of a kind, in the order of the unknowns ...
+_EFFECTS = ("sampling", "actuator_gain", "actuator_width", "slope_gain")
+#: ... and the share of its usual scatter below which none is taken to fall.
+_LEAST_SCATTER = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """Scatter of the random effects as the data have it, and how many unknowns the data decided."""
+
+    priors: Priors
+    decided: float
 
 
 @dataclass(slots=True, eq=False)
@@ -76,7 +90,8 @@ class Problem:
         priors: Priors,
         bends: Sequence[NDArray[np.float64]] = (),
     ) -> None:
-        self.weighted, self.bends, self.mean_width = weighted, tuple(bends), priors.mean_width
+        self.weighted, self.bends, self.priors = weighted, tuple(bends), priors
+        self.mean_width = priors.mean_width
         self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
         rows, cols = np.nonzero(weighted.valid)
@@ -177,6 +192,42 @@ class Problem:
             sampled,
             self.lines,
         )
+
+    def zonal(self, state: State) -> NDArray[np.float64]:
+        """Slopes per unit command ``(n_slopes, n_act)`` at a state, random effects included."""
+        here, w = Registration.from_array(state.alpha), 1.0 + state.width
+        zonal, moved = zonal_jacobian(self.model, here, w)
+        shaped = zonal + state.actuator_width * moved[5] * w
+        shaped += state.shape * (self.model.zonal_matrix(here, w * _PEDESTAL) - zonal)
+        for share, variant in zip(state.variant, self.variants, strict=True):
+            shaped += share * (variant.zonal_matrix(here, w) - zonal)
+        half = len(zonal) // 2
+        shaped += state.sampling[self.lines, None] * np.concatenate([moved[0, :half], moved[1, half:]])
+        return np.asarray(state.gain * (1 + state.slope_gain)[:, None] * shaped * (1 + state.actuator_gain))
+
+    def learned(self, state: State, system: NormalEquations) -> Learned:
+        """What a solution says about the scatter of the random effects.
+
+        One step of expectation and maximisation (Dempster, Laird & Rubin 1977): the scatter that makes an
+        effect's values most likely is that of their estimates and of what is left uncertain of them. Where
+        the data say nothing, that is the prior; an effect that is not there fades from step to step.
+
+        Parameters
+        ----------
+        state, system
+            Solution, and the problem about it.
+        """
+        variance = system.posterior_variance()
+        head = SHAPE + 1 + self.n_variants
+        counts = (self.n_lines, self.model.n_act, self.model.n_act, self.weighted.data.shape[0])
+        parts = np.split(variance[head:], np.cumsum(counts)[:-1])
+        scatter, usual = {}, Priors()
+        for name, part in zip(_EFFECTS, parts, strict=True):
+            least = _LEAST_SCATTER * getattr(usual, name)
+            found = float(np.mean(np.square(getattr(state, name)) + part))
+            scatter[name] = max(float(np.sqrt(found)), least)
+        decided = float(np.sum(1 - variance * self.precision))
+        return Learned(replace(self.priors, **scatter), decided)
 
     def move(self, state: State, step: NDArray[np.floating]) -> State:
         """The state after a step, in the order of the unknowns."""

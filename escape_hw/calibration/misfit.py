@@ -119,6 +119,13 @@ class NormalEquations:
         believed = answers.T @ (precision[:n, None] * answers) + by_slope.T @ (precision[n:, None] * by_slope)
         return np.asarray(answers[:k] - believed)
 
+    def posterior_variance(self) -> NDArray[np.float64]:
+        """Variance of every unknown given the data and the priors ``(n,)``, in the order of the unknowns."""
+        inverse = np.linalg.inv(self.whole)
+        coupled = self.across / self.diagonal[:, None]
+        of_slopes = 1 / self.diagonal + np.einsum("sp,sp->s", coupled @ inverse, coupled)
+        return np.concatenate([np.diag(inverse), of_slopes])
+
     def efficient(self) -> NDArray[np.float64]:
         """Derivatives by the common parameters, less what the random effects can imitate.
 

@@ -115,6 +115,10 @@ def calibrate(
         str | None,
         typer.Option("--estimator", help="What ESCAPE fits: auto, matrix or telemetry (few frames)."),
     ] = None,
+    pokes: options.Pokes = None,
+    solver: options.Solver = None,
+    modes_choice: options.ModesChoice = None,
+    loss: options.Loss = None,
     resume: Annotated[
         Path | None,
         typer.Option("--resume", metavar="RUN", help="Go on with a run that was broken off (its folder)."),
@@ -135,7 +139,9 @@ def calibrate(
             "closed_loop": None if closed_loop is None else str(closed_loop.absolute()),
         }  # fmt: skip
         request = _request(asked, resume).checked()
-        choice = options.Choice.of(_system(system, resume), set, seed, mode)
+        choice = options.Choice.of(_system(system, resume), set, seed, mode).calibrating(
+            pokes=pokes, solver=solver, modes_choice=modes_choice, loss=loss
+        )
         if modes is not None:
             choice = _with_modes(one, choice, modes)
         config = one.configured(choice)
@@ -274,20 +280,23 @@ def sprint(
     set: options.Set = None,
     seed: options.Seed = None,
     mode: options.Mode = None,
-    light: Annotated[
-        bool, typer.Option("--light", help="Gain and registration only; quick, for a mirror like its model.")
-    ] = False,
+    solver: options.Solver = None,
+    modes_choice: options.ModesChoice = None,
+    loss: options.Loss = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Find the registration behind a measured interaction matrix; opens no device."""
     with session("sprint", json=json, quiet=quiet) as one:
-        config = one.configured(options.Choice.of(system, set, seed, mode))
+        choice = options.Choice.of(system, set, seed, mode).calibrating(
+            solver=solver, modes_choice=modes_choice, loss=loss
+        )
+        config = one.configured(choice)
         with one.run_folder(config, "sprint", out) as folder:
-            _sprint(one, folder, config, im, light)
+            _sprint(one, folder, config, im)
 
 
-def _sprint(one: Session, folder: RunFolder, config: Any, im: Path, light: bool) -> None:
+def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
     from dataclasses import replace
 
     from escape_hw.calibration.sprint import sprint
@@ -314,8 +323,10 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path, light: bool)
         measured,
         model,
         modes=min(settings.sprint_modes, measured.n_modes),
+        choice=settings.modes_choice,
+        solver=settings.solver,
+        loss=settings.loss,
         learning_rate=settings.learning_rate,
-        misfit=not light,
     )
     result = replace(product.result, matrix=measured, measured=None, registration=estimate)
     origin = replace(config_record(config), parents={im.name: product.sha256})

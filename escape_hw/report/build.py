@@ -127,6 +127,7 @@ def _registration(run: RunContent) -> str:
                 )
             )
         parts.append(html.notes(list(estimate.warnings), "bad"))
+        parts.append(html.notes(list(estimate.notes)))
     return html.section("Registration", *parts)
 
 

@@ -191,7 +191,15 @@ class System(Bench):
 
         settings = self.config.calibration
         modes = min(settings.sprint_modes, matrix.n_modes)
-        return sprint(matrix, self.model(grid), modes=modes, learning_rate=settings.learning_rate)
+        return sprint(
+            matrix,
+            self.model(grid),
+            modes=modes,
+            choice=settings.modes_choice,
+            solver=settings.solver,
+            loss=settings.loss,
+            learning_rate=settings.learning_rate,
+        )
 
     def take_model_psf(self, *, frames: int = 20, progress: bool = False) -> NDArray[np.float32]:
         """The PSF of the flat mirror without turbulence, which Strehl ratios are measured against.

@@ -32,7 +32,7 @@ def plant(system: str, number: int, frames: Any, overrides: Any) -> PlantErrors:
         time.sleep(0.1)
     (Path(overrides[0]) / str(number)).touch()
     small = np.full((len(campaign.ESTIMATORS), len(frames), 5), 0.001)
-    return PlantErrors(small, small, small[0, 0])
+    return PlantErrors(small, small, small[0], small[0])
 
 
 def fails(*_: Any) -> PlantErrors:
