@@ -8,7 +8,24 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli import calibrate, emulate, gains, loop, modulator, perf, products, reproduce, systems
+from escape_hw.cli import (
+    asm,
+    calibrate,
+    camera,
+    discover,
+    dm,
+    doctor,
+    emulate,
+    gains,
+    loop,
+    modulator,
+    perf,
+    products,
+    rehearse,
+    reproduce,
+    systems,
+    udev,
+)
 
 app = typer.Typer(
     name="escape",
@@ -31,8 +48,15 @@ app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)
 app.command("perf")(perf.perf)
+app.add_typer(dm.app, name="dm")
+app.add_typer(camera.app, name="camera")
 app.add_typer(modulator.app, name="modulator")
+app.add_typer(asm.app, name="asm")
+app.command("doctor")(doctor.doctor)
+app.command("discover")(discover.discover)
+app.add_typer(udev.app, name="udev")
 app.command("emulate")(emulate.emulate)
+app.command("rehearse")(rehearse.rehearse)
 
 
 def _version(wanted: bool) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from escape_hw.cli import options
+from escape_hw.cli.hands import opened
 from escape_hw.cli.session import Session, session
 
 if TYPE_CHECKING:
@@ -52,7 +51,7 @@ def start(
         lambdas = _configured_radius(config) if radius is None else radius
         want = Modulation(lambdas * section.rad_per_lambda_d, frequency or section.frequency_hz)
         _warn(one, config, "servos on, auto-zero where needed, centre, then the circle")
-        with _open(one, device):
+        with opened(one, device):
             foreseen = device.check(want)
             one.tell(f"asked for {_words(want, section)}; it does {_words(foreseen, section)}")
             device.modulate(want)
@@ -79,7 +78,7 @@ def stop(
     with session("modulator stop", json=json) as one:
         config, section, device = _device(one, options.Choice.of(system, set, seed, mode))
         _warn(one, config, "centre, servos off")
-        with _open(one, device):
+        with opened(one, device):
             device.park()
             status = device.status()
         one.show(*_lines(status, section), "left parked")
@@ -120,20 +119,6 @@ def _device(one: Session, choice: options.Choice) -> tuple[SystemConfig, Modulat
     if section is None:
         raise ConfigError(f"system '{config.system.name}' has no modulator, [devices.modulator]")
     return config, section, build_device("modulator", config, TipTiltModulator)  # type: ignore[type-abstract]
-
-
-@contextmanager
-def _open(one: Session, device: TipTiltModulator) -> Iterator[None]:
-    """The device, open; parked and closed at the end unless it was released."""
-    one.was_opened = True
-    try:
-        with device:
-            try:
-                yield
-            finally:
-                one.interrupts.begin_closing()
-    finally:
-        one.interrupts.end_closing()
 
 
 def _warn(one: Session, config: SystemConfig, what: str) -> None:

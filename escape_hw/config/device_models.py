@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from escape_hw.api.frames import CameraSettings, Region
+from escape_hw.api.mirror import DMInfo
 from escape_hw.config import layouts
 from escape_hw.config.modulator_models import StageConfig, WireConfig
 from escape_hw.config.section import Breach, Listed, Section, enforce
@@ -97,6 +98,23 @@ class MirrorConfig(DeviceConfig):
     def positions(self) -> NDArray[np.float64]:
         """Actuator positions ``(n_act, 2)`` as (x, y) from the mirror's centre, in pitches."""
         return layouts.positions(self.layout)
+
+    def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
+        """Identity and nominal geometry, as a driver or twin of this mirror tells them.
+
+        Parameters
+        ----------
+        model
+            What the device is.
+        simulated
+            It is a twin.
+        serial
+            As the device says; by default as configured.
+        """
+        places = self.positions() * self.pitch_m
+        return DMInfo(
+            model, serial or self.serial, self.n_act, self.actuator_map(), places, self.stroke_m, simulated
+        )
 
     @model_validator(mode="after")
     def _rules(self) -> Self:

@@ -9,6 +9,7 @@ from typing import Any, cast
 from escape_hw.api.device import Device
 from escape_hw.api.emulator import EmulatorFactory
 from escape_hw.api.model import SyntheticModel
+from escape_hw.api.rehearsal import RehearsalFactory
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.config.models import SystemConfig
 from escape_hw.config.outline import nearest
@@ -17,7 +18,13 @@ from escape_hw.errors import ConfigError
 DEVICES = "escape.devices"
 MODELS = "escape.models"
 EMULATORS = "escape.emulators"
-_KINDS = {DEVICES: "device driver", MODELS: "synthetic model", EMULATORS: "emulator"}
+REHEARSALS = "escape.rehearsals"
+_KINDS = {
+    DEVICES: "device driver",
+    MODELS: "synthetic model",
+    EMULATORS: "emulator",
+    REHEARSALS: "rehearsal",
+}
 #: What the name of every twin begins with; other drivers drive real hardware.
 TWIN = "sim-"
 
@@ -97,6 +104,17 @@ def emulator_factory(name: str) -> EmulatorFactory:
         Unknown name (with the nearest one), or its package is not completely installed.
     """
     return cast(EmulatorFactory, _load(EMULATORS, name))
+
+
+def rehearsal_factory() -> RehearsalFactory:
+    """The factory of the simulated bench behind real drivers.
+
+    Raises
+    ------
+    ConfigError
+        The package that holds it is not completely installed.
+    """
+    return cast(RehearsalFactory, _load(REHEARSALS, "bench"))
 
 
 def _load(group: str, name: str, hardware: bool = False) -> Any:

@@ -106,6 +106,21 @@ class SimBench:
                 # The wall clock went on while nobody looked (set-up, a long sum): that is not made up for.
                 self._wall_start -= wait
 
+    # ------------------------------------------------------------------ mirror
+    def drive(self, shape: NDArray[np.float64]) -> None:
+        """Send the actuators a shape ``(n_act,)``, which arrives after the twin's latency and jitter."""
+        twin = self.config.twin
+        jitter = twin.latency_jitter_s * abs(self.latency_rng.standard_normal())
+        self.dynamics.command(self.now_s + twin.latency_s + jitter, shape)
+
+    def place(self, shape: NDArray[np.float64]) -> None:
+        """Have the actuators take a shape ``(n_act,)`` from now on."""
+        self.dynamics.command(self.now_s, shape)
+
+    def positions(self) -> NDArray[np.float64]:
+        """Where the actuators are now ``(n_act,)``, fractions of full stroke."""
+        return self.dynamics.at(self.now_s)
+
     # ------------------------------------------------------------------ beam
     def optical_path(self, start_s: float, end_s: float) -> NDArray[np.float32]:
         """Mean optical path ``(n, n)`` in metres over an exposure, common to both cameras."""

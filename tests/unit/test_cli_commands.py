@@ -25,6 +25,7 @@ def test_help_is_quick_and_light():
     assert done.returncode == 0, done.stderr
     for command in (
         "systems", "config", "calibrate", "sprint", "loop", "reproduce", "show", "compare", "report", "perf",
+        "dm", "camera", "asm", "doctor", "discover", "udev", "emulate",
     ):  # fmt: skip
         assert command in done.stdout
 
