@@ -40,6 +40,8 @@ def start_up(
     zero = stage.auto_zero == "always" or (stage.auto_zero == "needed" and not all(controller.zeroed()))
     if zero or not all(controller.servos()):
         controller.set_servo(False)
+        if not zero and not all(controller.zeroed()):
+            log.warning("%s: servos on without auto-zero, as configured: places may be off", name)
         if zero:
             _auto_zero(name, controller, stage, sleep)
         controller.set_volts(0.0)

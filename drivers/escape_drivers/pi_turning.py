@@ -190,6 +190,13 @@ class Turning:
         rows = self._stage.corrections if self._stage.correct != "none" else ()
         frequency = turn.frequency_hz(self._travel.servo_s)
         near = [row for row in rows if abs(row[0] / frequency - 1) < 0.005]
+        if not near and self._stage.correct == "table":
+            there = ", ".join(f"{row[0]:g}" for row in rows)
+            raise SettingRejected(
+                self._name,
+                f"frequency_hz is {frequency:.6g}, and devices.modulator.stage.corrections has rows "
+                f"for {there} Hz only; 'recorder' measures others",
+            )
         return pi_circle.from_words(near[0]) if near else (1 + 0j, 1 + 0j)
 
     def _measurable(self, modulation: Modulation) -> bool:

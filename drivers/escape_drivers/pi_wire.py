@@ -41,6 +41,11 @@ def make_transport(section: ModulatorConfig, config: SystemConfig, shared: dict[
         if not host or not port.isdigit():
             raise ConfigError(f"{ENVIRONMENT}={address}: write HOST:PORT, or unset it")
         return TcpTransport(host, int(port), wire.connect_s, wire.timeout_s)
+    if section.options and wire.kind != "emulator":
+        raise ConfigError(
+            f"devices.modulator.options: {', '.join(section.options)}: read with wire.kind = "
+            "'emulator' only; remove"
+        )
     if wire.kind == "tcp":
         return TcpTransport(wire.host, wire.port, wire.connect_s, wire.timeout_s)
     if wire.kind == "serial":

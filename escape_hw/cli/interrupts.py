@@ -7,9 +7,10 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from escape_hw.api.procedure import Flag
+if TYPE_CHECKING:
+    from escape_hw.api.procedure import Flag
 
 
 class Interrupts:
@@ -27,6 +28,9 @@ class Interrupts:
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
+        # Imported here: it brings numpy along, which no help text needs.
+        from escape_hw.api.procedure import Flag
+
         self.abort = Flag()
         self._tell = tell
         self._in_procedure = False

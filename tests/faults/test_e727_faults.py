@@ -15,8 +15,9 @@ from escape_sim.emulators.faults import KINDS, Fault
 CIRCLE = Modulation(1.41e-4, 303.03)
 #: What a message tells the operator to do.
 WAY_OUT = re.compile(r"open again|again|see |is the|start|park")
-#: Generous: a call ends within three time-outs for each of the two things that it may have to give up.
-LONGEST_S = 60 * TIMEOUT_S
+#: A call ends within three time-outs for each of the two things that it may have to give up, a fifth of a
+#: second; and what a busy machine makes of it.
+LONGEST_S = 180 * TIMEOUT_S
 
 
 def session(peers: Peers) -> list[str]:

@@ -133,6 +133,29 @@ def test_slow_circles_are_drawn_by_the_controller(emulator):
     assert emulator.complaints == ()
 
 
+def test_a_table_of_corrections_is_used_and_has_to_fit(emulator):
+    keys = (
+        'devices.modulator.stage.correct="table"',
+        "devices.modulator.stage.corrections=[[303.0,0.5,0.25,0.0,90.0]]",
+    )
+    with driver(emulator, *keys) as stage:
+        with pytest.raises(SettingRejected, match=r"frequency_hz is 500, .* rows for 303 Hz only"):
+            stage.check(Modulation(100 * URAD, 500.0))
+        stage.modulate(Modulation(100 * URAD, 303.03))
+        angle = 2 * np.pi * np.arange(66) / 66
+        # Half the amplitude takes twice the drive; a lag of a quarter turn takes a quarter turn of lead.
+        assert emulator.controller.waves.tables[1] == pytest.approx(1000 + 200 * np.cos(angle))
+        assert emulator.controller.waves.tables[2] == pytest.approx(1000 + 400 * np.cos(angle))
+        assert "WGR" not in emulator.controller.seen
+
+
+def test_auto_zero_may_be_forbidden(emulator, caplog):
+    with driver(emulator, 'devices.modulator.stage.auto_zero="never"'):
+        assert "servos on without auto-zero" in caplog.text
+        assert "ATZ 1 NaN" not in emulator.controller.seen
+    assert all("before auto-zero" in complaint for complaint in emulator.complaints)
+
+
 def test_axes_may_be_crossed_reversed_and_weak(emulator):
     keys = ('devices.modulator.stage.axes=["2","1"]', "devices.modulator.stage.axis_gain=[-1.0,0.5]")
     with driver(emulator, *keys, 'devices.modulator.stage.correct="none"') as stage:

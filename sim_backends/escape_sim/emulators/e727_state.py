@@ -147,7 +147,9 @@ class State:
     def position(self, name: str) -> float:
         """What the axis' sensor says now."""
         self.stage.advance()
-        offset = 0.0 if self.axes[name].zeroed else UNZEROED
+        # A closed loop makes right what its sensor says, however far that is off.
+        right = self.axes[name].zeroed or self.axes[name].servo
+        offset = 0.0 if right else UNZEROED
         return self.stage.axes[name].position + offset
 
     def target(self, name: str) -> float:
