@@ -7,13 +7,14 @@ import os
 from collections.abc import Callable
 from ctypes import c_void_p
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from escape_drivers.alpao_library import AlpaoLibrary, version_text
-from escape_drivers.options import read_options, require_serial
+from escape_drivers.options import read_options, require_between, require_serial
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.errors import CommandRejected, DeviceError
 
@@ -81,7 +82,9 @@ def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> A
     """
     section = config.devices.dm
     require_serial(name, section)
-    return AlpaoMirror(name, section, read_options(AlpaoOptions, name, section))
+    options = read_options(AlpaoOptions, name, section)
+    require_between(name, options, {"ack_timeout_ms": (0, 60_000)})
+    return AlpaoMirror(name, section, options)
 
 
 class AlpaoMirror(DeformableMirror):
@@ -105,7 +108,7 @@ class AlpaoMirror(DeformableMirror):
         self._pointer = c_void_p(self._buffer.ctypes.data)
         self._library: AlpaoLibrary | None = None
         self._handle: c_void_p | None = None
-        self._transfer: Callable[[c_void_p | None, c_void_p], int] = _not_connected
+        self._transfer: Callable[[], int] = _not_connected
         self._playing = False
         self._info = self._identity("ALPAO mirror", False)
 
@@ -205,7 +208,10 @@ class AlpaoMirror(DeformableMirror):
         log.info("%s: SDK %s, mirror %s", self.name, version, self._section.serial)
         for name, value in self._options.settings():
             library.set(handle, name, value)
-        self._playing, self._transfer = False, library.c.asdkSend
+        self._playing = False
+        # A function object of its own without prototype: both arguments are C pointers for good already,
+        # and checking them at every call costs as much as the call.
+        self._transfer = partial(library.c["asdkSend"], handle, self._pointer)
         self._info = self._identity(f"ALPAO mirror, SDK {version}", library.stand_in)
 
     def _close(self) -> None:
@@ -232,7 +238,7 @@ class AlpaoMirror(DeformableMirror):
         if self._playing:
             self._stop_playing()
         self._buffer[:] = command
-        if self._transfer(self._handle, self._pointer) != 0:
+        if self._transfer() != 0:
             raise self._connected()[0].failure("asdkSend")
 
     def _stop_playing(self) -> None:
@@ -271,6 +277,6 @@ class AlpaoMirror(DeformableMirror):
         return self._section.info(name, simulated=stand_in)
 
 
-def _not_connected(handle: c_void_p | None, pointer: c_void_p) -> int:
+def _not_connected() -> int:
     """Take the place of the transfer while there is none."""
     raise RuntimeError("a command passed the guard of a mirror that is not connected")

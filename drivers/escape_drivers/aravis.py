@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from escape_drivers.aravis_library import AravisLibrary, Received
 from escape_drivers.camera_limits import CameraLimits, Range
-from escape_drivers.options import read_options, require_serial
+from escape_drivers.options import camera_section, read_options, require_between, require_serial
 from escape_drivers.waiting_camera import WaitingCamera
 from escape_hw.api.frames import CameraSettings, Frame, Region
-from escape_hw.errors import ConfigError, DeviceError, DeviceLost, NotOpen
+from escape_hw.errors import DeviceError, DeviceLost, NotOpen
 
 if TYPE_CHECKING:
     from escape_hw.config.device_models import CameraConfig
@@ -70,13 +70,13 @@ def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> A
     Raises
     ------
     ConfigError
-        No such device section, no serial number, or an option that this driver does not know.
+        No such camera, no serial number, or an option that this driver does not know.
     """
-    section: CameraConfig | None = config.devices.wfs if name == "wfs" else config.devices.science
-    if section is None:
-        raise ConfigError(f"devices.{name}: the system has no such section")
+    section = camera_section(name, config)
     require_serial(name, section)
-    return AravisCamera(name, section, read_options(AravisOptions, name, section))
+    options = read_options(AravisOptions, name, section)
+    require_between(name, options, {"shift": (0, 8), "buffers": (2, 64)})
+    return AravisCamera(name, section, options)
 
 
 class AravisCamera(WaitingCamera):

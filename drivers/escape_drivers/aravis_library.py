@@ -147,8 +147,7 @@ class AravisLibrary:
         self.camera = c_void_p(self.call("camera_new", found[serial], own=False))
 
     def close(self) -> None:
-        """Give stream and camera back."""
-        self.end_stream()
+        """Give the camera back, whose stream has ended."""
         camera, self.camera = self.camera, None
         if camera is not None:
             self.c.g_object_unref(camera)

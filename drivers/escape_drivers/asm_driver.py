@@ -160,7 +160,7 @@ class AsmMirror(AdaptiveSecondary):
         self._found = welcome.present.astype(np.float64) / self._section.stroke_m if floats else None
 
     def _identify(self, welcome: m.Welcome) -> None:
-        model = f"adaptive secondary over TCP, protocol {welcome.version}"
+        model = f"adaptive secondary over TCP, protocol {welcome.version}{', emulated' * welcome.simulated}"
         self._info = self._section.info(model, simulated=welcome.simulated, serial=welcome.serial)
 
     def _close(self) -> None:

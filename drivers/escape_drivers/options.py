@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
 
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
-    from escape_hw.config.device_models import DeviceConfig
+    from escape_hw.config.device_models import CameraConfig, DeviceConfig
+    from escape_hw.config.models import SystemConfig
 
 Options = TypeVar("Options")
 
@@ -47,6 +49,42 @@ def read_options(kind: type[Options], device: str, section: DeviceConfig) -> Opt
     if problems:
         raise ConfigError("\n".join(problems))
     return kind(**values)
+
+
+def require_between(device: str, options: object, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Check numbers among the options of a device.
+
+    Parameters
+    ----------
+    ranges
+        Smallest and largest value of each.
+
+    Raises
+    ------
+    ConfigError
+        Every number that is out of its range, at once.
+    """
+    wrong = [
+        f"devices.{device}.options.{key}: {value:g}  is out of range (allowed range {low:g} to {high:g})"
+        for key, (low, high) in ranges.items()
+        if not low <= (value := getattr(options, key)) <= high
+    ]
+    if wrong:
+        raise ConfigError("\n".join(wrong))
+
+
+def camera_section(device: str, config: SystemConfig) -> CameraConfig:
+    """The section of one of the cameras.
+
+    Raises
+    ------
+    ConfigError
+        The system has no such camera.
+    """
+    section = {"wfs": config.devices.wfs, "science": config.devices.science}.get(device)
+    if section is None:
+        raise ConfigError(f"devices.{device}: system '{config.system.name}' has no such camera")
+    return section
 
 
 def require_serial(device: str, section: DeviceConfig) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_drivers.camera_limits import CameraLimits, Range
-from escape_drivers.options import read_options, require_serial
+from escape_drivers.options import camera_section, read_options, require_between, require_serial
 from escape_drivers.waiting_camera import WaitingCamera
 from escape_drivers.ximea_errors import NO_IMAGE, TIMEOUT
 from escape_drivers.ximea_library import XiImage, XimeaLibrary
@@ -31,6 +30,10 @@ _BINNINGS = {"binning": 0, "skipping": 1}
 _TRIGGERS = {"off": 0, "rising": 1, "falling": 2}
 _UNSAFE, _GPI_TRIGGER, _GPO_EXPOSURE, _ZERO_ROT = 0, 1, 4, 0
 _FREE_RUN, _FRAME_RATE = 0, 1
+_RANGES = {
+    "downsampling": (1, 16), "queue": (2, 1000), "gpi": (1, 16), "trigger_margin": (0, 0.5),
+    "bandwidth_mbit": (0, 100_000),
+}  # fmt: skip
 #: Never a frame number; stays where the library is too old to fill the field.
 _UNFILLED = 2**32 - 1
 
@@ -53,6 +56,9 @@ class XimeaOptions:
         Frames that the library buffers.
     trigger, gpi
         Edge on that input that starts an exposure; ``"off"``: the camera keeps its own rate.
+    trigger_margin
+        Share of the frame that the exposure leaves free with a trigger: for readout, and for edges that
+        come a little faster than ``frame_rate_hz`` says. A camera that is not ready misses every other one.
     exposure_output
         Whether output 1 is high while the camera exposes.
     zero_rot
@@ -69,6 +75,7 @@ class XimeaOptions:
     queue: int = 4
     trigger: Literal["off", "rising", "falling"] = "off"
     gpi: int = 1
+    trigger_margin: float = 0.02
     exposure_output: bool = False
     zero_rot: Literal["", "on", "off"] = ""
     bandwidth_mbit: int = 0
@@ -105,13 +112,13 @@ def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> X
     Raises
     ------
     ConfigError
-        No such device section, no serial number, or an option that this driver does not know.
+        No such camera, no serial number, or an option that this driver does not know.
     """
-    section = config.devices.science if name == "science" else config.devices.wfs
-    if section is None:
-        section = config.devices.wfs
+    section = camera_section(name, config)
     require_serial(name, section)
-    return XimeaCamera(name, section, read_options(XimeaOptions, name, section))
+    options = read_options(XimeaOptions, name, section)
+    require_between(name, options, _RANGES)
+    return XimeaCamera(name, section, options)
 
 
 class XimeaCamera(WaitingCamera):
@@ -189,7 +196,9 @@ class XimeaCamera(WaitingCamera):
             self._managed(library.close)
 
     def _longest_s(self, want: CameraSettings) -> float:
-        return super()._longest_s(want) if self._options.trigger == "off" else math.inf
+        """Longest exposure; with a trigger, one that leaves the camera ready for the next edge."""
+        spare = 0.0 if self._options.trigger == "off" else self._options.trigger_margin
+        return super()._longest_s(want) * (1 - spare)
 
     def _applied(self, want: CameraSettings) -> CameraSettings:
         library, region = self._connected(), want.region

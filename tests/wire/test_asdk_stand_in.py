@@ -170,6 +170,13 @@ def test_a_compiler_that_fails_is_quoted(monkeypatch, tmp_path) -> None:
         build("asdk")
 
 
+def test_a_cache_that_cannot_be_written_is_named(monkeypatch, tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(StandInUnavailable, match=r"file/escape/stand-ins writable.*XDG_CACHE_HOME"):
+        build("asdk")
+
+
 def test_the_cache_lies_outside_the_package(asdk) -> None:
     assert "site-packages" not in str(asdk.path)
     assert not (asdk.path.parent / "asdk.c").exists()

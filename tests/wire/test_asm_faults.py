@@ -302,3 +302,13 @@ def test_an_owner_that_hangs_does_not_own_for_ever() -> None:
         stopped.reply(asm_wire.WELCOME)
         wait_for(lambda: made.server.owner is None, "its time is over")
         assert stopped.hung_up()
+
+
+def test_a_rest_by_the_watchdog_is_told_with_its_reason() -> None:
+    with emulator() as made, driver(port_of(made)) as mirror:
+        made.inject("watchdog")
+        with pytest.raises(DeviceError, match=r"is rested and follows no commands \(the watchdog rested it"):
+            mirror.send(np.zeros(336))
+        mirror.go(ShellState.RUNNING)
+        mirror.send(np.zeros(336))
+        assert made.complaints == ()

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
+import struct
 import threading
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from driver_bench import stand_in
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from small_system import SMALL
 
 from escape_hw.config.load import load_system
 from escape_hw.errors import DeviceError, DeviceLost
 from escape_hw.runtime.system import System
+from escape_sim.stand_ins import bench_server
 from escape_sim.stand_ins.bench_server import BenchServer, Verb, in_environment
 
 #: The region lies on the increments of the real camera; the screen of the real bench is moved by hand.
@@ -104,3 +109,33 @@ def test_nonsense_on_the_socket_disturbs_nobody(server, nonsense) -> None:
         assert bench.wfs.next_frame(1.0).data.any()
         bench.dm.send(bench.dm.flat)
     assert threading.active_count() < 50
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.tuples(st.sampled_from(list(Verb)), st.binary(max_size=300)), min_size=1, max_size=5),
+    st.lists(st.integers(1, 400), min_size=1),
+    st.integers(0, 50),
+)
+def test_requests_arrive_whole_or_not_at_all(requests, cuts, missing) -> None:
+    stream = b"".join(struct.pack("=II", verb, len(payload)) + payload for verb, payload in requests)
+    stream = stream[: len(stream) - missing]
+    near, far = socket.socketpair()
+    with near, far:
+
+        def deliver() -> None:
+            at = 0
+            for size in itertools.cycle(cuts):
+                if at >= len(stream):
+                    break
+                near.sendall(stream[at : at + size])
+                at += size
+            near.shutdown(socket.SHUT_WR)
+
+        sender = threading.Thread(target=deliver)
+        sender.start()
+        received = list(iter(lambda: bench_server._receive(far), None))
+        sender.join()
+    assert received == requests[: len(received)]
+    whole = list(itertools.accumulate(8 + len(payload) for _, payload in requests))
+    assert len(received) == sum(end <= len(stream) for end in whole)

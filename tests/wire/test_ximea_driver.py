@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from escape_drivers.ximea_errors import ERRORS, explain
 from escape_hw.api.frames import Region
 from escape_hw.config.registry import available
-from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
+from escape_hw.errors import ConfigError, DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
 
 SET_UP = [
     "xiOpenDeviceBy 1 SIMWFS",
@@ -99,7 +99,8 @@ def test_options_become_parameters(xi) -> None:
 
 def test_the_modulators_edges_start_the_exposures(xi) -> None:
     xi.script("set trigger_hz 303.03")
-    with make("ximea", "devices.wfs.exposure_s=3.2e-3", system="razor-pywfs") as camera:
+    with make("ximea", system="razor-pywfs") as camera:
+        assert camera.settings.exposure_s == pytest.approx(3266e-6), "3.3 ms would miss every other edge"
         wanted = [
             "gpi_selector 1",
             "gpi_mode 1",
@@ -250,6 +251,18 @@ def test_the_wrong_downsampling_is_noticed(xi) -> None:
     assert xi.calls[-1] == "xiCloseDevice"
 
 
+def test_numbers_out_of_range_are_all_told_at_once() -> None:
+    wrong = ("downsampling=0", "queue=1", "trigger_margin=0.9")
+    with pytest.raises(ConfigError) as refused:
+        make("ximea", *(f"devices.wfs.options.{one}" for one in wrong))
+    told = str(refused.value).splitlines()
+    assert [line.split(":")[0].rpartition(".")[2] for line in told] == [
+        "downsampling",
+        "queue",
+        "trigger_margin",
+    ]
+
+
 def test_one_camera_has_one_owner(xi) -> None:
     with make("ximea"), pytest.raises(DeviceError, match="error 57, the camera is locked; another process"):
         make("ximea").open()
@@ -294,6 +307,20 @@ def test_a_long_time_out_never_outlasts_close(xi, call) -> None:
     assert isinstance(outcome[0], NotOpen)
     camera.close()
     assert not xi.complaints, "neither stopped nor closed while xiGetImage was waiting"
+
+
+def test_a_reader_that_starts_it_again_while_it_closes_is_stopped_too(xi) -> None:
+    camera = make("ximea").open()
+    camera.next_frame(1.0)
+
+    def overtaken() -> None:
+        camera.stop()
+        camera.start()
+
+    camera._before_close = overtaken
+    camera.close()
+    assert xi.names()[-3:] == ["xiStartAcquisition", "xiStopAcquisition", "xiCloseDevice"]
+    assert not xi.complaints
 
 
 def test_readers_and_a_closer_in_many_threads(xi) -> None:

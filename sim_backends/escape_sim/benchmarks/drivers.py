@@ -25,14 +25,14 @@ _BP_AT = 8
 def run() -> list[BenchmarkRow]:
     """All rows of the stage; rows without figures where there is no compiler."""
     try:
-        return [*_mirror(StandIn("asdk").clear(record=False)), *_camera(StandIn("m3api").clear(record=False))]
+        return [*_mirror(StandIn("asdk").clear(record=False)), *_camera(StandIn("m3api"))]
     except StandInUnavailable as reason:
         return [BenchmarkRow("drivers", 0.0, None, "C library", "us", "lower", str(reason))]
 
 
-def _device(driver: str, key: str, library: StandIn, *more: str) -> Any:
+def _device(driver: str, key: str, library: StandIn) -> Any:
     chosen = f'devices.{key}.options.library="{library.path}"'
-    config = load_system("razor-shwfs", mode="hardware", overrides=(chosen, *more))
+    config = load_system("razor-shwfs", mode="hardware", overrides=[chosen])
     return device_factory(driver, hardware=True)(key, config, {})
 
 
@@ -60,32 +60,38 @@ def _mirror(asdk: StandIn) -> list[BenchmarkRow]:
 
 
 def _camera(m3api: StandIn) -> list[BenchmarkRow]:
-    m3api.script("set pace 0")
-    with _device("ximea", "wfs", m3api, "devices.wfs.timeout_s=5.0") as camera:
-        frame = camera.next_frame(1.0)
-        buffer = ctypes.create_string_buffer(_IMAGE_BYTES)
-        ctypes.c_uint32.from_buffer(buffer).value = _IMAGE_BYTES
-        get = ctypes.CDLL(str(m3api.path)).xiGetImage
-        get.argtypes, get.restype = [ctypes.c_void_p, ctypes.c_uint32, ctypes.c_void_p], ctypes.c_int
-        handle, address = camera.handle, ctypes.c_void_p(ctypes.addressof(buffer))
-        rows_, columns = frame.data.shape
-        bp = ctypes.c_void_p.from_buffer(buffer, _BP_AT)
-        kind = ctypes.c_uint16 * (rows_ * columns)
+    rows = []
+    for dim, what in ((1, "no pixel saturated"), (0, "some saturated")):
+        m3api.clear(record=False).script(f"set pace 0; set dim {dim}")
+        with _device("ximea", "wfs", m3api) as camera:
+            rows.append(_frame(m3api, camera, what))
+    return rows
 
-        def directly() -> None:
-            # What any user must do: get the image and copy it before the ring turns.
-            if get(handle, 50, address) != 0:
-                raise RuntimeError("the stand-in gave no image")
-            np.frombuffer(kind.from_address(bp.value or 0), np.uint16).copy()
 
-        # The driver's view of the counter rises over both; only gaps come of it.
-        ours, peer = alternate(lambda: camera.next_frame(1.0), directly, seconds=0.5)
-        assert peer is not None
-        time_c = m3api.library.escape_stand_in_time
-        time_c.argtypes, time_c.restype = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_long], ctypes.c_double
-        note = f"in C without the copy {time_c(handle, address, 20_000) * 1e-3:.2f} us"
-        what = f"drivers: XIMEA frame {columns} x {rows_}, copied, saturation counted"
-        return [_row(what, ours, peer, "xiGetImage by ctypes, copied", note)]
+def _frame(m3api: StandIn, camera: Any, what: str) -> BenchmarkRow:
+    shape = camera.next_frame(1.0).data.shape
+    buffer = ctypes.create_string_buffer(_IMAGE_BYTES)
+    ctypes.c_uint32.from_buffer(buffer).value = _IMAGE_BYTES
+    get = ctypes.CDLL(str(m3api.path)).xiGetImage
+    get.argtypes, get.restype = [ctypes.c_void_p, ctypes.c_uint32, ctypes.c_void_p], ctypes.c_int
+    handle, address = camera.handle, ctypes.c_void_p(ctypes.addressof(buffer))
+    pixels = ctypes.c_void_p.from_buffer(buffer, _BP_AT)
+    kind = ctypes.c_uint16 * (shape[0] * shape[1])
+
+    def directly() -> None:
+        # What any user must do: get the image and copy it before the ring turns.
+        if get(handle, 50, address) != 0:
+            raise RuntimeError("the stand-in gave no image")
+        np.frombuffer(kind.from_address(pixels.value or 0), np.uint16).copy()
+
+    # Both read the same camera; to either, the other's frames are lost ones.
+    ours, peer = alternate(lambda: camera.next_frame(1.0), directly, seconds=0.4)
+    assert peer is not None
+    time_c = m3api.library.escape_stand_in_time
+    time_c.argtypes, time_c.restype = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_long], ctypes.c_double
+    note = f"in C, without the copy, {time_c(handle, address, 20_000) * 1e-3:.2f} us"
+    stage = f"drivers: XIMEA frame {shape[1]} x {shape[0]}, {what}"
+    return _row(stage, ours, peer, "xiGetImage by ctypes, copied", note)
 
 
 def _row(stage: str, ours_s: float, peer_s: float, peer: str, note: str) -> BenchmarkRow:

@@ -79,7 +79,17 @@ def _compiler() -> str:
 
 def _compile(compiler: str, name: str, sources: dict[str, bytes], target: Path) -> None:
     """Compile beside the target and move it there, so that nobody ever loads half a library."""
-    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _compile_in_place(compiler, name, sources, target)
+    except OSError as error:
+        raise StandInUnavailable(
+            f"the stand-in of {name} was not compiled: {error}; is {target.parent} writable? "
+            "XDG_CACHE_HOME chooses another place"
+        ) from error
+
+
+def _compile_in_place(compiler: str, name: str, sources: dict[str, bytes], target: Path) -> None:
     with tempfile.TemporaryDirectory(dir=target.parent) as folder:
         for file, text in sources.items():
             (Path(folder) / file).write_bytes(text)
@@ -89,7 +99,7 @@ def _compile(compiler: str, name: str, sources: dict[str, bytes], target: Path) 
             done = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, check=False, timeout=_COMPILE_S
             )
-        except (OSError, subprocess.TimeoutExpired) as error:
+        except subprocess.TimeoutExpired as error:
             raise StandInUnavailable(f"{compiler} did not compile the stand-in of {name}: {error}") from error
         if done.returncode != 0:
             raise StandInUnavailable(

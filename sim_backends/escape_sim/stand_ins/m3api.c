@@ -1,7 +1,8 @@
 /* Stand-in of XIMEA's libm3api: one MQ013MG-ON, strict about order, ranges, types and structure sizes.
  *
  * Properties (set KEY VALUE): serial, width_inc, height_inc, padding (bytes after each row), first (number of
- * the first frame), pace (0: frames are always ready), trigger_hz (edges on the input; 0: none), lost_code.
+ * the first frame), pace (0: frames are always ready), dim (halvings of the light), trigger_hz (edges on the
+ * input; 0: none), lost_code.
  */
 #define _GNU_SOURCE
 #include "stand_in.h"
@@ -114,7 +115,7 @@ struct camera {
 };
 static struct camera camera;
 static char serial[64];
-static int width_inc, height_inc, padding, first, pace, lost_code;
+static int width_inc, height_inc, padding, first, pace, dim, lost_code;
 static double trigger_hz;
 static uint16_t ring[QUEUE_MAX][SENSOR_H * PITCH_MAX / 2]; /* bytes for 8-bit formats */
 static struct {
@@ -136,7 +137,7 @@ static void si_forget(void) {
     height_inc = 2;
     pace = 1;
     lost_code = BAD_HANDLE;
-    padding = first = 0;
+    padding = first = dim = 0;
     trigger_hz = 0;
 }
 
@@ -147,6 +148,7 @@ static int si_set(const char *key, const char *value) {
     if (strcmp(key, "height_inc") == 0) return (height_inc = whole) > 0;
     if (strcmp(key, "padding") == 0) return (padding = whole) >= 0 && padding <= 256 && padding % 2 == 0;
     if (strcmp(key, "first") == 0) return (first = whole) >= 0;
+    if (strcmp(key, "dim") == 0) return (dim = whole) >= 0;
     if (strcmp(key, "pace") == 0) return (pace = whole) >= 0;
     if (strcmp(key, "lost_code") == 0) return (lost_code = whole) > 0;
     if (strcmp(key, "trigger_hz") == 0) return (trigger_hz = atof(value)) >= 0;
@@ -452,7 +454,7 @@ EXPORT XI_RETURN xiStartAcquisition(HANDLE handle) {
     for (int slot = 0; slot < (int)VALUE(QUEUE); slot++) {
         memset(ring[slot], 0xFF, (size_t)(pitch_bytes() * (int)VALUE(HEIGHT)));
         for (int y = 0; y < (int)VALUE(HEIGHT); y++)
-            for (int x = 0; x < (int)VALUE(WIDTH); x++) put(slot, x, y, (3 * x + 7 * y) & top);
+            for (int x = 0; x < (int)VALUE(WIDTH); x++) put(slot, x, y, (3 * x + 7 * y) & (top >> dim));
     }
     camera.acquiring = 1;
     return OK;
@@ -506,12 +508,13 @@ static XI_RETURN from_the_bench(DWORD timeout_ms, int64_t *stamp_ns, long *numbe
 
 static XI_RETURN from_the_sensor(DWORD timeout_ms, long lose, int64_t *stamp_ns, long *number) {
     *number = next_frame(timeout_ms, lose);
+    if (*number >= 0) camera.counters[0] += lose;
     if (*number < 0) return si_unplugged ? lost_code : TIMEOUT;
     *stamp_ns = camera.start_ns + (int64_t)((double)(*number + 1) * (pace ? camera.period_ns : 1e6));
     int slots = (int)VALUE(QUEUE), top = (1 << bits()) - 1;
     /* The real ring goes on turning: what was handed out before is no longer what it was. */
     if (si_recording && camera.delivered >= 0) put((int)(camera.delivered % slots), 1, 0, top);
-    put((int)(*number % slots), 0, 0, (int)*number & top);
+    put((int)(*number % slots), 0, 0, (int)*number & (top >> dim));
     put((int)(*number % slots), 1, 0, 3);
     return OK;
 }
@@ -533,7 +536,9 @@ static XI_RETURN picture(XI_IMG *image, DWORD timeout_ms, long lose, XI_IMG *ful
     }
     full->width = (DWORD)VALUE(WIDTH);
     full->height = (DWORD)VALUE(HEIGHT);
-    full->nframe = full->acq_nframe = (DWORD)(number + first);
+    full->acq_nframe = (DWORD)(number + first);
+    /* The library counts what reached it; what was lost on the cable only the camera knows. */
+    full->nframe = full->acq_nframe - (DWORD)camera.counters[0];
     full->tsSec = (DWORD)(stamp_ns / 1000000000);
     full->tsUSec = (DWORD)(stamp_ns / 1000 % 1000000);
     return OK;
