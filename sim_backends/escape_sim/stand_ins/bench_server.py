@@ -28,9 +28,11 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from escape_hw.api.camera import Camera
+from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.api.frames import CameraSettings, Region
 from escape_hw.errors import EscapeError, FrameTimeout
 from escape_sim.devices import make_mirror, make_science_camera, make_wfs_camera, shared_bench
+from escape_sim.emulators.e727 import E727
 from escape_sim.stand_ins.build import build
 
 if TYPE_CHECKING:
@@ -52,6 +54,8 @@ VARIABLES = {
     "aravis": "ESCAPE_ARAVIS_LIBRARY",
 }
 _SOCKET_VARIABLE = "ESCAPE_STAND_IN_BENCH"
+#: Environment variable that leads the modulator's driver to an emulated controller.
+E727_VARIABLE = "ESCAPE_E727"
 
 Answer = tuple[int, bytes]
 
@@ -82,6 +86,8 @@ class BenchServer:
         What a process needs in its environment for its drivers to find the stand-ins and this bench.
     requests
         Number of requests answered, per verb.
+    modulator
+        Emulated controller of the modulator, where the system has one.
     """
 
     def __init__(self, config: SystemConfig, shared: dict[str, object] | None = None) -> None:
@@ -93,6 +99,7 @@ class BenchServer:
         self._turn = threading.Lock()
         self._listener: socket.socket | None = None
         self._folder: Path | None = None
+        self.modulator: E727 | None = None
         self._connections: set[socket.socket] = set()
         self._threads: list[threading.Thread] = []
 
@@ -111,14 +118,27 @@ class BenchServer:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(path)
         self._listener.listen()
-        self.environment = {**libraries, _SOCKET_VARIABLE: path}
+        self.environment = {**libraries, _SOCKET_VARIABLE: path, **self._emulated_modulator()}
         thread = threading.Thread(target=self._accept, name="bench", daemon=True)
         thread.start()
         self._threads.append(thread)
         return path
 
+    def _emulated_modulator(self) -> dict[str, str]:
+        """Start the controller of a modulator, which turns the twin's beam; returns where it listens."""
+        section = self.config.devices.modulator
+        if section is None or section.driver != "pi-e727":
+            return {}
+        options = {"serial": section.serial, "zeroed": "1"}
+        request = EmulatorRequest(port=0, options=options, shared=self.shared, config=self.config)
+        self.modulator = E727(request)
+        return {E727_VARIABLE: self.modulator.start().removeprefix("tcp ")}
+
     def stop(self) -> None:
         """Hang up and stop listening; may be repeated."""
+        if self.modulator is not None:
+            self.modulator.stop()
+            self.modulator = None
         listener, self._listener = self._listener, None
         if listener is not None:
             for one in (listener, *self._connections):
