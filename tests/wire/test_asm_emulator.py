@@ -53,6 +53,7 @@ def running(client: RawClient) -> int:
         (hello(1, versions=(2, 9)), w.UNSUPPORTED, "versions 1 to 1"),
         (frame(w.HELLO, 1, b"\x01"), w.BAD_LENGTH, "HELLO makes no sense"),
     ],
+    ids=["no hello", "role", "versions", "short hello"],  # the bytes hold the time
 )
 def test_a_bad_beginning_is_refused(request_: bytes, code: int, words: str) -> None:
     with emulator() as made, RawClient(port_of(made)) as client:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,6 +59,8 @@ def test_a_peer_that_is_stopped_is_told_in_time_and_rests_when_it_goes_on(
     process, port = remote
     mirror = driver(port, reply_s=0.5, heartbeat_s=0.05).open()
     process.send_signal(signal.SIGSTOP)
+    stat = Path(f"/proc/{process.pid}/stat")
+    wait_for(lambda: ") T " in stat.read_text(), "it has stopped")
     with pytest.raises(DeviceLost, match=r"no answer within 0\.5 s"):
         mirror.send(np.zeros(336))
     with pytest.raises(DeviceLost):
