@@ -124,7 +124,7 @@ def follow(options: argparse.Namespace) -> None:
         found = bench.run(
             track(
                 bench, result.matrix, result.grid, seconds=options.seconds, registration=result.registration,
-                response=result.response, model_psf=psf, memory_s=options.memory,
+                response=result.response, model_psf=psf, memory_s=options.memory, poke=options.poke,
             ),
             observers=(_tell,),
         )  # fmt: skip
@@ -175,7 +175,8 @@ def compare(options: argparse.Namespace) -> None:
     rows = {name: np.array(tracked["rows"][name], float) for name in ("seconds", "strehl")}
     # A ratio holds the science frames of the five updates before.
     ends = rows["seconds"][np.isfinite(rows["strehl"])][1:]
-    ends = ends[:: max(1, len(ends) // options.looks)]
+    # Two rows apart at least: a look takes longer than the time that it covers.
+    ends = ends[:: max(2, len(ends) // options.looks)]
     looks = [[end - LOOK_S] for end in ends]
     for knows in (True, False):
         bench, result, psf, twin = started(options)
@@ -271,6 +272,7 @@ def main() -> None:
     parser.add_argument("--swing", type=float, default=0.0, help="swing of the rotation, degrees")
     parser.add_argument("--seeing", type=float, default=0.2, help="swing of r0, fraction")
     parser.add_argument("--memory", type=float, default=10.0)
+    parser.add_argument("--poke", type=float, default=None, help="as configured by default")
     parser.add_argument("--frames", type=int, default=2000, help="frames of the calibration before")
     parser.add_argument("--looks", type=int, default=11, help="how often the other loops are closed")
     parser.add_argument("--seed", type=int, default=5)
