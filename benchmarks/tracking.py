@@ -218,9 +218,8 @@ def draw(options: argparse.Namespace) -> None:
     ratio = np.isfinite(rows["strehl"]) & settled
     if looks is not None:
         here = np.interp(looks[:, 0] + LOOK_S, t[ratio], rows["strehl"][ratio])
-        print(
-            f"Strehl: tracked {here.mean():.4f}, truth {looks[:, 1].mean():.4f}, never {looks[:, 3].mean():.4f}"
-        )
+        knows, never = looks[:, 1].mean(), looks[:, 3].mean()
+        print(f"Strehl: tracked {here.mean():.4f}, knows {knows:.4f}, never {never:.4f}")
     figure = picture(rows, truth, gains, looks, ratio)
     figure.savefig(options.figure, dpi=110)
 
