@@ -124,7 +124,7 @@ def follow(options: argparse.Namespace) -> None:
         found = bench.run(
             track(
                 bench, result.matrix, result.grid, seconds=options.seconds, registration=result.registration,
-                response=result.response, model_psf=psf, memory_s=options.memory,
+                response=result.response, model_psf=psf, memory_s=options.memory, poke=options.poke,
             ),
             observers=(_tell,),
         )  # fmt: skip
@@ -175,7 +175,8 @@ def compare(options: argparse.Namespace) -> None:
     rows = {name: np.array(tracked["rows"][name], float) for name in ("seconds", "strehl")}
     # A ratio holds the science frames of the five updates before.
     ends = rows["seconds"][np.isfinite(rows["strehl"])][1:]
-    ends = ends[:: max(1, len(ends) // options.looks)]
+    # Two rows apart at least: a look takes longer than the time that it covers.
+    ends = ends[:: max(2, len(ends) // options.looks)]
     looks = [[end - LOOK_S] for end in ends]
     for knows in (True, False):
         bench, result, psf, twin = started(options)
@@ -200,7 +201,8 @@ def at_truth(bench: System, result: CalibrationResult, here: Registration) -> In
 def draw(options: argparse.Namespace) -> None:
     """Errors in numbers, and the figure."""
     tracked = json.loads((options.out / "track.json").read_text())
-    looks = np.array(json.loads((options.out / "compare.json").read_text()))
+    others = options.out / "compare.json"
+    looks = np.array(json.loads(others.read_text())) if others.exists() else None
     rows = {name: np.array(values, float) for name, values in tracked["rows"].items()}
     truth, t = np.array(tracked["truth"]), rows["seconds"]
     settled = t > 10
@@ -214,10 +216,10 @@ def draw(options: argparse.Namespace) -> None:
     rms = np.sqrt(np.mean(np.square(said - gains[:, 1])))
     print(f"optical gain: rms error {rms:.4f} of {gains[:, 1].mean():.3f}")
     ratio = np.isfinite(rows["strehl"]) & settled
-    here = np.interp(looks[:, 0] + LOOK_S, t[ratio], rows["strehl"][ratio])
-    print(
-        f"Strehl: tracked {here.mean():.4f}, truth {looks[:, 1].mean():.4f}, never {looks[:, 3].mean():.4f}"
-    )
+    if looks is not None:
+        here = np.interp(looks[:, 0] + LOOK_S, t[ratio], rows["strehl"][ratio])
+        knows, never = looks[:, 1].mean(), looks[:, 3].mean()
+        print(f"Strehl: tracked {here.mean():.4f}, knows {knows:.4f}, never {never:.4f}")
     figure = picture(rows, truth, gains, looks, ratio)
     figure.savefig(options.figure, dpi=110)
 
@@ -244,12 +246,13 @@ def picture(rows: dict[str, Any], truth: Any, gains: Any, looks: Any, ratio: Any
     panels[2].plot(gains[:, 0], gains[:, 1], "o", ms=3, color=style.INK, label="truth")
     style.tidy(panels[2]).set_title("optical gain, beside the start's matrix", fontsize=9.5)
     panels[3].plot(t[ratio], rows["strehl"][ratio], color=style.SERIES[0], lw=1.0, label="tracked")
-    panels[3].errorbar(
-        looks[:, 0], looks[:, 1], looks[:, 2], fmt="o", ms=3, color=style.INK, label="knows the truth"
-    )
-    panels[3].errorbar(
-        looks[:, 0], looks[:, 3], looks[:, 4], fmt="s", ms=3, color=style.SERIES[1], label="never looks"
-    )
+    if looks is not None:
+        panels[3].errorbar(
+            looks[:, 0], looks[:, 1], looks[:, 2], fmt="o", ms=3, color=style.INK, label="knows the truth"
+        )
+        panels[3].errorbar(
+            looks[:, 0], looks[:, 3], looks[:, 4], fmt="s", ms=3, color=style.SERIES[1], label="never looks"
+        )
     style.tidy(panels[3]).set_title("Strehl ratio, peak", fontsize=9.5)
     for panel in panels:
         panel.set_xlabel("seconds")
@@ -271,6 +274,7 @@ def main() -> None:
     parser.add_argument("--swing", type=float, default=0.0, help="swing of the rotation, degrees")
     parser.add_argument("--seeing", type=float, default=0.2, help="swing of r0, fraction")
     parser.add_argument("--memory", type=float, default=10.0)
+    parser.add_argument("--poke", type=float, default=None, help="as configured by default")
     parser.add_argument("--frames", type=int, default=2000, help="frames of the calibration before")
     parser.add_argument("--looks", type=int, default=11, help="how often the other loops are closed")
     parser.add_argument("--seed", type=int, default=5)

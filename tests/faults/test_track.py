@@ -42,7 +42,7 @@ def followed(bench, start, seconds, *, at=None, do=None, **options):
 
     procedure = track(
         bench, start.matrix, start.grid, seconds=seconds, registration=start.registration,
-        response=start.response, **options,
+        response=start.response, **{"poke": 0.002, **options},
     )  # fmt: skip
     found = bench.run(procedure, observers=(watch,))
     assert_flat(bench)
