@@ -15,7 +15,7 @@ from escape_drivers import asm_messages as m
 from escape_drivers.asm_codec import AsmCodec
 from escape_drivers.asm_link import AsmLink, Refused
 from escape_drivers.asm_options import EMULATOR, RANGES, AsmOptions
-from escape_drivers.asm_welcome import require_fit
+from escape_drivers.asm_welcome import require_fit, require_meant
 from escape_drivers.options import read_options, require_between, require_serial
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.emulator import Emulator, EmulatorRequest
@@ -265,7 +265,9 @@ class AsmMirror(AdaptiveSecondary):
         link = self._new_link(m.Role.TELEMETRY)
         link.address = self._address()
         try:
-            self._identify(link.connect())
+            welcome = link.connect()
+            require_meant(self.name, self._section, welcome)
+            self._identify(welcome)
             return _translated(link.ask(m.GetHealth(), m.Health))
         finally:
             link.drop("it was only looked at")

@@ -14,6 +14,27 @@ if TYPE_CHECKING:
 _ROUNDING = 1e-6
 
 
+def require_meant(name: str, section: MirrorConfig, welcome: Welcome) -> None:
+    """Require the mirror that was meant; who only looks needs no more.
+
+    Raises
+    ------
+    DeviceError
+        It is another mirror.
+    """
+    if welcome.present.size != section.n_act:
+        raise DeviceError(
+            name,
+            f"has {welcome.present.size} actuators, devices.{name}.layout = '{section.layout}' has "
+            f"{section.n_act}; correct the layout or the address",
+        )
+    if section.serial and section.serial != welcome.serial:
+        raise DeviceError(
+            name,
+            f"is {welcome.serial!r}, not {section.serial!r}; correct devices.{name}.serial or the address",
+        )
+
+
 def require_fit(name: str, section: MirrorConfig, welcome: Welcome) -> tuple[int, ...]:
     """Require the mirror that was meant, and limits of ours that lie within its own.
 
@@ -39,17 +60,7 @@ def require_fit(name: str, section: MirrorConfig, welcome: Welcome) -> tuple[int
         A limit of ours exceeds the mirror's, or actuators are out of service that the configuration
         counts on.
     """
-    if welcome.present.size != section.n_act:
-        raise DeviceError(
-            name,
-            f"has {welcome.present.size} actuators, devices.{name}.layout = '{section.layout}' has "
-            f"{section.n_act}; correct the layout or the address",
-        )
-    if section.serial and section.serial != welcome.serial:
-        raise DeviceError(
-            name,
-            f"is {welcome.serial!r}, not {section.serial!r}; correct devices.{name}.serial or the address",
-        )
+    require_meant(name, section, welcome)
     limits, stroke = section.limits, section.stroke_m
     slew = limits.max_slew if limits.max_slew is not None else 2 * limits.max_stroke
     for key, ours, theirs in (

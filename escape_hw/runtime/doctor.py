@@ -188,7 +188,8 @@ def _usb(host: Host, real: dict[str, DeviceConfig] | None) -> Iterator[Finding]:
     mb = host.usbfs_mb()
     if mb is None:
         needed = real is not None and {"ximea", "aravis"} & set(real)
-        yield Finding("usbfs memory", "error" if needed else "info", "this computer has no USB")
+        way = "cameras need a USB port; a virtual machine must be given one" if needed else ""
+        yield Finding("usbfs memory", "error" if needed else "info", "this computer has no USB", way)
     elif 0 < mb < USBFS_MB:
         way = (
             "escape udev install, then restart; or usbcore.usbfs_memory_mb=1000 on the kernel's command line"

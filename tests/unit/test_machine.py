@@ -132,6 +132,13 @@ def test_doctor_names_what_is_wrong_and_the_way_out(bench: Path) -> None:
     assert doctor.exit_code(list(found.values())) == 1
 
 
+def test_doctor_tells_the_way_out_of_a_computer_without_usb(tmp_path: Path) -> None:
+    config = load_system("razor-shwfs", overrides=["devices.wfs.mode=hardware"])
+    found = levels(tmp_path, config)
+    assert found["usbfs memory"].level == "error"
+    assert "virtual machine" in found["usbfs memory"].way_out
+
+
 def test_doctor_is_content_with_a_good_bench(bench: Path) -> None:
     put(bench, "sys/module/usbcore/parameters/usbfs_memory_mb", "1000")
     put(bench, "sys/bus/usb-serial/devices/ttyUSB0/latency_timer", "1")

@@ -168,6 +168,22 @@ def test_the_first_cause_comes_out_of_with() -> None:
     assert dm.closings == 1
 
 
+def test_what_is_lost_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
+    dm = Flaky()
+
+    def work() -> None:
+        with dm:
+            dm.send(np.full(N, 0.1))
+            dm.lost = True
+            dm.send(np.full(N, 0.2))
+
+    with pytest.raises(DeviceLost, match="cable out") as caught:
+        work()
+    assert not getattr(caught.value, "__notes__", [])
+    assert not caplog.records
+    assert dm.closings == 1
+
+
 def test_a_failed_flatten_is_not_hidden_by_a_failed_disconnection() -> None:
     dm = Flaky()
     dm.open()

@@ -180,6 +180,13 @@ def test_many_may_look_while_one_controls() -> None:
         assert made.complaints == ()
 
 
+def test_nobody_looks_at_another_mirror_than_configured() -> None:
+    with emulator() as made:
+        with pytest.raises(DeviceError, match=r"is 'SIM336', not 'MMT336'; correct devices.dm.serial"):
+            driver(port_of(made), "devices.dm.serial=MMT336").glance()
+        assert made.complaints == ()
+
+
 def test_a_second_owner_is_refused_and_told_who_has_it() -> None:
     with emulator() as made, driver(port_of(made)) as owner:
         with pytest.raises(DeviceError, match=r"not owner.*pid \d+ controls it"):
