@@ -32,8 +32,12 @@ def status(
         config, mirror = _secondary(one, options.Choice.of(system, set, seed, mode))
         one.was_opened = True
         health = mirror.glance()
-        one.show(*_lines(health))
-        told(one, "asm status", config, mirror.info.simulated, False, **asdict(health))
+        info = mirror.info
+        one.show(f"{info.model} {info.serial}", *_lines(health))
+        told(
+            one, "asm status", config, info.simulated, False,
+            model=info.model, serial=info.serial, **asdict(health),
+        )  # fmt: skip
 
 
 @app.command("set")

@@ -85,6 +85,7 @@ def test_asm_verbs_lead_the_mirror_and_tell(document, asm):
     made, options = asm
     code, found, _ = document("asm", "status", *options)
     assert (code, found["state"], found["changed"], found["simulated"]) == (0, "off", False, True)
+    assert (found["serial"], "emulated" in found["model"]) == ("SIM336", True)
     code, found, err = document("asm", "set", *options)
     assert (code, found["before"], found["after"], found["changed"]) == (0, "off", "set", True)
     assert "this changes hardware" in err
@@ -117,7 +118,9 @@ def test_a_fault_is_cleared_only_by_who_says_that_it_was_seen_to(document, escap
 def test_looking_takes_no_control(escape, asm):
     made, options = asm
     with other_owner(made):
-        assert "controlled by somebody else" in escape("asm", "status", *options)[1]
+        out = escape("asm", "status", *options)[1]
+        assert "emulated SIM336" in out
+        assert "controlled by somebody else" in out
         code, _, err = escape("asm", "rest", *options)
         assert code == 3
         assert "somebody else controls it" in err
