@@ -81,6 +81,12 @@ class Motion:
         self._sum += slopes
         self._squares += np.square(slopes, dtype=np.float64)
 
+    def extend(self, slopes: NDArray[np.float32]) -> None:
+        """Take the slopes of many frames ``(n, n_slopes)``."""
+        self._n += len(slopes)
+        self._sum += slopes.sum(axis=0, dtype=np.float64)
+        self._squares += np.einsum("ts,ts->s", slopes, slopes, dtype=np.float64)
+
     def state(self) -> NDArray[np.float64]:
         """Sums and sums of squares with the number of frames behind them ``(3, n_slopes)``."""
         return np.stack([self._sum, self._squares, np.full(self.n_slopes, float(self._n))])

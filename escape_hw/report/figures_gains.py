@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from escape_hw.api.gains import GainsResult, OpticalGains
 from escape_hw.report import style
@@ -58,6 +59,7 @@ def bootstrap(result: GainsResult) -> Figure:
     effective = [step.gain * step.optical_gain for step in steps]
     top.plot(number, effective, "o-", ms=3, color=style.SERIES[0], label="effective gain")
     top.axhline(result.loop_gain, color=style.MUTED, lw=1.0, ls=":", label="wanted")
+    top.xaxis.set_major_locator(MaxNLocator(integer=True))
     style.tidy(top).set(xlabel="gain tried in the first closure", ylabel="effective gain")
     residual = top.twinx()
     line = residual.plot(
