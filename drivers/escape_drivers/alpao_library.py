@@ -11,7 +11,7 @@ from ctypes import POINTER, c_char_p, c_double, c_int, c_size_t, c_uint32, c_voi
 from typing import Any
 
 from escape_drivers.alpao_errors import LOST, explain
-from escape_drivers.vendor_library import VendorLibrary, is_stand_in, require
+from escape_drivers.vendor_library import VendorLibrary, is_stand_in
 from escape_hw.errors import DeviceError, DeviceLost
 
 SDK = VendorLibrary(
@@ -52,11 +52,7 @@ class AlpaoLibrary:
 
     def __init__(self, device: str, path: str = "") -> None:
         self.device = device
-        self.c = SDK.load(device, path)
-        require(device, self.c, list(_PROTOTYPES))
-        for name, (result, arguments) in _PROTOTYPES.items():
-            function = getattr(self.c, name)
-            function.restype, function.argtypes = result, arguments
+        self.c = SDK.bind(device, path, _PROTOTYPES)
         self.stand_in = is_stand_in(self.c)
 
     def init(self, serial: str) -> c_void_p:

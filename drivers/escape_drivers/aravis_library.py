@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint64, c_void_p
 from typing import Any, NamedTuple
 
-from escape_drivers.vendor_library import VendorLibrary, is_stand_in, require
+from escape_drivers.vendor_library import VendorLibrary, is_stand_in
 from escape_hw.errors import DeviceError
 
 ARAVIS = VendorLibrary(
@@ -106,11 +106,7 @@ class AravisLibrary:
 
     def __init__(self, device: str, path: str = "") -> None:
         self.device = device
-        self.c = ARAVIS.load(device, path)
-        require(device, self.c, list(_PROTOTYPES))
-        for name, (result, arguments) in _PROTOTYPES.items():
-            function = getattr(self.c, name)
-            function.restype, function.argtypes = result, arguments
+        self.c = ARAVIS.bind(device, path, _PROTOTYPES)
         self.stand_in = is_stand_in(self.c)
         self.camera: c_void_p | None = None
         self._stream: c_void_p | None = None

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from typing import Any
 
 from escape_drivers.pi_transports import WireLost
 
 _SIZE = 16384
+
+log = logging.getLogger(__name__)
 
 
 class UsbTransport:
@@ -78,10 +81,13 @@ class UsbTransport:
     def _claim(self, usb: Any) -> None:
         interface = self._device.get_active_configuration()[(0, 0)]
         number = interface.bInterfaceNumber
-        with contextlib.suppress(NotImplementedError):
+        try:
             if self._device.is_kernel_driver_active(number):
                 self._device.detach_kernel_driver(number)
                 self._detached.append(number)
+        except NotImplementedError:
+            # pyusb's word for a backend without kernel drivers: there is none to take the controller from.
+            log.debug("%s: this USB backend knows no kernel drivers", self.where)
         usb.util.claim_interface(self._device, number)
         for endpoint in interface:
             if usb.util.endpoint_type(endpoint.bmAttributes) != usb.util.ENDPOINT_TYPE_BULK:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from escape_hw.errors import DeviceError
 
@@ -61,6 +62,30 @@ class VendorLibrary:
             f"the library of the {self.what} cannot be loaded ({'; '.join(failures)}); {self.source}, then "
             f"name its file in the option 'library' of the device or in {self.variable}",
         )
+
+    def bind(
+        self, device: str, path: str, prototypes: Mapping[str, tuple[Any, Sequence[Any]]]
+    ) -> ctypes.CDLL:
+        """Load the library and declare what the driver calls.
+
+        Parameters
+        ----------
+        device, path
+            As for :meth:`load`.
+        prototypes
+            Type of the result and types of the arguments by the function's name.
+
+        Raises
+        ------
+        DeviceError
+            The library is missing or is another one.
+        """
+        library = self.load(device, path)
+        require(device, library, list(prototypes))
+        for name, (result, arguments) in prototypes.items():
+            function = getattr(library, name)
+            function.restype, function.argtypes = result, arguments
+        return library
 
 
 def require(device: str, library: ctypes.CDLL, names: Sequence[str]) -> None:

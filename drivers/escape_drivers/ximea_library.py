@@ -9,7 +9,7 @@ import ctypes
 from ctypes import POINTER, c_char_p, c_double, c_float, c_int, c_uint32, c_void_p
 from typing import Any
 
-from escape_drivers.vendor_library import VendorLibrary, is_stand_in, require
+from escape_drivers.vendor_library import VendorLibrary, is_stand_in
 from escape_drivers.ximea_errors import LOST, STOPPED, explain
 from escape_hw.errors import DeviceError, DeviceLost
 
@@ -94,11 +94,8 @@ class XimeaLibrary:
 
     def __init__(self, device: str, path: str = "") -> None:
         self.device = device
-        self.c = XIAPI.load(device, path)
-        require(device, self.c, list(_PROTOTYPES))
-        for name, arguments in _PROTOTYPES.items():
-            function = getattr(self.c, name)
-            function.restype, function.argtypes = c_int, arguments
+        prototypes = {name: (c_int, arguments) for name, arguments in _PROTOTYPES.items()}
+        self.c = XIAPI.bind(device, path, prototypes)
         self.stand_in = is_stand_in(self.c)
         self.handle: c_void_p | None = None
 
