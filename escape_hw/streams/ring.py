@@ -281,14 +281,10 @@ class RingReader:
     def stats(self) -> RingStats:
         """What the ring tells of itself, without copying an entry."""
         count = self.written
-        index, shape, dtype, arrived = 0, (), "", 0
-        if count:
-            entry = self._entry(count - 1)
-            index, arrived = entry[0], entry[2]
-            shape, dtype = (
-                entry[8 : 8 + min(entry[5], 4)],
-                layout.DTYPES[entry[4] % len(layout.DTYPES)].str[1:],
-            )
+        entry = self._entry(count - 1) if count else [0] * 12
+        index, arrived, code, dimensions = entry[0], entry[2], entry[4], entry[5]
+        shape = tuple(entry[8 : 8 + min(dimensions, layout.MOST_DIMENSIONS)])
+        dtype = layout.DTYPES[code % len(layout.DTYPES)].str[1:] if count else ""
         intervals = np.array(self._words[layout.INTERVALS : layout.INTERVALS + BINS], dtype=np.uint64)
         return RingStats(
             self.name, self.pid, self.slots, self.capacity, count, index, shape, dtype, arrived, intervals,
@@ -315,7 +311,7 @@ class RingReader:
         return list(layout.ENTRY.unpack_from(self._memory, self._at(number) + layout.ENTRY_AT))
 
     def _index(self, number: int) -> int:
-        return self._entry(number)[0]
+        return int(self._entry(number)[0])
 
     def _copy(self, number: int) -> Sample | None:
         """An entry by its number, or ``None`` when it was overwritten before or meanwhile."""
