@@ -96,6 +96,7 @@ class LoopPanel(Panel):
             self.editors[name].setToolTip(_TIPS[name])
             self.editors[name].setAccessibleName(f"{words} wanted")
         form.setColumnStretch(2, 1)
+        form.setColumnStretch(3, 1)
         buttons = QHBoxLayout()
         for button in (self.check_button, self.apply_button, self.reset_button):
             buttons.addWidget(button)
@@ -247,8 +248,10 @@ class LoopPanel(Panel):
         mono = self.context.theme.font(mono=True)
         for label in self.current.values():
             label.setFont(mono)
-        for spin in (self.gain, self.leak, self.dropped_modes):
-            spin.setFont(mono)
+        for name, editor in self.editors.items():
+            editor.setMaximumWidth(self.context.theme.pixels(180))
+            if name != "matrix":
+                editor.setFont(mono)
 
 
 def _spin(low: float, high: float, step: float, digits: int) -> QDoubleSpinBox:
