@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 from escape_hw.calibration.sensor_setup import SETUP_FRAMES
 from escape_hw.config.models import ESTIMATORS, SOLVERS, SystemConfig
-from escape_hw.errors import ConfigError
+from escape_hw.errors import ConfigError, ProductError
 from escape_hw.remote.state import Arguments, Parameter, ProcedureEntry
 from escape_hw.runtime.calibration_task import CalibrationRequest, CalibrationTask
 from escape_hw.runtime.gains_task import GainsTask
@@ -121,11 +122,24 @@ def _calibration(method: str) -> Callable[[Arguments, Shelf], Task[Any]]:
         if closing is not None and method in CLOSED_LOOP:
             asked["closed_loop"] = str(shelf.matrix(str(closing)))
         folder = None if resume is None else shelf.allowed(str(resume))
+        if folder is not None:
+            kept = _kept_settings(folder)
+            settings = {key: kept.get(key) if value is None else value for key, value in settings.items()}
         if method != "escape" or settings.get("solver") is None:
             settings.pop("solver")
         return CalibrationTask(CalibrationRequest.of(asked, folder), resume=folder, settings=settings)
 
     return make
+
+
+def _kept_settings(folder: Path) -> dict[str, Any]:
+    """The section ``calibration`` of the configuration of the run in a folder."""
+    path = folder / "config.toml"
+    try:
+        found = tomllib.loads(path.read_text(encoding="utf-8")).get("calibration", {})
+    except (OSError, ValueError) as error:
+        raise ProductError(f"{path}: cannot be read ({error}); is {folder} the folder of a run?") from error
+    return dict(found)
 
 
 def _matrix(arguments: Arguments, shelf: Shelf) -> Path:
@@ -223,15 +237,18 @@ class Offers:
         """
         return completed(self._known(name).entry.parameters, given)
 
-    def task(self, name: str, arguments: Arguments, shelf: Shelf) -> Task[Any]:
-        """The task that a procedure's arguments, complete, ask for.
+    def task(self, name: str, given: Arguments, shelf: Shelf) -> Task[Any]:
+        """The task that these arguments ask for; a run that goes on keeps its own where none are given.
 
         Raises
         ------
         ConfigError, ProductError
             They do not go together.
         """
-        return self._known(name).make(dict(arguments), shelf)
+        arguments = self.arguments(name, given)
+        if given.get("resume") is not None:
+            arguments = {key: value if key in given else None for key, value in arguments.items()}
+        return self._known(name).make(arguments, shelf)
 
     def _known(self, name: str) -> Offer:
         if name not in self._offers:
