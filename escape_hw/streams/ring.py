@@ -208,7 +208,8 @@ class RingReader:
         self.name = name
         self._memory = segments.attach(name)
         _, _, self.pid, self._started = segments.IDENTITY.unpack_from(self._memory)
-        self.slots, self.capacity = layout.GEOMETRY.unpack_from(self._memory, segments.IDENTITY.size)
+        geometry: tuple[int, int] = layout.GEOMETRY.unpack_from(self._memory, segments.IDENTITY.size)
+        self.slots, self.capacity = geometry
         self._stride = layout.slot_bytes(self.capacity)
         if len(self._memory) != layout.HEADER_BYTES + self.slots * self._stride:
             self._memory.close()
