@@ -69,5 +69,7 @@ def _number(parameter: Parameter, value: Value) -> float | int:
         unit = f" {parameter.unit}" if parameter.unit else ""
         least = "" if low is None else f"at least {low:g}"
         most = "" if high is None else f"at most {high:g}"
-        raise ConfigError(f"{name} is {value:g}; it must be {' and '.join(filter(None, (least, most)))}{unit}")
+        raise ConfigError(
+            f"{name} is {value:g}; it must be {' and '.join(filter(None, (least, most)))}{unit}"
+        )
     return int(value) if whole else float(value)

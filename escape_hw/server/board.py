@@ -70,7 +70,9 @@ class Board:
         if self.fault is not None:
             raise RequestRefused(f"made safe: {self.fault.reason}; clear the fault first")
         if self.running is not None:
-            raise RequestRefused(f"'{self.running.name}' (run {self.running.id}) is running; abort it, or wait")
+            raise RequestRefused(
+                f"'{self.running.name}' (run {self.running.id}) is running; abort it, or wait"
+            )
         if self.phase is Phase.LOOP:
             raise RequestRefused("the loop is closed; open it first")
         if self.phase is not Phase.IDLE:

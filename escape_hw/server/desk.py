@@ -175,7 +175,9 @@ class Desk:
         if board.running is None:
             raise RequestRefused("nothing is running")
         if board.needs_loop:
-            raise RequestRefused(f"'{board.running.name}' works in closed loop and cannot be halted; abort it")
+            raise RequestRefused(
+                f"'{board.running.name}' works in closed loop and cannot be halted; abort it"
+            )
         board.paused = True
         return None
 

@@ -57,9 +57,7 @@ class Engine:
         self.channel, self.setup = channel, setup
         self.config = load_text(setup.config_text)
         loop = self.config.loop
-        self.board = Board(
-            LoopSettings(gain=loop.gain, leak=loop.leak, dropped_modes=loop.dropped_modes)
-        )
+        self.board = Board(LoopSettings(gain=loop.gain, leak=loop.leak, dropped_modes=loop.dropped_modes))
         self.bench = System.from_config(self.config)
         self.publisher = Publisher(self.config.system.name)
         self.shelf = Shelf((setup.runs, *setup.reads))
@@ -71,9 +69,7 @@ class Engine:
         self._flat_lock = threading.Lock()
         self._ending = threading.Event()
         self._slopes: tuple[object, Any] = (None, None)
-        self.pulse = Pulse(
-            self.bench, self.board, self.publisher, self.shelf, setup.runs, self._tell_state
-        )
+        self.pulse = Pulse(self.bench, self.board, self.publisher, self.shelf, setup.runs, self._tell_state)
 
     # ------------------------------------------------------------ for other threads
     def post(self, job: Job) -> None:
@@ -172,7 +168,9 @@ class Engine:
             try:
                 self.bench.dm.flatten()
             except DeviceError as error:
-                self.make_safe(str(error), "the mirror cannot be flattened from here: cut its power if in doubt")
+                self.make_safe(
+                    str(error), "the mirror cannot be flattened from here: cut its power if in doubt"
+                )
         self.answer_flat()
 
     def make_safe(self, reason: str, way_out: str) -> None:
@@ -279,5 +277,3 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
-
-

@@ -61,10 +61,9 @@ def do_task(engine: Engine, task: Task[Any], config: SystemConfig) -> None:
     finally:
         bench.config = usual
         board.closed = board.needs_loop = False
-    log.log(
-        logging.INFO if ended.finish is Finish.DONE else logging.WARNING,
-        "run %d: %s %s%s", ended.id, ended.name, ended.finish.value, f": {ended.message}" * bool(ended.message),
-    )  # fmt: skip
+    level = logging.INFO if ended.finish is Finish.DONE else logging.WARNING
+    why = f": {ended.message}" if ended.message else ""
+    log.log(level, "run %d: %s %s%s", ended.id, ended.name, ended.finish.value, why)
     _shelve(engine, ended)
     board.last, board.running = ended, None
     board.phase = Phase.IDLE if board.fault is None else Phase.FAULT
@@ -125,7 +124,9 @@ def _measured(engine: Engine, task: Task[Any], folder: RunFolder) -> tuple[Kept,
 
 def _place(engine: Engine, task: Task[Any], run: int) -> Path:
     now = datetime.now().astimezone()
-    return engine.setup.runs / f"{now:%Y-%m-%d}" / f"{now:%H%M%S}_{engine.config.system.name}_{task.kind}-{run}"
+    return (
+        engine.setup.runs / f"{now:%Y-%m-%d}" / f"{now:%H%M%S}_{engine.config.system.name}_{task.kind}-{run}"
+    )
 
 
 def _shelve(engine: Engine, ended: Ended) -> None:
@@ -191,7 +192,9 @@ def keep_loop_closed(engine: Engine, product: MatrixProduct) -> None:
 
 
 # ---------------------------------------------------------------- safety
-def make_safe_now(engine: Engine, reason: str, way_out: str = "look at the log, then clear the fault") -> None:
+def make_safe_now(
+    engine: Engine, reason: str, way_out: str = "look at the log, then clear the fault"
+) -> None:
     """Stop what runs, and latch the reason; from any thread."""
     log.error("FAULT: %s", reason)
     engine.board.latch(reason, way_out)

@@ -56,7 +56,7 @@ class LeaseBook:
         self._clients: dict[str, Client] = {}
         self._holder: Client | None = None
         self._since = ""
-        #: When the lease was last lost without being given back; ``None``: it is held, or was given back.
+        #: When the lease was last lost or given back; ``None``: it is held, or never was.
         self.lost_at: float | None = None
 
     @property
@@ -137,7 +137,7 @@ class LeaseBook:
         """Take the lease back from a client; does nothing when it has none."""
         if self._holder is client:
             log.info("%s gives the right to write back", client.words)
-            self._holder = None
+            self._holder, self.lost_at = None, self._clock()
 
     def require(self, client: Client) -> None:
         """Let pass who has the lease.
@@ -167,5 +167,5 @@ class LeaseBook:
             del self._clients[number]
 
     def lost_for(self) -> float:
-        """Seconds since the lease was lost and nobody took it up; 0 when that is not so."""
+        """Seconds since the lease was last held; 0 while it is, or when it never was."""
         return 0.0 if self.lost_at is None else self._clock() - self.lost_at

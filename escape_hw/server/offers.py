@@ -61,9 +61,7 @@ _SNR = Parameter(
 )
 _IM = Parameter(name="im", kind="matrix", help="Interaction matrix to close the loop with.")
 _CLOSED = Parameter(name="closed_loop", kind="matrix", help="Measure in closed loop, with this matrix.")
-_RESUME = Parameter(
-    name="resume", kind="text", help="Folder of a run that was broken off, to go on with it."
-)
+_RESUME = Parameter(name="resume", kind="text", help="Folder of a run that was broken off, to go on with it.")
 _STREHL = Parameter(
     name="strehl", kind="bool", default=True, help="Measure the model PSF and the Strehl ratios."
 )

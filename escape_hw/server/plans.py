@@ -108,4 +108,3 @@ class Planner:
         if arguments.get("snr") is not None or arguments.get("accuracy") is not None:
             found.append("it may stop earlier, when the target is reached")
         return found
-

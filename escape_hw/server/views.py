@@ -69,9 +69,7 @@ def light_of(frame: Frame, full_scale: int) -> Light:
 
 def geometry_of(bench: Bench, grid: SensorGeometry | None) -> Geometry:
     """Where slopes and actuators stand."""
-    valid = (
-        () if grid is None else tuple("".join("1" if one else "0" for one in row) for row in grid.valid)
-    )
+    valid = () if grid is None else tuple("".join("1" if one else "0" for one in row) for row in grid.valid)
     return Geometry(
         valid=valid,
         layout=layout_of(bench),
