@@ -111,7 +111,7 @@ class Connection:
         """Give the lease back and hang up; what runs goes on as long as somebody else takes it up."""
         if self._closed:
             return
-        if self._beating:
+        if self._beating and self.connected:
             self.release()
         self._closed = True
         self._link.close()

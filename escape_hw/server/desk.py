@@ -88,6 +88,9 @@ class Desk:
                 )
 
     def _take(self, message: dict[str, Any]) -> None:
+        if "end" in message:
+            self._engine.end()
+            return
         if "fault" in message:
             jobs.make_safe_now(self._engine, str(message["fault"]), str(message.get("way_out", "")))
             return

@@ -32,7 +32,8 @@ from escape_hw.server.setup import Setup
 from escape_hw.server.shelf import Shelf
 from escape_hw.server.wire_log import WireLog
 
-log = logging.getLogger(__name__)
+# Run as a program it would be called otherwise, and nobody would hear it.
+log = logging.getLogger("escape_hw.server.engine")
 
 #: Frames per wall-clock second that are looked at while nothing runs.
 WATCH_HZ = 25.0

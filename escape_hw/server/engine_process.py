@@ -116,6 +116,11 @@ class EngineProcess:
         """Whether the guardian is still there."""
         return self._guardian.poll() is None
 
+    def hang_up(self) -> None:
+        """Say no more; an engine that notices it stops, the mirror flat."""
+        with contextlib.suppress(OSError):
+            self.connection.shutdown(socket.SHUT_WR)
+
     def kill(self) -> None:
         """End an engine that does not answer any more; the guardian does the rest."""
         with contextlib.suppress(ProcessLookupError):

@@ -72,6 +72,7 @@ class Front:
         self._setup = Setup(config_text=config.to_toml(), runs=runs, reads=reads)
         self._pending: dict[int, Pending] = {}
         self._next, self._ticked, self._ending, self._asked = 0, 0.0, False, False
+        self._condemned = ""
         self._state = State(
             at_utc=utc_text(), server_pid=os.getpid(), version=software_version(),
             system=config.system.name, simulated=config.simulated, seed=config.system.seed, notes=notes,
@@ -116,13 +117,13 @@ class Front:
         if self._engine is None:
             self._ending = True
         else:
-            self._engine.send({"id": self._number(), "request": _plain(ask.Shutdown(client="front-00"))})
+            self._engine.send({"end": True})
 
     def _close(self) -> None:
         engine, self._engine = self._engine, None
         clean = True
         if engine is not None:
-            engine.connection.close()  # its end makes the engine stop
+            engine.hang_up()
             clean = engine.close()
         self._state = self._state.model_copy(
             update={"phase": Phase.STOPPED, "serial": self._state.serial + 1}
@@ -131,7 +132,6 @@ class Front:
         if clean:
             self._journal.close()
         self._samples.close()
-        self._door.close()
         self._log.close()
 
     def _start_engine(self) -> EngineProcess:
@@ -181,8 +181,10 @@ class Front:
         engine.send({"fault": reason, "way_out": way_out})
 
     def _condemn(self, engine: EngineProcess, reason: str) -> None:
-        log.error("%s; it is ended, and the guardian makes the mirror safe", reason)
-        engine.kill()
+        if not self._condemned:
+            self._condemned = reason
+            log.error("%s; it is ended, and the guardian makes the mirror safe", reason)
+            engine.kill()
 
     def _bury(self, engine: EngineProcess) -> None:
         """The engine has ended: in order, or the guardian has something to tell."""
@@ -198,7 +200,8 @@ class Front:
             return
         incident = self._journal.incident(engine.pid)
         done = "its guardian left no word; look at the mirror" if incident is None else incident.mirror
-        reason = f"the engine (process {engine.pid}) died; {done}"
+        reason = f"{self._condemned or f'the engine (process {engine.pid}) died'}; {done}"
+        self._condemned = ""
         log.error("FAULT: %s", reason)
         fault = self._state.fault or Fault(reason=reason, at_utc=utc_text(), way_out=_WAY_OUT)
         self._became(
@@ -227,9 +230,9 @@ class Front:
                 self._door.publish("progress", message["progress"])
             elif "run" in message:
                 self._journal.write(message["run"])
+                self._setup = self._setup.model_copy(update={"first_run": message["run"]["id"] + 1})
             elif "ended" in message:
                 ended = Ended.model_validate(message["ended"])
-                self._setup = self._setup.model_copy(update={"first_run": ended.id + 1})
                 self._journal.write(None)
                 self._door.publish("ended", ended)
 
