@@ -7,20 +7,20 @@ from dataclasses import dataclass, field
 
 from escape_hw.api.flag import Flag
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.calibration.loop_orders import LoopOrders
 from escape_hw.errors import RequestRefused
 from escape_hw.io.provenance import utc_text
 from escape_hw.remote.state import Ended, Fault, Phase, Running
 
 
-@dataclass(slots=True)
-class LoopSettings:
-    """How the loop is closed; ``version`` counts the changes."""
+@dataclass(frozen=True, slots=True)
+class LoopChoice:
+    """How the loop is closed, or would be; the matrix by its name."""
 
     matrix: str = ""
     gain: float = 0.0
     leak: float = 0.0
     dropped_modes: int = 0
-    version: int = 0
 
 
 @dataclass(slots=True)
@@ -35,13 +35,15 @@ class Board:
         Whether the procedure is asked to halt.
     closed
         Whether the loop is closed.
+    orders, loop_metrics
+        What a loop that stays closed is asked, and what it tells of itself.
     complaints
         What devices were last heard to complain of, by name.
     grid
         The sensor's geometry, once known.
     """
 
-    loop: LoopSettings
+    loop: LoopChoice
     phase: Phase = Phase.STARTING
     fault: Fault | None = None
     running: Running | None = None
@@ -49,6 +51,8 @@ class Board:
     stop: Flag = field(default_factory=Flag)
     paused: bool = False
     closed: bool = False
+    orders: LoopOrders | None = None
+    loop_metrics: dict[str, float] = field(default_factory=dict)
     needs_loop: bool = False
     complaints: dict[str, str] = field(default_factory=dict)
     grid: SensorGeometry | None = None

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 from escape_hw.errors import ConfigError, RequestRefused
 from escape_hw.remote import requests as ask
 from escape_hw.remote.faults import to_wire
-from escape_hw.remote.state import Phase
 from escape_hw.server import jobs
 from escape_hw.server.offers import needs_loop
 from escape_hw.server.views import geometry_of
@@ -194,18 +193,12 @@ class Desk:
         engine = self._engine
         with engine.board.lock:
             engine.board.require_idle()
-            jobs.change_loop(engine, request)
-            product = jobs.fitting(engine, request.matrix)
-            engine.board.phase, engine.board.needs_loop = Phase.LOOP, True
-            engine.board.stop = type(engine.board.stop)()
-        engine.post(lambda: jobs.keep_loop_closed(engine, product))
+            jobs.close_loop(engine, request)
         return None
 
     def _set_loop(self, request: ask.SetLoop, number: int) -> object:
         engine = self._engine
         with engine.board.lock:
-            if request.matrix is not None:
-                jobs.fitting(engine, request.matrix)
             jobs.change_loop(engine, request)
         return None
 

@@ -14,6 +14,9 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from escape_hw.api.procedure import Progress
 from escape_hw.calibration.acquire import go_to
 from escape_hw.calibration.sensor_setup import extractor
@@ -21,7 +24,7 @@ from escape_hw.config.load import load_text
 from escape_hw.errors import DeviceError, EscapeError, FrameTimeout
 from escape_hw.remote.state import Phase, State
 from escape_hw.runtime.system import System
-from escape_hw.server.board import Board, LoopSettings
+from escape_hw.server.board import Board, LoopChoice
 from escape_hw.server.channel import Channel
 from escape_hw.server.desk import Desk
 from escape_hw.server.offers import Offers
@@ -58,13 +61,15 @@ class Engine:
         self.channel, self.setup = channel, setup
         self.config = load_text(setup.config_text)
         loop = self.config.loop
-        self.board = Board(LoopSettings(gain=loop.gain, leak=loop.leak, dropped_modes=loop.dropped_modes))
+        self.board = Board(LoopChoice(gain=loop.gain, leak=loop.leak, dropped_modes=loop.dropped_modes))
         self.bench = System.from_config(self.config)
         self.publisher = Publisher(self.config.system.name)
         self.shelf = Shelf((setup.runs, *setup.reads))
         self.offers = Offers(self.config)
         self.planner = Planner(self.bench)
         self.next_run = setup.first_run
+        #: What an image without turbulence looks like, once it was measured.
+        self.model_psf: NDArray[np.float32] | None = None
         self._jobs: SimpleQueue[Job] = SimpleQueue()
         self._flat: list[int] = []
         self._flat_lock = threading.Lock()
@@ -106,6 +111,7 @@ class Engine:
         self.board.phase = Phase.STARTING
         try:
             self.bench.open()
+            self.publisher.top = self.bench.wfs.info.full_scale
             self.bench.taps = self.publisher.taps
             self.bench.dm.flatten()
             self.board.complaints.clear()
@@ -237,6 +243,8 @@ class Engine:
                 }
             )  # fmt: skip
             self.channel.post({"progress": board.running.model_dump(mode="json")})
+        elif board.orders is not None:
+            board.loop_metrics = dict(progress.metrics)
         if progress.arrays:
             self.publisher.arrays(progress.arrays, stage=progress.stage, done=float(progress.done))
         if board.paused:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from escape_hw.api.flag import Flag
 from escape_hw.api.procedure import run as run_procedure
+from escape_hw.calibration.endless_loop import keep_closed
+from escape_hw.calibration.loop_orders import LoopOrders
 from escape_hw.config.load import load_text
 from escape_hw.config.models import SystemConfig
 from escape_hw.errors import Aborted, CommandRejected, DeviceError, EscapeError, SettingRejected
@@ -21,7 +24,7 @@ from escape_hw.remote.requests import CloseLoop, SetLoop
 from escape_hw.remote.state import Ended, Finish, Phase, Running
 from escape_hw.runtime.records import BenchRecord
 from escape_hw.runtime.task import Kept, Task, fitting_matrix, refuse_simulated
-from escape_hw.server.closed_loop import keep_closed
+from escape_hw.server.board import LoopChoice
 
 if TYPE_CHECKING:
     from escape_hw.server.engine import Engine
@@ -114,12 +117,21 @@ def _measured(engine: Engine, task: Task[Any], folder: RunFolder) -> tuple[Kept,
     # Whoever asked for a flat mirror does not wait for files.
     engine.answer_flat()
     engine.board.closed = False
-    grid = getattr(result, "grid", None)
-    engine.board.grid = engine.board.grid if grid is None else grid
+    _learn(engine, result)
     kept = task.keep(folder, record, result, time.monotonic() - began)
     if stop is None:
         task.done()
     return kept, stop
+
+
+def _learn(engine: Engine, result: object) -> None:
+    """Keep what a result tells of the bench: where the slopes are, what an image should look like."""
+    grid, psf = getattr(result, "grid", None), getattr(result, "model_psf", None)
+    if grid is not None:
+        engine.board.grid = grid
+    if psf is not None:
+        engine.model_psf = psf
+        engine.publisher.arrays({"model_psf": psf})
 
 
 def _place(engine: Engine, task: Task[Any], run: int) -> Path:
@@ -154,38 +166,78 @@ def fitting(engine: Engine, name: str) -> MatrixProduct:
     return product
 
 
-def change_loop(engine: Engine, request: CloseLoop | SetLoop) -> None:
-    """Change the loop's parameters; what is absent stays. A closed loop takes them up at once."""
-    loop = engine.board.loop
-    said = []
-    for key in ("matrix", "gain", "leak", "dropped_modes"):
-        value = getattr(request, key)
-        if value is not None and value != getattr(loop, key):
-            said.append(f"{key} {getattr(loop, key)} -> {value}")
-            setattr(loop, key, value)
-    loop.version += 1
-    if said:
-        log.info("loop: %s", ", ".join(said))
+def close_loop(engine: Engine, request: CloseLoop) -> None:
+    """Close the loop and keep it closed until it is told to open.
+
+    Raises
+    ------
+    ConfigError, ProductError, IncompatibleProduct, CalibrationError
+        The parameters mean nothing, or the matrix belongs elsewhere; nothing moves.
+    """
+    board = engine.board
+    wanted = _wanted(engine, request)
+    product = fitting(engine, wanted.matrix)
+    orders = LoopOrders(
+        engine.bench, product.result,
+        gain=wanted.gain, leak=wanted.leak, dropped_modes=wanted.dropped_modes,
+    )  # fmt: skip
+    board.loop, board.orders = wanted, orders
+    board.phase, board.stop, board.needs_loop = Phase.LOOP, Flag(), True
+    engine.post(lambda: _keep_loop_closed(engine, orders))
 
 
-def keep_loop_closed(engine: Engine, product: MatrixProduct) -> None:
-    """Close the loop and keep it closed until it is told to open."""
+def change_loop(engine: Engine, request: SetLoop) -> None:
+    """Change the loop's parameters; what is absent stays. A closed loop takes them up at once.
+
+    Raises
+    ------
+    ConfigError, ProductError, IncompatibleProduct, CalibrationError
+        As for :func:`close_loop`; the loop goes on as it was.
+    """
+    board = engine.board
+    wanted = _wanted(engine, request)
+    product = None if request.matrix is None else fitting(engine, request.matrix)
+    if board.orders is not None:
+        board.orders.change(
+            closing=None if product is None else product.result,
+            gain=request.gain, leak=request.leak, dropped_modes=request.dropped_modes,
+        )  # fmt: skip
+    said = [
+        f"{key} {old} -> {new}"
+        for key, old, new in zip(
+            asdict(wanted), asdict(board.loop).values(), asdict(wanted).values(), strict=True
+        )
+        if old != new
+    ]
+    board.loop = wanted
+    log.info("loop: %s", ", ".join(said) or "as it was")
+
+
+def _wanted(engine: Engine, request: CloseLoop | SetLoop) -> LoopChoice:
+    asked = {key: getattr(request, key) for key in ("matrix", "gain", "leak", "dropped_modes")}
+    return replace(engine.board.loop, **{key: value for key, value in asked.items() if value is not None})
+
+
+def _keep_loop_closed(engine: Engine, orders: LoopOrders) -> None:
     board, bench = engine.board, engine.bench
     bench.wfs.stop()
-    board.grid, board.closed = product.grid, True
+    board.grid, board.closed = orders.settings.closing.grid, True
     log.info("loop closed on '%s', gain %g", board.loop.matrix, board.loop.gain)
     try:
-        run_procedure(
-            keep_closed(bench, product, board.loop, lambda name: fitting(engine, name)),
+        end = run_procedure(
+            keep_closed(bench, orders, model_psf=engine.model_psf),
             observers=(engine.observe,), abort=board.stop,
         )  # fmt: skip
-        engine.make_safe("the loop diverged and was opened", "lower the gain or take another matrix")
+        log.info("loop open after %d frames, %d lost; mirror flat", end.frames, end.lost_frames)
+        if end.fault:
+            engine.make_safe(f"the loop was opened: {end.fault}", "mend it, then clear the fault")
     except Aborted:
         log.info("loop open, mirror flat")
     except EscapeError as error:
         engine.make_safe(str(error), "mend it, then clear the fault")
     finally:
         board.closed = board.needs_loop = False
+        board.orders, board.loop_metrics = None, {}
         if board.phase is Phase.LOOP:
             board.phase = Phase.IDLE
         engine.answer_flat()

@@ -16,14 +16,17 @@ from escape_hw.runtime.calibration_task import CalibrationRequest, CalibrationTa
 from escape_hw.runtime.gains_task import GainsTask
 from escape_hw.runtime.loop_task import LoopTask
 from escape_hw.runtime.procedures import CLOSED_LOOP
+from escape_hw.runtime.psf_task import PsfTask
 from escape_hw.runtime.sensor_task import SensorTask
 from escape_hw.runtime.task import Task
 from escape_hw.runtime.track_task import TrackTask
 from escape_hw.server.arguments import completed
 from escape_hw.server.shelf import Shelf
 
+#: Science frames of a model PSF.
+_PSF_FRAMES = 20
 #: DO-CRIME's pokes, as the configuration names them.
-_POKES = ("white", "shaped", "equal-snr")
+_POKES: tuple[str, ...] = ("white", "shaped", "equal-snr")
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +204,9 @@ def _others(config: SystemConfig) -> list[Offer]:
          (_IM, seconds, _poke(t.poke), memory, gain, exchange, _STREHL), _track),
         ("sensor", "Find the sensor", "Watch the sensor and find its sub-apertures; the mirror stays flat.",
          (_frames(SETUP_FRAMES),), lambda arguments, shelf: SensorTask(int(arguments["frames"] or 1))),
+        ("model-psf", "Model PSF", "Image without turbulence, which Strehl ratios are measured against.",
+         (_frames(_PSF_FRAMES, "Science frames to average."),),
+         lambda arguments, shelf: PsfTask(int(arguments["frames"] or 1))),
     ]  # fmt: skip
     return [
         Offer(ProcedureEntry(name=name, title=title, help=help, parameters=parameters), make)

@@ -51,6 +51,16 @@ class Publisher:
         self.command: NDArray[np.float64] | None = None
         self.frames = self.commands = 0
         self.residual_nm = 0.0
+        self._top = b""
+
+    @property
+    def top(self) -> float:
+        """Value at which a pixel of the sensor's camera is saturated; 0: unknown."""
+        return float(json.loads(self._top or b'{"top": 0}')["top"])
+
+    @top.setter
+    def top(self, counts: float) -> None:
+        self._top = json.dumps({"top": counts}).encode()
 
     @property
     def taps(self) -> Taps:
@@ -109,7 +119,7 @@ class Publisher:
     def _frame(self, frame: Frame) -> None:
         self.frame = frame
         self.frames += 1
-        self._write("frames", frame.data, frame.index, frame.exposed_ns)
+        self._write("frames", frame.data, frame.index, frame.exposed_ns, self._top)
 
     def _science(self, frame: Frame) -> None:
         self._write("psf", frame.data, frame.index, frame.exposed_ns)
@@ -126,10 +136,12 @@ class Publisher:
         self.residual_nm = rms
         self._write("modes", modes, index)
 
-    def _write(self, name: str, data: NDArray[Any], index: int, exposed_ns: int = 0) -> None:
+    def _write(
+        self, name: str, data: NDArray[Any], index: int, exposed_ns: int = 0, meta: bytes = b""
+    ) -> None:
         ring = self._rings.get(name)
         if ring is None or data.nbytes > ring.capacity:
             ring = self._ring(name, data)
             if ring is None:
                 return
-        ring.write(data, index, exposed_ns, time.monotonic_ns())
+        ring.write(data, index, exposed_ns, time.monotonic_ns(), meta)

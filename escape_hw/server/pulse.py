@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import shutil
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,8 +49,8 @@ class Pulse:
         The bench; its devices are asked for what they remember, never for anything new.
     tell
         Gets each state.
-    telemetry, latency
-        What the recorder and the loop's clock say.
+    telemetry
+        What the recorder says.
     """
 
     def __init__(
@@ -61,10 +62,9 @@ class Pulse:
         runs: Path,
         tell: Callable[[State], object],
         telemetry: Callable[[], Telemetry] = Telemetry,
-        latency: Callable[[], Latency] = Latency,
     ) -> None:
         self._bench, self._board, self._publisher, self._shelf = bench, board, publisher, shelf
-        self._runs, self._tell, self._telemetry, self._latency = runs, tell, telemetry, latency
+        self._runs, self._tell, self._telemetry = runs, tell, telemetry
         self._ending = threading.Event()
         self._last: Frame | None = None
         self._rate = 0.0
@@ -105,11 +105,12 @@ class Pulse:
             at_utc=utc_text(), engine_pid=os.getpid(), version=software_version(),
             system=bench.config.system.name, simulated=bench.simulated, seed=bench.config.system.seed,
             phase=board.phase, fault=board.fault, devices=device_states(bench, dict(board.complaints)),
-            rates=self._rates(frame), mirror=self._mirror(), latency=self._latency(),
+            rates=self._rates(frame), mirror=self._mirror(), latency=_latency(board.loop_metrics),
             loop=LoopState(
                 closed=board.closed, matrix=loop.matrix, gain=loop.gain, leak=loop.leak,
                 dropped_modes=loop.dropped_modes, modes=bench.config.basis.n_modes,
                 residual_nm=publisher.residual_nm if board.closed else 0.0,
+                strehl=board.loop_metrics.get("strehl"), strehl_sigma=board.loop_metrics.get("strehl_sigma"),
             ),
             procedure=board.running, last=board.last, products=self._shelf.products,
             telemetry=self._telemetry(), disk=self._disk(), streams=publisher.entries, **light,
@@ -141,3 +142,10 @@ class Pulse:
     def _disk(self) -> Disk:
         folder = next(one for one in (self._runs, *self._runs.parents) if one.exists())
         return Disk(folder=str(self._runs), free_gb=shutil.disk_usage(folder).free / 1e9)
+
+
+def _latency(metrics: Mapping[str, float]) -> Latency:
+    """What a loop that stays closed tells of its times; NaN while it has none."""
+    names = {"p50": "latency_p50", "p99": "latency_p99", "largest": "latency_max", "jitter_p99": "jitter_p99"}
+    known = {key: metrics.get(name, math.nan) for key, name in names.items()}
+    return Latency(**{key: value for key, value in known.items() if math.isfinite(value)})

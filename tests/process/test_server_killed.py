@@ -60,7 +60,7 @@ def test_the_guardian_flattens_the_mirror_of_an_engine_that_was_killed(system, b
         wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
         os.kill(running, signal.SIGKILL)
         with pytest.raises(
-            CalibrationError, match="ended with its engine: the engine .* died; the mirror is flat"
+            CalibrationError, match=r"ended with its engine: the engine .* died; the mirror is flat"
         ):
             run.wait(60)
         assert spy.flat
@@ -124,7 +124,7 @@ def test_fifty_kills_at_random_moments_of_a_calibration(system, bench, tmp_path)
                 engine = client.state.engine_pid
                 if which == "engine":
                     os.kill(engine, signal.SIGKILL)
-                    wait_for(lambda: client.state.fault is not None, "the fault is latched")  # noqa: B023
+                    wait_for(lambda: client.state.fault is not None, "the fault is latched")
                     assert "the mirror is flat" in client.state.fault.reason
                 else:
                     served.kill()
