@@ -110,7 +110,8 @@ def arrange(window: QMainWindow, docks: dict[str, QDockWidget], plan: Workspace)
     for _, cells in columns:
         for cell in cells:
             _front(docks, cell).raise_()
-    _resize(window, docks, columns, heads)
+    if columns:
+        _resize(window, docks, columns, heads)
     for name in docks.keys() - set(plan.panels):
         # Where the View menu will show it.
         window.addDockWidget(Qt.DockWidgetArea.RightDockWidgetArea, docks[name])

@@ -219,13 +219,10 @@ class LoopPanel(Panel):
         if problems := edit.problems(self._loop):
             self.message.setText("\n".join(problems))
             return
-        values = {"leak": edit.leak, "dropped_modes": edit.dropped_modes}
-        if edit.gain > 0:
-            values["gain"] = edit.gain
         self.message.setText("Closing the loop…")
         commands.ask(
             "close the loop",
-            lambda server: server.close_loop(edit.matrix, **values),
+            lambda server: server.close_loop(edit.matrix, edit.gain or None, edit.leak, edit.dropped_modes),
             self._applied,
             self._refused,
         )
