@@ -2,36 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
-
-from numpy.typing import NDArray
+from collections.abc import Sequence
+from typing import Protocol
 
 from escape_hw.remote.state import Arguments, Geometry, LogLine, Plan, ProcedureEntry, State
+from escape_hw.streams.sample import Sample
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sample:
-    """One entry of a stream, copied out of its memory.
-
-    Parameters
-    ----------
-    index
-        Number of the entry; of frame streams the frame's index.
-    exposed_ns, arrived_ns
-        When it was taken and when it was written, monotonic nanoseconds.
-    data
-        The entry's own array.
-    meta
-        Short description of the entry: ``{"stage": ..., "frames": ...}``.
-    """
-
-    index: int
-    exposed_ns: int
-    arrived_ns: int
-    data: NDArray[Any]
-    meta: Mapping[str, float | str]
+__all__ = ["STREAMS", "Sample", "Source"]
 
 
 class Source(Protocol):
@@ -77,11 +54,14 @@ class Source(Protocol):
 #: Streams by name, with the shape and unit of an entry. Frame streams have one entry per frame.
 STREAMS: dict[str, str] = {
     # per frame
-    "frames": "raw frame of the sensor's camera (rows, columns), counts",
+    "frames": "raw frame of the sensor's camera (rows, columns), counts; meta 'top': where pixels saturate",
     "slopes": "(n_slopes,), pixel",
     "modes": "reconstructed residual (n_modes,), nm rms wavefront; closed loop only",
     "commands": "what the mirror got (n_act,), fraction of full stroke",
     "psf": "science frame (rows, columns), counts",
+    # seldom
+    "model_psf": "image that the Strehl ratio is measured against (rows, columns), scale of 'psf'",
+    "latency_histogram": "counts in the bins of streams.histogram (2, bins): latency, spacing of frames",
     # a few times a second, while something is measured
     "measured_positions": "(n_act,), metres; adaptive secondaries only",
     "matrix": "interaction matrix as measured so far (n_slopes, n_modes), slopes per unit mode",
