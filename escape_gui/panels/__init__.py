@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 from escape_gui.panels.devices import DevicesPanel
+from escape_gui.panels.gains import GainsPanel
+from escape_gui.panels.modes import ModesPanel
 from escape_gui.panels.panel import Panel
+from escape_gui.panels.procedure import ProcedurePanel
+from escape_gui.panels.sprint import SprintPanel
 
 #: All panels, in the order in which the View menu and F6 go through them. A panel is added here and
 #: in :data:`escape_gui.workspaces.WORKSPACES`.
-PANELS: tuple[type[Panel], ...] = (DevicesPanel,)
+PANELS: tuple[type[Panel], ...] = (
+    DevicesPanel,
+    ProcedurePanel,
+    ModesPanel,
+    SprintPanel,
+    GainsPanel,
+)

@@ -88,20 +88,24 @@ class GainsPanel(Panel):
         gains = self._live.get("gains")
         if gains is not None and (self._running or self._label not in found):
             found[self._label] = live_curve(
-                self._label, gains, *(self._live.get(f"gains_{name}") for name in ("sigma", "smooth", "rounds"))
+                self._label,
+                gains,
+                *(self._live.get(f"gains_{name}") for name in ("sigma", "smooth", "rounds")),
             )
         return dict(sorted(found.items(), key=lambda item: item[1].middle))
 
     def _fill_legend(self) -> None:
         while (item := self._legend.takeAt(0)) is not None:
-            item.widget().deleteLater()
+            if (old := item.widget()) is not None:
+                old.deleteLater()
         on = self.plot.labels
         for k, (label, curve) in enumerate(self._curves.items()):
             side = f", {on[label]} axis" if len(set(on.values())) > 1 else ""
             rounds = f", {len(curve.rounds)} rounds" if len(curve.rounds) > 1 else ""
             mean = f"median {curve.middle:.3f}" if np.isfinite(curve.middle) else "no smooth course yet"
             colour = self.context.theme.series(k).name()
-            words = QLabel(f"<span style='color:{colour}'>{MARKERS[k % len(MARKERS)][1]}</span> {label}: {mean}{side}{rounds}")
+            sign = f"<span style='color:{colour}'>{MARKERS[k % len(MARKERS)][1]}</span>"
+            words = QLabel(f"{sign} {label}: {mean}{side}{rounds}")
             words.setWordWrap(True)
             self._legend.addWidget(words)
 

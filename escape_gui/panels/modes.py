@@ -72,8 +72,8 @@ class ModesPanel(Panel):
             button.clicked.connect(lambda _=False, step=step: self.mosaic.turn_to(self.mosaic.page[0] + step))
         self._pages = QLabel()
         row = QHBoxLayout()
-        for widget in (self.which, self.fade):
-            row.addWidget(widget)
+        row.addWidget(self.which)
+        row.addWidget(self.fade)
         row.addStretch()
         for widget in (self._back, self._pages, self._on):
             row.addWidget(widget)
@@ -125,7 +125,9 @@ class ModesPanel(Panel):
         data = self._live.get("matrix")
         if data is not None and 2 * int(self._valid.sum()) != len(data):
             rows = source.geometry().valid
-            self._valid = np.array([[spot == "1" for spot in row] for row in rows], bool).reshape(len(rows), -1)
+            self._valid = np.array([[spot == "1" for spot in row] for row in rows], bool).reshape(
+                len(rows), -1
+            )
         self._dirty = False
         self._fill_list()
         if self.matrices:
@@ -184,7 +186,9 @@ class ModesPanel(Panel):
         found = self.matrices
         chosen = str(self.which.currentData())
         others = [name for name in found if name != chosen][: _MOST - 1]
-        self.detail.show_tiles(tiles({name: found[name] for name in found if name in (*others, chosen)}, mode))
+        self.detail.show_tiles(
+            tiles({name: found[name] for name in found if name in (*others, chosen)}, mode)
+        )
         self.detail.show()
         self._words.setText(self._about(mode))
 

@@ -128,7 +128,9 @@ class SprintPanel(Panel):
         level = {None: Level.ACTIVE, True: Level.GOOD, False: Level.BAD}[self._course.converged]
         self._pill.show_condition(level, self._course.headline())
         for k, label in enumerate(self._values):
-            label.setText(with_error(Measured(float(self._course.values[-1, k]), _error(self._course.sigma[k]))))
+            label.setText(
+                with_error(Measured(float(self._course.values[-1, k]), _error(self._course.sigma[k])))
+            )
         self._say_notes()
 
     def _say_notes(self) -> None:
@@ -164,7 +166,9 @@ class SprintPanel(Panel):
         if track is not None:
             drift = Drift.of(track)
             heads = ("time", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS))
-            found.append(Shown("track", np.column_stack([track[:, 0], drift.values, drift.sigma]), columns=heads))
+            found.append(
+                Shown("track", np.column_stack([track[:, 0], drift.values, drift.sigma]), columns=heads)
+            )
         return tuple(found)
 
 

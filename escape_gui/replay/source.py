@@ -57,9 +57,6 @@ class ReplaySource:
         It is no run and no product, or it is damaged.
     """
 
-    #: Streams know a recording by this.
-    commands = None
-
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self.run: RunContent = read_run(self.path) if self.path.is_dir() else read_product(self.path)

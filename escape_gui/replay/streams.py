@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_gui.views.convergence import TO_PAPER
 from escape_hw.api.gains import GainsResult
-from escape_hw.api.registration import PARAMETERS
+from escape_hw.api.registration import PARAMETERS, TO_PLAIN
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.report.content import RunContent
 
@@ -80,19 +79,17 @@ def _sprint(estimate: RegistrationEstimate) -> dict[str, Course]:
     steps = estimate.iterations
     if not steps:
         return {}
-    path = np.array([step.registration.to_array() for step in steps]) / TO_PAPER
+    path = np.array([step.registration.to_array() for step in steps]) * TO_PLAIN
     # The steps tell how the fit went; what came of it, model errors included, is the last word.
-    path[-1] = estimate.registration.to_array() / TO_PAPER
+    path[-1] = estimate.registration.to_array() * TO_PLAIN
     norm = np.array([step.step_norm for step in steps])
-    sigma, unknown = estimate.sigma / TO_PAPER, np.full(len(PARAMETERS), np.nan)
+    sigma, unknown = estimate.sigma * TO_PLAIN, np.full(len(PARAMETERS), np.nan)
     n = len(steps)
     meta: Meta = {"stage": "SPRINT"}
     return {
         "registration": Course(n, lambda k: path[:k], meta),
         "step_norm": Course(n, lambda k: norm[:k], meta),
-        "registration_sigma": Course(
-            n, lambda k: sigma if k == n else unknown, meta
-        ),
+        "registration_sigma": Course(n, lambda k: sigma if k == n else unknown, meta),
     }
 
 
@@ -119,6 +116,8 @@ def _loop(label: str, loop: LoopResult) -> dict[str, Course]:
         found["commands"] = _still(loop.last_command, meta)
     if loop.psf is not None:
         found["psf"] = _still(loop.psf, meta)
+    if loop.model_psf is not None:
+        found["model_psf"] = _still(loop.model_psf, meta)
     residual = loop.residual_nm
     if residual.size:
         found["residual"] = Course(residual.size, lambda k: residual[:k], meta)
@@ -129,6 +128,6 @@ def _table(track: Mapping[str, Any]) -> NDArray[np.float64]:
     """Rows of the stream ``registration_track`` from the document's columns."""
     names = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS))
     table = np.array([track[name] for name in names], float).T
-    table[:, 1:6] /= TO_PAPER
-    table[:, 6:11] /= TO_PAPER
+    table[:, 1:6] *= TO_PLAIN
+    table[:, 6:11] *= TO_PLAIN
     return table

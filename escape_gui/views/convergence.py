@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.registration import PARAMETERS
+from escape_hw.api.registration import PARAMETERS, TO_PLAIN
 
 #: Names of the parameters for people, in the order of ``PARAMETERS``.
 NAMES = ("Shift x", "Shift y", "Rotation", "Radial scaling", "Tangential scaling")
@@ -20,8 +20,6 @@ GROUPS: tuple[tuple[str, str, tuple[int, ...]], ...] = (
 )
 #: Unit of each parameter, in their order.
 UNITS = tuple(next(unit for _, unit, members in GROUPS if k in members) for k in range(len(NAMES)))
-#: From the streams' units (sub-apertures, radians, fractions) to the paper's (Table 1).
-TO_PAPER = np.array([100.0, 100.0, 180.0 / np.pi, 100.0, 100.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,10 +52,10 @@ class Course:
         converged: bool | None = None,
     ) -> Course:
         """From the streams ``registration``, ``registration_sigma`` and ``step_norm``."""
-        values = np.asarray(registration, float).reshape(-1, len(PARAMETERS)) * TO_PAPER
+        values = np.asarray(registration, float).reshape(-1, len(PARAMETERS)) / TO_PLAIN
         errors = np.full(len(PARAMETERS), np.nan)
         if sigma is not None and np.size(sigma) == errors.size:
-            errors = np.asarray(sigma, float).ravel() * TO_PAPER
+            errors = np.asarray(sigma, float).ravel() / TO_PLAIN
         norm = np.full(len(values), np.nan)
         if step_norm is not None:
             # Read at another moment, it may be one iteration ahead or behind.
@@ -120,8 +118,8 @@ class Drift:
         return cls(
             seconds / size,
             unit,
-            table[:, 1:6] * TO_PAPER,
-            table[:, 6:11] * TO_PAPER,
+            table[:, 1:6] / TO_PLAIN,
+            table[:, 6:11] / TO_PLAIN,
             tuple((at / size, what) for at, what in marks),
         )
 

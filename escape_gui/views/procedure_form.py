@@ -18,8 +18,9 @@ NONE = "–"
 #: Words for parameters whose names do not read like words.
 _WORDS = {
     "snr": "SNR goal", "im": "Matrix", "closed_loop": "In closed loop on", "frames": "Frames", "poke": "Poke",
-    "accuracy": "Accuracy goal", "strehl": "Measure Strehl", "best": "Search best gain", "resume": "Resume run",
-    "plain": "Paper's estimator", "budget": "Strehl budget", "exchange": "Exchange matrix",
+    "accuracy": "Accuracy goal", "strehl": "Measure Strehl", "best": "Search best gain",
+    "resume": "Resume run", "plain": "Paper's estimator",
+    "budget": "Strehl budget", "exchange": "Exchange matrix",
 }  # fmt: skip
 
 
@@ -100,7 +101,9 @@ def duration(seconds: float) -> str:
 
 def plan_lines(plan: Plan) -> list[str]:
     """A plan in two lines: what it takes, and how far the mirror moves."""
-    stroke = "the mirror stays flat" if not plan.stroke else f"pokes reach {100 * plan.stroke:.3g} % of the stroke"
+    stroke = (
+        "the mirror stays flat" if not plan.stroke else f"pokes reach {100 * plan.stroke:.3g} % of the stroke"
+    )
     return [f"{plan.frames} frames, {duration(plan.seconds)} at the camera's rate", stroke]
 
 
@@ -131,7 +134,11 @@ def worst_mode(snr: np.ndarray[Any, np.dtype[np.float64]]) -> str:
 
 def ended_line(ended: Ended) -> str:
     """How a procedure ended, in one line."""
-    word = {Finish.DONE: "Done", Finish.ABORTED: "Aborted, what was measured is kept", Finish.FAILED: "Failed"}
+    word = {
+        Finish.DONE: "Done",
+        Finish.ABORTED: "Aborted, what was measured is kept",
+        Finish.FAILED: "Failed",
+    }
     return f"{word[ended.finish]}: {ended.name}" + (f". {ended.message}" if ended.message else "")
 
 

@@ -74,5 +74,7 @@ class ColourScale(QWidget):
         axis.setPen(self._theme.colour("line"))
         axis.setTextPen(text)
         axis.setTickFont(self._theme.font(0.9))
-        axis.setLabel(self._label, color=text.name(), **{"font-size": f"{self._theme.font(0.9).pointSizeF()}pt"})
+        axis.setLabel(
+            self._label, color=text.name(), **{"font-size": f"{self._theme.font(0.9).pointSizeF()}pt"}
+        )
         self.setFixedWidth(self._theme.pixels(64))

@@ -25,7 +25,9 @@ _DASHES = (
 )
 
 
-def style_axis(theme: Theme, axis: pg.AxisItem, label: str, unit: str = "", colour: QColor | None = None) -> None:
+def style_axis(
+    theme: Theme, axis: pg.AxisItem, label: str, unit: str = "", colour: QColor | None = None
+) -> None:
     """Give an axis its words and colours; the unit stands in brackets and is never scaled."""
     text = theme.colour("text") if colour is None else colour
     axis.setPen(theme.colour("line"))
@@ -68,7 +70,9 @@ class ErrorCurve:
             pen=pen, symbol=MARKERS[number % len(MARKERS)][0], symbolSize=size, symbolBrush=colour,
             symbolPen=None, connect="finite",
         )  # fmt: skip
-        bars = pg.ErrorBarItem(x=np.zeros(1), y=np.zeros(1), height=np.zeros(1), pen=pg.mkPen(colour, width=1))
+        bars = pg.ErrorBarItem(
+            x=np.zeros(1), y=np.zeros(1), height=np.zeros(1), pen=pg.mkPen(colour, width=1)
+        )
         bars.setVisible(False)
         return cls(line, bars)
 

@@ -72,7 +72,9 @@ class GainsPlot(QWidget):
         on = sides(self._curves)
         self._second = self._add_second(on) if "right" in on.values() else None
         style_axis(self._theme, self._plot.getAxis("bottom"), "Mode")
-        style_axis(self._theme, self._plot.getAxis("left"), _words(on, "left"), colour=self._colour(on, "left"))
+        style_axis(
+            self._theme, self._plot.getAxis("left"), _words(on, "left"), colour=self._colour(on, "left")
+        )
         self._plot.addItem(line_at(self._theme, 1.0, horizontal=True, label="1"))
         self._items: dict[str, tuple[list[pg.PlotCurveItem], ErrorCurve, Band]] = {}
         for number, label in enumerate(self._curves):

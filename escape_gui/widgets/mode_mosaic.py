@@ -104,7 +104,11 @@ class ModeMosaic(QWidget):
         return self._layout.per_page
 
     def show_matrix(
-        self, valid: NDArray[np.bool_], data: NDArray[np.floating], sigma: NDArray[np.floating] | None, fade: bool
+        self,
+        valid: NDArray[np.bool_],
+        data: NDArray[np.floating],
+        sigma: NDArray[np.floating] | None,
+        fade: bool,
     ) -> None:
         """Show a matrix ``(n_slopes, n_modes)``; ``fade`` draws uncertain modes pale."""
         same = data.shape == self._data.shape and np.array_equal(valid, self._valid)
@@ -186,7 +190,9 @@ class ModeMosaic(QWidget):
         height, width = self._layout.cell
         x, y = left - 1.5, top - self._layout.head - 1.5
         self._frame.setData(
-            [x, x + width, x + width, x, x], [y, y, y + height, y + height, y], pen=pg.mkPen(self._accent, width=2)
+            [x, x + width, x + width, x, x],
+            [y, y, y + height, y + height, y],
+            pen=pg.mkPen(self._accent, width=2),
         )
 
     def restyle(self) -> None:
