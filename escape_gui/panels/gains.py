@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QLabel, QVBoxLayout
+from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QLabel
 
 from escape_gui.library import Shelf
 from escape_gui.panels.panel import Context, Panel, Shown
@@ -47,10 +47,10 @@ class GainsPanel(Panel):
         self.rounds.setChecked(True)
         self.rounds.setToolTip("Draw the earlier rounds of the bootstrap as thin lines.")
         self.rounds.toggled.connect(self.plot.show_rounds)
-        self._legend = QVBoxLayout()
-        self._legend.setSpacing(2)
+        self._legend = QLabel()
+        self._legend.setWordWrap(True)
         row = QHBoxLayout()
-        row.addLayout(self._legend, 1)
+        row.addWidget(self._legend, 1)
         row.addWidget(self.rounds)
         self.body.addLayout(row)
         self.body.addWidget(self.plot, 1)
@@ -95,19 +95,15 @@ class GainsPanel(Panel):
         return dict(sorted(found.items(), key=lambda item: item[1].middle))
 
     def _fill_legend(self) -> None:
-        while (item := self._legend.takeAt(0)) is not None:
-            if (old := item.widget()) is not None:
-                old.deleteLater()
-        on = self.plot.labels
+        on, lines = self.plot.labels, []
         for k, (label, curve) in enumerate(self._curves.items()):
             side = f", {on[label]} axis" if len(set(on.values())) > 1 else ""
             rounds = f", {len(curve.rounds)} rounds" if len(curve.rounds) > 1 else ""
             mean = f"median {curve.middle:.3f}" if np.isfinite(curve.middle) else "no smooth course yet"
             colour = self.context.theme.series(k).name()
             sign = f"<span style='color:{colour}'>{MARKERS[k % len(MARKERS)][1]}</span>"
-            words = QLabel(f"{sign} {label}: {mean}{side}{rounds}")
-            words.setWordWrap(True)
-            self._legend.addWidget(words)
+            lines.append(f"{sign} {label}: {mean}{side}{rounds}")
+        self._legend.setText("<br>".join(lines))
 
     def clear(self) -> None:
         """Forget the gains of another source."""

@@ -7,8 +7,17 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QKeyEvent
-from PySide6.QtWidgets import QCheckBox, QComboBox, QHBoxLayout, QLabel, QPushButton, QSplitter
+from PySide6.QtGui import QKeyEvent, QResizeEvent
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QComboBox,
+    QHBoxLayout,
+    QLabel,
+    QPushButton,
+    QSizePolicy,
+    QSplitter,
+    QWidget,
+)
 
 from escape_gui.library import Shelf
 from escape_gui.panels.panel import Context, Panel, Shown
@@ -24,8 +33,12 @@ from escape_hw.report.content import METHOD_LABELS
 
 #: How the matrix that is being measured is called in the list.
 LIVE = "as measured now"
+#: What stands below the maps until something else is to be said.
+_HOW = "Each pair: x slopes left, y slopes right. Click a mode to see it in every matrix."
 #: Matrices that the detail has room for.
 _MOST = 4
+#: Shares of mosaic and detail, and the width from which on they stand beside each other.
+_SHARES, _WIDE = (550, 450), 900
 
 
 class ModesPanel(Panel):
@@ -86,14 +99,21 @@ class ModesPanel(Panel):
         self._scale.set_range(-LIMIT, LIMIT, "slope / rms slope of the mode")
         self.detail = MapTiles(theme)
         self.detail.hide()
-        self.splitter = QSplitter(Qt.Orientation.Horizontal)
-        for widget, share in ((self.mosaic, 3), (self._scale, 0), (self.detail, 2)):
-            self.splitter.addWidget(widget)
-            self.splitter.setStretchFactor(self.splitter.count() - 1, share)
+        maps = QWidget()
+        row = QHBoxLayout(maps)
+        row.setContentsMargins(0, 0, 0, 0)
+        row.addWidget(self.mosaic, 1)
+        row.addWidget(self._scale)
+        self.splitter = QSplitter(Qt.Orientation.Vertical)
+        self.splitter.addWidget(maps)
+        self.splitter.addWidget(self.detail)
+        self.splitter.setSizes([_SHARES[0], _SHARES[1]])
         self.splitter.setChildrenCollapsible(False)
         self.body.addWidget(self.splitter, 1)
-        self._words = QLabel(" ")
+        self._words = QLabel(_HOW)
         self._words.setFont(theme.font(mono=True))
+        # It must not make the panel wider than its neighbours allow.
+        self._words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
         self.body.addWidget(self._words)
         self.setFocusProxy(self.mosaic)
         self.mosaic.hovered.connect(self._say)
@@ -199,7 +219,7 @@ class ModesPanel(Panel):
 
     def _say(self, spot: Spot | None) -> None:
         if spot is None:
-            self._words.setText(self._about(self.mosaic.mode) if self.mosaic.mode >= 0 else " ")
+            self._words.setText(self._about(self.mosaic.mode) if self.mosaic.mode >= 0 else _HOW)
             return
         place = f"{spot.part} slope {spot.value:+.3g}, row {spot.row + 1}, column {spot.column + 1}"
         self._words.setText(f"{self._about(spot.mode)}  {place}")
@@ -217,6 +237,16 @@ class ModesPanel(Panel):
             self.detail.hide()
         else:
             super().keyPressEvent(event)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Beside each other where there is room, else below each other."""
+        super().resizeEvent(event)
+        wide = self.width() >= self.context.theme.pixels(_WIDE)
+        way = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
+        if self.splitter.orientation() != way:
+            self.splitter.setOrientation(way)
+            self.splitter.setSizes([_SHARES[0], _SHARES[1]])
+        self.detail.use_columns(2 if wide else _MOST)
 
     def clear(self) -> None:
         """Forget the matrix of another source."""

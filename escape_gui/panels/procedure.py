@@ -9,7 +9,17 @@ from typing import Any, ClassVar
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt, QTimer, QUrl
 from PySide6.QtGui import QDesktopServices
-from PySide6.QtWidgets import QComboBox, QGridLayout, QHBoxLayout, QLabel, QProgressBar, QPushButton, QWidget
+from PySide6.QtWidgets import (
+    QComboBox,
+    QFrame,
+    QGridLayout,
+    QHBoxLayout,
+    QLabel,
+    QProgressBar,
+    QPushButton,
+    QScrollArea,
+    QWidget,
+)
 
 from escape_gui.panels.panel import Context, Panel
 from escape_gui.situation import Situation, to_abort, to_ask, to_pause, to_write
@@ -21,6 +31,8 @@ from escape_hw.remote.state import Arguments, Ended, Plan, ProcedureEntry, State
 
 #: Wait so long after the last edit before the server is asked what the procedure would do.
 _SETTLED_MS = 400
+#: What stands in the form of a recording.
+NOTHING = "This is a recording: it can be looked at, nothing can be started. Its result stands below."
 
 
 class ProcedurePanel(Panel):
@@ -100,8 +112,13 @@ class ProcedurePanel(Panel):
         grid.addWidget(self.report, 2, 0)
         grid.addWidget(self.folder, 2, 1)
         grid.setColumnStretch(2, 1)
-        self.body.addWidget(self._result)
-        self._result.hide()
+        grid.setRowStretch(3, 1)
+        self._outcome = QScrollArea()
+        self._outcome.setWidgetResizable(True)
+        self._outcome.setFrameShape(QFrame.Shape.NoFrame)
+        self._outcome.setWidget(self._result)
+        self.body.addWidget(self._outcome, 1)
+        self._outcome.hide()
 
     # ------------------------------------------------------------ data
     def tick(self, source: Source) -> None:
@@ -111,6 +128,8 @@ class ProcedurePanel(Panel):
             for one in found:
                 self.choice.addItem(one.title, one.name)
             self._choose()
+        elif not self._entries:
+            _put(self._about, "" if self.context.session.commands else NOTHING)
         self._enable()
 
     def take_state(self, state: State) -> None:
@@ -149,7 +168,7 @@ class ProcedurePanel(Panel):
         _put(self.numbers, "\n".join(words.comparison_lines(ended.document, before)))
         self.report.setVisible(bool(self._product("report")))
         self.folder.setVisible(bool(ended.folder))
-        self._result.show()
+        self._outcome.show()
 
     def _product(self, name: str) -> str:
         return self._ended.products.get(name, "") if self._ended is not None else ""
@@ -160,7 +179,7 @@ class ProcedurePanel(Panel):
         self._documents.clear()
         self._matrix.clear()
         self.choice.clear()
-        self._result.hide()
+        self._outcome.hide()
 
     # ------------------------------------------------------------ form
     @property

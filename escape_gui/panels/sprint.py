@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PySide6.QtWidgets import QGridLayout, QHBoxLayout, QLabel, QPushButton, QTabWidget, QVBoxLayout, QWidget
 
 from escape_gui.panels.panel import Context, Panel, Shown
-from escape_gui.views.convergence import NAMES, UNITS, Course, Drift
+from escape_gui.views.convergence import NAMES, UNITS, Course, Drift, short_unit
 from escape_gui.widgets.convergence_plot import ConvergencePlot
 from escape_gui.widgets.curve_plot import MARKERS
 from escape_gui.widgets.drift_plot import DriftPlot
@@ -48,35 +48,36 @@ class SprintPanel(Panel):
         self._course: Course | None = None
         self.plot, self.drift = ConvergencePlot(context.theme), DriftPlot(context.theme)
         self.tabs = QTabWidget()
-        self.tabs.addTab(self._make_convergence(), "Convergence")
-        self.tabs.addTab(self.drift, "Drift")
         self.tabs.setDocumentMode(True)
+        self.tabs.addTab(self._make_convergence(), "Fit")
+        self.tabs.addTab(self.drift, "Drift")
         self.body.addWidget(self.tabs)
         self.setFocusProxy(self.units)
 
     def _make_convergence(self) -> QWidget:
         page = QWidget()
         column = QVBoxLayout(page)
-        column.setContentsMargins(0, 8, 0, 0)
+        column.setContentsMargins(0, 4, 0, 0)
         self._pill = StatusPill(self.context.theme)
-        self.units = QPushButton("Physical units")
+        self.units = QPushButton("Units")
         self.units.setCheckable(True)
         self.units.setToolTip("Each kind of parameter in its own unit, or all on one axis (U).")
         self.units.setShortcut("U")
         self.units.toggled.connect(self.plot.use_units)
-        row = QHBoxLayout()
+        corner = QWidget()
+        row = QHBoxLayout(corner)
+        row.setContentsMargins(0, 0, 0, 2)
         row.addWidget(self._pill)
-        row.addStretch()
         row.addWidget(self.units)
-        column.addLayout(row)
+        self.tabs.setCornerWidget(corner)
         column.addWidget(self.plot, 1)
         self._table = QGridLayout()
-        self._table.setHorizontalSpacing(12)
-        self._table.setVerticalSpacing(2)
+        self._table.setHorizontalSpacing(8)
+        self._table.setVerticalSpacing(0)
         self._signs = [QLabel(MARKERS[k][1]) for k in range(len(PARAMETERS))]
         self._values = [QLabel("–") for _ in PARAMETERS]
         for k, (sign, value) in enumerate(zip(self._signs, self._values, strict=True)):
-            for at, widget in enumerate((sign, QLabel(NAMES[k]), value, QLabel(UNITS[k]))):
+            for at, widget in enumerate((sign, QLabel(NAMES[k]), value, QLabel(short_unit(UNITS[k])))):
                 self._table.addWidget(widget, k, at)
         self._table.setColumnStretch(3, 1)
         column.addLayout(self._table)

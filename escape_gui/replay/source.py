@@ -18,7 +18,6 @@ from escape_hw.io.gains import KIND_GAINS
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
     Arguments,
-    Disk,
     Ended,
     Finish,
     Geometry,
@@ -120,11 +119,9 @@ class ReplaySource:
                 document={key: value for key, value in document.items() if key != "products"},
             ),
             products=_products(run),
-            disk=Disk(folder=str(run.folder)),
             streams=tuple(
                 StreamEntry(name=name, segment="", unit=STREAMS.get(name, "")) for name in self._courses
             ),
-            notes=(REASON,),
         )
 
     def geometry(self) -> Geometry:

@@ -84,7 +84,7 @@ class Course:
         turns = f"{n} iteration{'' if n == 1 else 's'}"
         if self.converged is None:
             return f"running, {turns}"
-        return f"converged after {turns}" if self.converged else f"NOT converged after {turns}"
+        return f"{'converged' if self.converged else 'NOT converged'}, {turns}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,3 +137,14 @@ def time_unit(seconds: float) -> tuple[str, float]:
     if seconds < 300:
         return "s", 1.0
     return ("min", 60.0) if seconds < 3 * 3600 else ("h", 3600.0)
+
+
+def short_unit(unit: str) -> str:
+    """A unit as an axis or a narrow column has room for it."""
+    return _SHORT.get(unit.lower(), unit)
+
+
+_SHORT = {
+    "% of a sub-aperture": "% sub-ap.", "% of sub aperture": "% sub-ap.",
+    "% of the diameter": "% diam.", "% of diameter": "% diam.",
+}  # fmt: skip

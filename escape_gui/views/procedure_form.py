@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from escape_gui.views.convergence import short_unit
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Measured
 from escape_hw.remote.state import Arguments, Ended, Finish, Parameter, Plan, Product, Running
@@ -172,7 +173,7 @@ def _registration_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None
         if not one or one.get("value") is None:
             continue
         title, unit = TITLES[name]
-        line = f"{title}: {with_error(Measured(one['value'], one.get('sigma') or 0.0))} {unit}"
+        line = f"{title}: {with_error(Measured(one['value'], one.get('sigma') or 0.0))} {short_unit(unit)}"
         last = old.get(name)
         if last and last.get("value") is not None:
             error = math.hypot(one.get("sigma") or 0.0, last.get("sigma") or 0.0)

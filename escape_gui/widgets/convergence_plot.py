@@ -7,11 +7,11 @@ import pyqtgraph as pg
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from escape_gui.theme import Theme
-from escape_gui.views.convergence import GROUPS, NAMES, Course
+from escape_gui.views.convergence import GROUPS, NAMES, Course, short_unit
 from escape_gui.widgets.curve_plot import ErrorCurve, line_at, style_axis, style_plot
 
 #: Width of the left axes at normal letter size, so that all plots begin at the same place.
-AXIS = 58
+AXIS = 66
 
 
 class ConvergencePlot(QWidget):
@@ -56,13 +56,13 @@ class ConvergencePlot(QWidget):
         self._grid.clear()
         self._grid.setBackground(self._theme.colour("field"))
         self._curves: dict[int, ErrorCurve] = {}
-        top = self._plot(0, "Step norm", "relative", last=False)
+        top = self._plot(0, "Step norm", "", last=False)
         top.setLogMode(y=True)
         self._norm = ErrorCurve.make(self._theme, 0)
         self._norm.add_to(top)
         self._marks = [line_at(self._theme, 1, horizontal=False)]
         top.addItem(self._marks[0])
-        groups = GROUPS if self._physical else (("Parameters", "normalised", tuple(range(len(NAMES)))),)
+        groups = GROUPS if self._physical else (("Normalised", "", tuple(range(len(NAMES)))),)
         for row, (title, unit, members) in enumerate(groups, 1):
             plot = self._plot(row, title, short_unit(unit), last=row == len(groups))
             plot.setXLink(top)
@@ -82,7 +82,7 @@ class ConvergencePlot(QWidget):
         plot = self._grid.addPlot(row=row, col=0)
         style_plot(self._theme, plot)
         plot.setMouseEnabled(x=False, y=False)
-        style_axis(self._theme, plot.getAxis("left"), title, unit)
+        style_axis(self._theme, plot.getAxis("left"), title, unit, stacked=True)
         plot.getAxis("left").setWidth(self._theme.pixels(AXIS))
         style_axis(self._theme, plot.getAxis("bottom"), "Iteration" if last else "")
         plot.getAxis("bottom").setStyle(showValues=last)
@@ -110,8 +110,3 @@ class ConvergencePlot(QWidget):
         ticks = [(int(k), str(k)) for k in range(1, max(2, x.size) + 1, step)]
         for row in range(len(self._marks)):
             self._grid.getItem(row, 0).getAxis("bottom").setTicks([ticks])
-
-
-def short_unit(unit: str) -> str:
-    """A unit as an axis has room for it."""
-    return {"% of a sub-aperture": "% sub-ap.", "% of the diameter": "% diam."}.get(unit, unit)

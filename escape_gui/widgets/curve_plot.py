@@ -26,16 +26,21 @@ _DASHES = (
 
 
 def style_axis(
-    theme: Theme, axis: pg.AxisItem, label: str, unit: str = "", colour: QColor | None = None
+    theme: Theme,
+    axis: pg.AxisItem,
+    label: str,
+    unit: str = "",
+    colour: QColor | None = None,
+    stacked: bool = False,
 ) -> None:
-    """Give an axis its words and colours; the unit stands in brackets and is never scaled."""
+    """Give an axis its words and colours; the unit in brackets, ``stacked`` on a line of its own."""
     text = theme.colour("text") if colour is None else colour
     axis.setPen(theme.colour("line"))
     axis.setTextPen(text)
     axis.setTickFont(theme.font(0.85))
     axis.enableAutoSIPrefix(False)
     size = f"{theme.font(0.9).pointSizeF()}pt"
-    words = f"{label} [{unit}]" if unit else label
+    words = f"{label}<br>[{unit}]" if unit and stacked else f"{label} [{unit}]" if unit else label
     axis.setLabel(words, color=text.name(), **{"font-size": size})
 
 
@@ -126,11 +131,7 @@ class Band:
             self._high.setData(x[known], (y + sigma)[known])
 
 
-def line_at(theme: Theme, value: float, *, horizontal: bool, label: str = "") -> pg.InfiniteLine:
-    """A reference line with a word on it."""
-    colour = theme.colour("muted")
-    options = {"color": theme.colour("text"), "position": 0.92, "fill": None} if label else None
-    return pg.InfiniteLine(
-        value, angle=0 if horizontal else 90, pen=pg.mkPen(colour, width=1, style=Qt.PenStyle.DashLine),
-        label=label or None, labelOpts=options,
-    )  # fmt: skip
+def line_at(theme: Theme, value: float, *, horizontal: bool, colour: QColor | None = None) -> pg.InfiniteLine:
+    """A dashed reference line."""
+    pen = pg.mkPen(colour or theme.colour("muted"), width=1, style=Qt.PenStyle.DashLine)
+    return pg.InfiniteLine(value, angle=0 if horizontal else 90, pen=pen)

@@ -7,8 +7,8 @@ import pyqtgraph as pg
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from escape_gui.theme import Theme
-from escape_gui.views.convergence import GROUPS, Drift
-from escape_gui.widgets.convergence_plot import AXIS, short_unit
+from escape_gui.views.convergence import GROUPS, Drift, short_unit
+from escape_gui.widgets.convergence_plot import AXIS
 from escape_gui.widgets.curve_plot import Band, line_at, style_axis, style_plot
 
 
@@ -50,7 +50,9 @@ class DriftPlot(QWidget):
             style_plot(self._theme, plot)
             plot.setMouseEnabled(x=False, y=False)
             last = row == len(GROUPS) - 1
-            style_axis(self._theme, plot.getAxis("left"), f"Δ {title.lower()}", short_unit(unit))
+            style_axis(
+                self._theme, plot.getAxis("left"), f"Δ {title.lower()}", short_unit(unit), stacked=True
+            )
             plot.getAxis("left").setWidth(self._theme.pixels(AXIS))
             style_axis(self._theme, plot.getAxis("bottom"), *(("Time", self._drift.unit) if last else ("",)))
             plot.getAxis("bottom").setStyle(showValues=last)

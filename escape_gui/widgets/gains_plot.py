@@ -75,7 +75,7 @@ class GainsPlot(QWidget):
         style_axis(
             self._theme, self._plot.getAxis("left"), _words(on, "left"), colour=self._colour(on, "left")
         )
-        self._plot.addItem(line_at(self._theme, 1.0, horizontal=True, label="1"))
+        self._plot.addItem(line_at(self._theme, 1.0, horizontal=True, colour=self._colour(on, "left")))
         self._items: dict[str, tuple[list[pg.PlotCurveItem], ErrorCurve, Band]] = {}
         for number, label in enumerate(self._curves):
             right = on[label] == "right" and self._second is not None
@@ -120,7 +120,7 @@ class GainsPlot(QWidget):
         main = self._plot.getViewBox()
         main.sigResized.connect(lambda: box.setGeometry(main.sceneBoundingRect()))
         box.setGeometry(main.sceneBoundingRect())
-        box.addItem(line_at(self._theme, 1.0, horizontal=True))
+        box.addItem(line_at(self._theme, 1.0, horizontal=True, colour=self._colour(on, "right")))
         return box
 
     def _zoom(self, on: Mapping[str, str]) -> None:
@@ -139,9 +139,8 @@ class GainsPlot(QWidget):
 
 
 def _words(on: Mapping[str, str], side: str) -> str:
-    here = [label for label, one in on.items() if one == side]
-    both = len(set(on.values())) > 1
-    return "Optical gain" + (f", {' and '.join(here)}" if both and here else "")
+    """The legend says which curve is read where; an axis has no room for names."""
+    return f"Optical gain, {side}" if len(set(on.values())) > 1 else "Optical gain"
 
 
 def _range(curves: list[Curve]) -> tuple[float, float]:
