@@ -62,7 +62,11 @@ class Picture(QWidget):
         unit: str = "",
     ) -> None:
         super().__init__()
-        self._theme, self._maps, self._symmetric, self._unit = theme, tuple(maps), symmetric, unit
+        self._theme, self._maps, self._symmetric = theme, tuple(maps), symmetric
+        #: Unit of the values, said with the one under the cursor.
+        self.unit = unit
+        #: Levels never lie closer than this.
+        self.floor = 0.0
         self.data: NDArray[Any] | None = None
         self.logarithmic = False
         #: Levels follow the data; otherwise they stay.
@@ -142,7 +146,7 @@ class Picture(QWidget):
             return 0.0, 1.0
         low, high = (float(value) for value in np.percentile(sample, (1.0, 99.7)))
         if self._symmetric:
-            high = max(abs(low), abs(high))
+            high = max(abs(low), abs(high), self.floor)
             low = -high
         elif self.logarithmic:
             high = float(sample.max())
@@ -200,7 +204,7 @@ class Picture(QWidget):
         self._cursor = (column, row)
         value = data[row, column]
         text = f"{value:d}" if np.issubdtype(data.dtype, np.integer) else f"{value:.4g}"
-        self.pointed.emit(f"x {column:4d}  y {row:4d}  {text:>8} {self._unit}".rstrip())
+        self.pointed.emit(f"x {column:4d}  y {row:4d}  {text:>8} {self.unit}".rstrip())
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Keys of pictures, see :mod:`escape_gui.key_map`."""
