@@ -12,6 +12,8 @@ from PySide6.QtWidgets import QApplication
 
 from escape_gui.exports import save_png
 from escape_gui.main_window import MainWindow
+from escape_gui.replay.desk import is_recording
+from escape_gui.replay.source import ReplaySource
 from escape_gui.session import Session
 from escape_gui.settings import Settings, load_settings, settings_file
 
@@ -36,7 +38,8 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     Parameters
     ----------
     system
-        System to serve on its twin, or whose running server is looked at; empty with ``address``.
+        System to serve on its twin, or whose running server is looked at; empty with ``address``. A FITS
+        product or the folder of a run is shown as a recording.
     address
         Address of a server.
     screenshot
@@ -56,6 +59,8 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     window = MainWindow(session, settings, None if screenshot else store)
     for warning in warnings:
         log.warning("%s", warning)
+    if system and is_recording(Path(system)):
+        session.use(ReplaySource(system), None)
     window.ticker.start()
     window.show()
     if screenshot is not None:

@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
 )
 
 from escape_gui.library import Shelf
+from escape_gui.maps import mask_of
 from escape_gui.panels.panel import Context, Panel, Shown
 from escape_gui.views.mode_detail import tiles
 from escape_gui.views.mode_mosaic import LIMIT
@@ -144,10 +145,7 @@ class ModesPanel(Panel):
             return
         data = self._live.get("matrix")
         if data is not None and 2 * int(self._valid.sum()) != len(data):
-            rows = source.geometry().valid
-            self._valid = np.array([[spot == "1" for spot in row] for row in rows], bool).reshape(
-                len(rows), -1
-            )
+            self._valid = mask_of(source.geometry().valid)
         self._dirty = False
         self._fill_list()
         if self.matrices:
