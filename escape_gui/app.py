@@ -12,7 +12,7 @@ from PySide6.QtWidgets import QApplication
 
 from escape_gui.exports import save_png
 from escape_gui.main_window import MainWindow
-from escape_gui.replay.desk import is_recording
+from escape_gui.replay.desk import WORKSPACE, is_recording
 from escape_gui.replay.source import ReplaySource
 from escape_gui.session import Session
 from escape_gui.settings import Settings, load_settings, settings_file
@@ -61,6 +61,7 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
         log.warning("%s", warning)
     if system and is_recording(Path(system)):
         session.use(ReplaySource(system), None)
+        window.show_workspace(WORKSPACE)
     window.ticker.start()
     window.show()
     if screenshot is not None:

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from escape_gui.main_window import MainWindow
 
 
+#: Where a recording is looked at.
+WORKSPACE = "calibrate"
+
+
 class ReplayDesk(QObject):
     """Takes recordings into a window.
 
@@ -76,10 +80,12 @@ class ReplayDesk(QObject):
         session = self._window.context.session
         if session.commands is None:
             session.use(source, None)
+            self._window.show_workspace(WORKSPACE)
             return
         other = self._make()
         self.others.append(other)
         other.context.session.use(source, None)
+        other.show_workspace(WORKSPACE)
         other.setWindowTitle(f"ESCAPE · {source.path.name}")
         other.ticker.start()
         other.show()
