@@ -24,6 +24,7 @@ from escape_hw.cli import (
     products,
     rehearse,
     reproduce,
+    serve,
     systems,
     track,
     udev,
@@ -46,6 +47,7 @@ app.command("sprint")(calibrate.sprint)
 app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.command("track")(track.track)
+app.command("serve")(serve.serve)
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
 app.command("compare")(products.compare)

@@ -1,0 +1,84 @@
+"""Opening the door of a server, and closing it behind."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import zmq
+
+from escape_hw.api.procedure import Stop
+from escape_hw.config.models import SystemConfig
+from escape_hw.errors import ConfigError
+from escape_hw.remote.address import (
+    Listing,
+    find_listing,
+    is_loopback,
+    list_server,
+    local_endpoint,
+    tcp_endpoint,
+    unlist_server,
+)
+from escape_hw.server.door import Door
+from escape_hw.server.front import Front
+from escape_hw.streams.segments import process_start
+
+
+class Serving:
+    """A server that listens, from its sockets to its entry in the user's list; a context manager.
+
+    Parameters
+    ----------
+    config
+        The system.
+    host, port
+        Address to listen on beside the local sockets; no port: none.
+
+    Raises
+    ------
+    ConfigError
+        The system is served already, or the address cannot be had.
+    """
+
+    def __init__(self, config: SystemConfig, host: str = "127.0.0.1", port: int | None = None) -> None:
+        self._config, self._stack = config, ExitStack()
+        name, pid = config.system.name, os.getpid()
+        running = find_listing(name)
+        if running is not None and running.alive:
+            raise ConfigError(f"'{name}' is served by process {running.pid} already; stop that one first")
+        if running is not None:
+            unlist_server(running)
+        local = local_endpoint(name, pid)
+        tcp = "" if port is None else tcp_endpoint(host, port).requests
+        self.listing = Listing(name, pid, process_start(pid) or 0, local.requests, local.events, tcp)
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._stack.callback(context.term)
+        self._doors = [self._door(context)]
+        self._doors[0].bind(local)
+        self._stack.callback(unlist_server, self.listing)
+        if port is not None:
+            if not is_loopback(host):
+                raise ConfigError("keys first")
+            self._doors[0].bind(tcp_endpoint(host, port))
+
+    def _door(self, context: zmq.Context[zmq.Socket[bytes]]) -> Door:
+        door = Door(context)
+        self._stack.callback(door.close)
+        return door
+
+    def run(self, stop: Stop, runs: Path, reads: tuple[Path, ...] = ()) -> None:
+        """Serve until told to stop."""
+        front = Front(self._config, self._doors[0], runs, reads)
+        list_server(self.listing)
+        front.run(stop)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
