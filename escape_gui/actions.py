@@ -71,6 +71,22 @@ def _workspaces() -> tuple[Action, ...]:
 
 ACTIONS: tuple[Action, ...] = (
     Action(
+        "open_product",
+        "&File",
+        "&Open product…",
+        "Show a FITS product in these panels.",
+        lambda w: w.replay.ask_product(),
+        ("Ctrl+O",),
+    ),
+    Action(
+        "open_run",
+        "&File",
+        "Open &run folder…",
+        "Show a finished run in these panels, step by step if wanted.",
+        lambda w: w.replay.ask_run(),
+        ("Ctrl+Alt+O",),
+    ),
+    Action(
         "save_png",
         "&File",
         "Save panel as &picture…",

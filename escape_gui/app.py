@@ -14,6 +14,8 @@ from escape_gui.exports import save_png
 from escape_gui.live import Attachment, LiveSource
 from escape_gui.main_window import MainWindow
 from escape_gui.own_server import OwnServer
+from escape_gui.replay.desk import WORKSPACE, is_recording
+from escape_gui.replay.source import ReplaySource
 from escape_gui.session import Session
 from escape_gui.settings import Settings, load_settings, settings_file
 from escape_gui.widgets.status_pill import Level
@@ -74,8 +76,7 @@ class Desk(QObject):
             self.window.toasts.tell(Level.BAD, "The server did not start", failure)
 
     def close(self) -> None:
-        """Hang up, and end the window's own server with its mirror flat."""
-        self.session.close()
+        """Hang up, and end the window's own server with its mirror flat; after the session was closed."""
         if self.own is not None:
             self.own.end(None if self._live is None else self._live.connection)
         self.attachment.close()
@@ -87,7 +88,8 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     Parameters
     ----------
     system
-        System to serve on its twin, or whose running server is looked at; empty with ``address``.
+        System to serve on its twin, or whose running server is looked at; empty with ``address``. A FITS
+        product or the folder of a run is shown as a recording.
     address
         Address of a server.
     screenshot
@@ -106,7 +108,8 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
         There is no such system.
     """
     qt = application()
-    address, own = _server(system, address)
+    recording = bool(system) and is_recording(Path(system))
+    address, own = ("", None) if recording else _server(system, address)
     store = settings_file()
     settings, warnings = (Settings(), ()) if reset_settings else load_settings(store)
     session = Session()
@@ -114,15 +117,22 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     for warning in warnings:
         log.warning("%s", warning)
         window.toasts.tell(Level.WARN, "Settings", warning)
-    desk = Desk(window, session, address, own)
-    window.ticker.start()
-    window.show()
     if screenshot is not None:
         _picture(window, session, screenshot)
+    desk = None
+    if recording:
+        session.use(ReplaySource(system), None)
+        window.show_workspace(WORKSPACE)
+    else:
+        desk = Desk(window, session, address, own)
+    window.ticker.start()
+    window.show()
     try:
         return qt.exec()
     finally:
-        desk.close()
+        session.close()
+        if desk is not None:
+            desk.close()
 
 
 def _server(system: str, address: str) -> tuple[str, OwnServer | None]:

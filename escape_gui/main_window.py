@@ -33,6 +33,7 @@ from escape_gui.key_map import key_map, keys_text
 from escape_gui.news import News
 from escape_gui.panels import PANELS
 from escape_gui.panels.panel import Context, Panel
+from escape_gui.replay.desk import ReplayDesk
 from escape_gui.session import Control, Session
 from escape_gui.settings import Settings, save_settings
 from escape_gui.situation import Situation
@@ -96,6 +97,9 @@ class MainWindow(QMainWindow):
         self.overlay = Overlay(self, self.context.theme)
         self.news = News(self.toasts)
         self.ticker = Ticker(session, self.panels.values(), self.refresh)
+        self.replay: ReplayDesk = ReplayDesk(
+            self, lambda: MainWindow(Session(), settings.model_copy(deep=True), None, panels)
+        )
         session.failed.connect(lambda what, why: self.toasts.tell(Level.BAD, f"Could not {what}", why))
         session.waiting_changed.connect(
             lambda n: self._note("busy", f"{n} request(s) under way" if n else "")
@@ -331,6 +335,7 @@ class MainWindow(QMainWindow):
     def closeEvent(self, event: QCloseEvent) -> None:
         """Remember the layout; the server goes on."""
         self.ticker.stop()
+        self.replay.close()
         self._remember_layout()
         theme, settings = self.context.theme, self._settings
         settings.geometry = _text(self.saveGeometry())

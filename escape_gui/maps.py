@@ -16,7 +16,9 @@ _ACROSS = 160
 
 def mask_of(rows: tuple[str, ...]) -> NDArray[np.bool_]:
     """The mask ``(rows, columns)`` that :class:`Geometry` writes as rows of 0 and 1."""
-    return np.array([[one == "1" for one in row] for row in rows], dtype=bool).reshape(len(rows), -1)
+    return np.array([[one == "1" for one in row] for row in rows], dtype=bool).reshape(
+        len(rows), len(rows[0]) if rows else 0
+    )
 
 
 def slope_maps(slopes: NDArray[np.floating], valid: NDArray[np.bool_]) -> NDArray[np.float32]:

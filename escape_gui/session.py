@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 from PySide6.QtCore import QObject, Qt, Signal
 
+from escape_gui.library import Library
 from escape_hw.errors import EscapeError
 from escape_hw.remote.source import Sample, Source
 from escape_hw.remote.state import Arguments, Geometry, LogLine, Plan, ProcedureEntry, State
@@ -132,6 +133,7 @@ class Commands(QObject):
         otherwise: Callable[[str], None] | None = None,
         *,
         urgent: bool = False,
+        quiet: bool = False,
     ) -> None:
         """Send a request; returns at once.
 
@@ -146,13 +148,15 @@ class Commands(QObject):
             failure is also told through :attr:`failed`.
         urgent
             A safety request.
+        quiet
+            Whoever asked tells of a failure; it is not told through :attr:`failed`.
         """
         if not self._open:
             return
         self._count(+1)
         future = self._workers[urgent].submit(call, self.control)
         future.add_done_callback(
-            lambda done: self._delivered.emit(lambda: self._take(what, done, then, otherwise))
+            lambda done: self._delivered.emit(lambda: self._take(what, done, then, otherwise, quiet))
         )
 
     def _take(
@@ -161,6 +165,7 @@ class Commands(QObject):
         future: Future[T],
         then: Callable[[T], None] | None,
         otherwise: Callable[[str], None] | None,
+        quiet: bool,
     ) -> None:
         if not self._open:
             return
@@ -174,7 +179,8 @@ class Commands(QObject):
         if not isinstance(error, EscapeError):
             log.error("%s failed unexpectedly", what, exc_info=error)
         reason = str(error) or type(error).__name__
-        self.failed.emit(what, reason)
+        if not quiet:
+            self.failed.emit(what, reason)
         if otherwise is not None:
             otherwise(reason)
 
@@ -230,6 +236,8 @@ class Session(QObject):
         self.source: Source = NoSource()
         #: ``None`` while a finished run is replayed.
         self.commands: Commands | None = None
+        #: Products that the source names, as panels show them.
+        self.library = Library()
 
     def use(self, source: Source, control: Control | None) -> None:
         """Show this source from now on; without ``control`` nothing can be asked of it."""
@@ -253,6 +261,7 @@ class Session(QObject):
     def close(self) -> None:
         """End the worker threads."""
         self._drop()
+        self.library.close()
         self.source = NoSource()
 
     def _drop(self) -> None:

@@ -243,6 +243,7 @@ QPushButton:disabled, QToolButton:disabled { background: @panel; color: @muted; 
 QPushButton:focus, QToolButton:focus, QLineEdit:focus, QSpinBox:focus, QDoubleSpinBox:focus, QComboBox:focus,
 QTableView:focus, QPlainTextEdit:focus { border: 1px solid @accent; }
 QPushButton#stop { background: @stop; color: @on_stop; border: 1px solid @stop; font-weight: bold; }
+QPushButton#stop:disabled { background: @panel; color: @muted; border: 1px solid @line; }
 QPushButton#stop:focus, QPushButton#stop:hover { border: 1px solid @on_stop; }
 QToolButton#quiet { background: transparent; border: 1px solid transparent; padding: 0 @4px; color: @muted; }
 QToolButton#quiet:hover, QToolButton#quiet:focus { border: 1px solid @accent; color: @text; }

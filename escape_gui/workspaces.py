@@ -65,7 +65,7 @@ WORKSPACES: tuple[Workspace, ...] = (
         (
             Column((Cell(("procedure",), 1.4), Cell(("camera", "devices", "log"), 1.0)), 1.0),
             Column((Cell(("modes",)),), 1.4),
-            Column((Cell(("sprint",), 1.0), Cell(("gains",), 1.0)), 1.1),
+            Column((Cell(("sprint",), 1.2), Cell(("gains",), 1.0)), 1.1),
         ),
     ),
     Workspace(

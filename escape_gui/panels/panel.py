@@ -135,7 +135,8 @@ class Panel(QWidget):
         if state.phase is Phase.FAULT:
             return Health.FAULT
         limit = self.stale_after_s
-        if limit is not None and time.monotonic() - self._newest > limit:
+        live = self.context.session.commands is not None
+        if live and limit is not None and time.monotonic() - self._newest > limit:
             return Health.STALE
         return Health.OK
 
