@@ -165,6 +165,7 @@ class MainWindow(QMainWindow):
             self.restoreGeometry(_bytes(self._settings.geometry))
         self._show_layout()
         self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
+        self.setFocus()
 
     def _show_layout(self) -> None:
         stored = self._settings.layouts.get(self.workspace.name)

@@ -29,7 +29,10 @@ class News:
         self._state, self._connected = state, connected
         if was_connected and not connected:
             self._toasts.tell(
-                Level.BAD, "Server lost", "No word from the server. The window tries again by itself."
+                Level.BAD,
+                "Server lost",
+                "No word from the server. The window tries again by itself.",
+                stays=False,
             )
         if not connected:
             return

@@ -62,11 +62,23 @@ class Control(Protocol):
         """Go on."""
         ...
 
-    def close_loop(self, matrix: str, **parameters: Any) -> object:
+    def close_loop(
+        self,
+        matrix: str,
+        gain: float | None = None,
+        leak: float | None = None,
+        dropped_modes: int | None = None,
+    ) -> object:
         """Close the loop until it is opened."""
         ...
 
-    def set_loop(self, **parameters: Any) -> object:
+    def set_loop(
+        self,
+        matrix: str | None = None,
+        gain: float | None = None,
+        leak: float | None = None,
+        dropped_modes: int | None = None,
+    ) -> object:
         """Other parameters for the loop."""
         ...
 

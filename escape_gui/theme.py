@@ -251,11 +251,14 @@ QToolButton#quiet:checked { background: @button; color: @text; border: 1px solid
 QLineEdit, QSpinBox, QDoubleSpinBox, QComboBox { background: @field; color: @text; border: 1px solid @line;
     border-radius: 4px; padding: @2px @6px; selection-background-color: @accent;
     selection-color: @on_accent; }
+QSpinBox::up-button, QSpinBox::down-button, QDoubleSpinBox::up-button, QDoubleSpinBox::down-button
+    { width: 0; border: none; }
 QLineEdit:disabled, QSpinBox:disabled, QDoubleSpinBox:disabled, QComboBox:disabled { color: @muted; }
 QComboBox QAbstractItemView { background: @field; color: @text; border: 1px solid @line; }
 QTableView, QPlainTextEdit, QTextBrowser, QListView { background: @field; color: @text;
     border: 1px solid @line; border-radius: 4px; }
 QHeaderView::section { background: @panel; color: @muted; border: none; padding: @2px @6px; }
+QTabBar { qproperty-drawBase: 0; }
 QTabBar::tab { background: @window; color: @muted; padding: @4px @12px; border: none;
     border-bottom: 2px solid transparent; }
 QTabBar::tab:selected { color: @text; background: @panel; border-bottom: 2px solid @accent; }

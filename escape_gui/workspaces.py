@@ -55,7 +55,7 @@ WORKSPACES: tuple[Workspace, ...] = (
         (
             Column((Cell(("devices",), 1.5), Cell(("log",), 1.0)), 1.0),
             Column((Cell(("camera",)),), 1.5),
-            Column((Cell(("mirror",), 1.3), Cell(("psf",), 1.0)), 1.0),
+            Column((Cell(("mirror",), 1.1), Cell(("psf",), 1.0)), 1.0),
         ),
     ),
     Workspace(
@@ -73,9 +73,9 @@ WORKSPACES: tuple[Workspace, ...] = (
         "Operate",
         "Closed loop, Strehl, latency",
         (
-            Column((Cell(("loop",), 1.2), Cell(("devices", "procedure"), 1.0)), 1.0),
+            Column((Cell(("loop",), 1.2), Cell(("devices", "procedure"), 1.0)), 0.9),
             Column((Cell(("performance",), 1.4), Cell(("log", "latency"), 0.8)), 1.5),
-            Column((Cell(("camera",), 1.1), Cell(("psf", "mirror"), 1.0)), 1.1),
+            Column((Cell(("camera",), 1.0), Cell(("psf", "mirror"), 1.15)), 1.1),
         ),
     ),
 )
@@ -110,7 +110,8 @@ def arrange(window: QMainWindow, docks: dict[str, QDockWidget], plan: Workspace)
     for _, cells in columns:
         for cell in cells:
             _front(docks, cell).raise_()
-    _resize(window, docks, columns, heads)
+    if columns:
+        _resize(window, docks, columns, heads)
     for name in docks.keys() - set(plan.panels):
         # Where the View menu will show it.
         window.addDockWidget(Qt.DockWidgetArea.RightDockWidgetArea, docks[name])

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
+from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QToolButton
 
 from escape_gui.maps import mask_of, slope_maps
@@ -30,6 +31,8 @@ _TIPS = (
 _BINS = 128
 _HISTOGRAM_EVERY_S = 0.2
 _SAMPLED = 40_000
+#: Pixels of height below which the histogram gives way.
+_LEAST_HEIGHT = 420
 
 
 class CameraPanel(Panel):
@@ -63,18 +66,16 @@ class CameraPanel(Panel):
         head.addWidget(self.saturation)
         self.picture = Picture(theme, "Frame of the sensor", COUNTS, unit="counts")
         self.signed = Picture(theme, "Slopes or difference", SIGNED, symmetric=True)
-        self.signed.hide()
         self.quiver = Quiver(theme)
         self.picture.box.addItem(self.quiver)
         self._outlines = pg.PlotCurveItem()
         self._outlines.setZValue(3)
         self.picture.box.addItem(self._outlines)
         self.bars = (PictureBar(theme, self.picture), PictureBar(theme, self.signed, logarithmic=False))
-        self.bars[1].hide()
         self.histogram = Plot(theme, "Histogram of the frame", "counts", "pixels")
         self.histogram.setLogMode(x=False, y=True)
         self.histogram.setFixedHeight(theme.pixels(92))
-        self._curve = self.histogram.curve(0, stepMode="center")
+        self._curve = self.histogram.curve(0, alone=True, stepMode="center")
         self.body.addLayout(head)
         for widget in (self.picture, self.signed, *self.bars, self.histogram):
             self.body.addWidget(widget)
@@ -87,6 +88,7 @@ class CameraPanel(Panel):
         self._valid = np.zeros((0, 0), bool)
         self._top: float | None = None
         self._histogram_due = 0.0
+        self._show_parts()
         self.restyle()
 
     # ------------------------------------------------------------ news
@@ -147,14 +149,23 @@ class CameraPanel(Panel):
             self.signed.show_array(slope_maps(slopes, self._valid))
 
     # ------------------------------------------------------------ views
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Little room belongs to the picture alone."""
+        super().resizeEvent(event)
+        self._show_parts()
+
+    def _show_parts(self) -> None:
+        signed = self.choice.word in (MAPS, CHANGE)
+        for widget in (self.picture, self.bars[0]):
+            widget.setVisible(not signed)
+        for widget in (self.signed, self.bars[1]):
+            widget.setVisible(signed)
+        self.quiver.setVisible(self.choice.word == ARROWS)
+        room = self.height() >= self.context.theme.pixels(_LEAST_HEIGHT)
+        self.histogram.setVisible(room and not signed)
+
     def _change_view(self, view: str) -> None:
-        signed = view in (MAPS, CHANGE)
-        self.picture.setVisible(not signed)
-        self.bars[0].setVisible(not signed)
-        self.histogram.setVisible(not signed)
-        self.signed.setVisible(signed)
-        self.bars[1].setVisible(signed)
-        self.quiver.setVisible(view == ARROWS)
+        self._show_parts()
         self.signed.clear()
         if view == CHANGE and self._kept is None:
             self._keep()

@@ -20,6 +20,8 @@ ROLES = {
     "screen": "Turbulence",
     "modulator": "Modulator",
 }
+#: A space at which no line is broken.
+_TOGETHER = "\u00a0"
 #: Endings of the keys of facts, with the unit they mean and digits after the point.
 _UNITS = {
     "_c": ("°C", 1),
@@ -113,7 +115,7 @@ class _Row(QFrame):
         self._model.setText(
             " · ".join(part for part in (device.model or device.kind, device.serial, twin) if part)
         )
-        facts = "   ".join(fact(key, value) for key, value in device.facts.items())
+        facts = "   ".join(fact(key, value).replace(" ", _TOGETHER) for key, value in device.facts.items())
         self._facts.setText("\n".join(line for line in (facts, device.message) if line))
         self._facts.setVisible(bool(facts or device.message))
         self.setAccessibleName(f"{role}: {device.health.value}. {device.message}")

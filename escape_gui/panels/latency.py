@@ -6,14 +6,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PySide6.QtWidgets import QGridLayout
+from PySide6.QtWidgets import QGridLayout, QHBoxLayout
 
 from escape_gui.panels.panel import Context, Panel, Shown
 from escape_gui.widgets.plot import Plot
 from escape_gui.widgets.readout import Readout
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
-from escape_hw.streams.histogram import MIDDLES
+from escape_hw.streams.histogram import MIDDLES, percentiles_of
+
+#: Percentiles between which the axis runs; the largest stands above as a number.
+_SHOWN = (0.0, 99.9)
 
 
 class LatencyPanel(Panel):
@@ -49,12 +52,13 @@ class LatencyPanel(Panel):
             Plot(theme, "Histogram of the spacing of frames", "spacing of frames [µs]", "frames"),
         )
         self._curves = []
+        plots = QHBoxLayout()
         self.body.addLayout(row)
+        self.body.addLayout(plots, 1)
         for number, plot in enumerate(self.plots):
-            plot.setLogMode(x=True, y=True)
-            plot.pin_left_axis()
-            self._curves.append(plot.curve(number, stepMode="center", connect="finite"))
-            self.body.addWidget(plot, 1)
+            plot.setLogMode(x=False, y=True)
+            self._curves.append(plot.curve(number, alone=True, stepMode="center", connect="finite"))
+            plots.addWidget(plot, 1)
         self._counts: NDArray[Any] | None = None
 
     def take_state(self, state: State) -> None:
@@ -66,17 +70,18 @@ class LatencyPanel(Panel):
     def take_sample(self, stream: str, sample: Sample) -> None:
         """Counts of all frames since the loop was closed."""
         self._counts = sample.data
-        for curve, counts in zip(self._curves, sample.data, strict=True):
+        for plot, curve, counts in zip(self.plots, self._curves, sample.data, strict=True):
             used = np.flatnonzero(counts)
             if used.size == 0:
                 curve.setData([1.0, 2.0], [np.nan])
                 continue
-            # Bins below 16 ns are no durations that a loop could have.
-            first, last = max(int(used[0]) - 1, 16), int(used[-1]) + 2
-            middles = MIDDLES[first : last + 1] / 1e3
-            edges = np.sqrt(middles[:-1] * middles[1:])
+            first, last = max(int(used[0]) - 1, 1), min(int(used[-1]) + 2, MIDDLES.size - 1)
+            middles = MIDDLES[first - 1 : last + 1] / 1e3
+            edges = (middles[:-1] + middles[1:]) / 2
             # Half a frame stands for none on a logarithmic axis.
-            curve.setData(edges, np.maximum(counts[first + 1 : last], 0.5))
+            curve.setData(edges, np.maximum(counts[first:last], 0.5))
+            few = percentiles_of(counts, _SHOWN) / 1e3
+            plot.setXRange(float(few[0]) * 0.95, float(few[1]) * 1.05)
 
     def clear(self) -> None:
         """Another loop."""

@@ -49,7 +49,7 @@ class LogPanel(Panel):
         self.text.setReadOnly(True)
         self.text.setMaximumBlockCount(KEPT)
         self.text.setAccessibleName("Lines of the log")
-        self.text.setLineWrapMode(QPlainTextEdit.LineWrapMode.NoWrap)
+        self.text.setLineWrapMode(QPlainTextEdit.LineWrapMode.WidgetWidth)
         row = QHBoxLayout()
         row.addWidget(self.search, 1)
         row.addWidget(self.level)

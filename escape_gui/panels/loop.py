@@ -96,6 +96,7 @@ class LoopPanel(Panel):
             self.editors[name].setToolTip(_TIPS[name])
             self.editors[name].setAccessibleName(f"{words} wanted")
         form.setColumnStretch(2, 1)
+        form.setColumnStretch(3, 1)
         buttons = QHBoxLayout()
         for button in (self.check_button, self.apply_button, self.reset_button):
             buttons.addWidget(button)
@@ -218,13 +219,10 @@ class LoopPanel(Panel):
         if problems := edit.problems(self._loop):
             self.message.setText("\n".join(problems))
             return
-        values = {"leak": edit.leak, "dropped_modes": edit.dropped_modes}
-        if edit.gain > 0:
-            values["gain"] = edit.gain
         self.message.setText("Closing the loop…")
         commands.ask(
             "close the loop",
-            lambda server: server.close_loop(edit.matrix, **values),
+            lambda server: server.close_loop(edit.matrix, edit.gain or None, edit.leak, edit.dropped_modes),
             self._applied,
             self._refused,
         )
@@ -247,8 +245,10 @@ class LoopPanel(Panel):
         mono = self.context.theme.font(mono=True)
         for label in self.current.values():
             label.setFont(mono)
-        for spin in (self.gain, self.leak, self.dropped_modes):
-            spin.setFont(mono)
+        for name, editor in self.editors.items():
+            editor.setMaximumWidth(self.context.theme.pixels(180))
+            if name != "matrix":
+                editor.setFont(mono)
 
 
 def _spin(low: float, high: float, step: float, digits: int) -> QDoubleSpinBox:

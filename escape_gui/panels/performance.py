@@ -38,6 +38,7 @@ class PerformancePanel(Panel):
         self.strehl = StripChart(theme, "Strehl ratio over time", "Strehl ratio [%]", number=0)
         self.residual = StripChart(theme, "Residual over time", "residual [nm rms]", number=1)
         self.residual.setXLink(self.strehl)
+        self.strehl.hide_bottom_label()
         self.readouts = {
             "strehl": Readout(theme, "Strehl", "%", 12),
             "residual": Readout(theme, "residual", "nm rms", 7),

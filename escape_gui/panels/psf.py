@@ -44,7 +44,7 @@ class PsfPanel(Panel):
         }
         pair = QHBoxLayout()
         pair.setSpacing(8)
-        for key, caption in (("psf", "measured"), ("model_psf", "model")):
+        for key, caption in (("psf", "measured, solid"), ("model_psf", "model, dashed")):
             self.pictures[key].logarithmic = True
             self.pictures[key].use_map(1)
             column = QVBoxLayout()
@@ -54,19 +54,19 @@ class PsfPanel(Panel):
             column.addWidget(label)
             column.addWidget(self.pictures[key], 1)
             pair.addLayout(column, 1)
-        self.plot = Plot(theme, "Radial profiles", "radius [pixel]", "relative to model")
+        self.plot = Plot(theme, "Radial profiles", "radius [pixel]", "relative")
         self.plot.setLogMode(x=False, y=True)
         self.plot.setYRange(np.log10(_FLOOR), 0.1)
+        self.plot.setXRange(0, 40)
+        self.plot.pin_left_axis()
         self._curves = {
             "psf": self.plot.curve(0, name="measured"),
             "model_psf": self.plot.curve(1, name="model"),
         }
-        self._key = QLabel("measured solid, model dashed")
-        self._key.setObjectName("caption")
+        self.plot.setMinimumHeight(120)
         self.body.addLayout(pair, 3)
         self.body.addWidget(PictureBar(theme, self.pictures["psf"]))
         self.body.addWidget(self.plot, 2)
-        self.body.addWidget(self._key)
         self._images: dict[str, NDArray[Any]] = {}
         self._profiles: dict[str, NDArray[np.float64]] = {}
         self._radial = RadialProfile((1, 1), (0, 0))

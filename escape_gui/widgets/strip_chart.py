@@ -61,9 +61,9 @@ class StripChart(Plot):
     """
 
     def __init__(self, theme: Theme, name: str, y: str, span_s: float = 120.0, number: int = 0) -> None:
-        super().__init__(theme, name, "seconds before now [s]", y)
+        super().__init__(theme, name, "time before now [s]", y)
         self.span_s = span_s
-        self._line = self.curve(number, connect="finite")
+        self._line = self.curve(number, alone=True, connect="finite")
         self.setXRange(-span_s, 0, padding=0.0)
         self.getPlotItem().enableAutoRange(axis="y")
         self.pin_left_axis()

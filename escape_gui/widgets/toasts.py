@@ -75,15 +75,15 @@ class Toasts(QWidget):
         window.installEventFilter(self)
         self.hide()
 
-    def tell(self, level: Level, title: str, text: str) -> None:
-        """Show a note; the oldest goes when there are too many."""
+    def tell(self, level: Level, title: str, text: str, *, stays: bool | None = None) -> None:
+        """Show a note until its time is over, or until it is closed; the oldest goes when there are many."""
         while len(self.notes) >= _MOST:
             self._drop(self.notes[0])
         note = Toast(self._theme, level, title, text)
         note.shut.clicked.connect(lambda: self._drop(note))
         self.notes.append(note)
         self._column.addWidget(note)
-        if level is not Level.BAD:
+        if not (level is Level.BAD if stays is None else stays):
             timer = QTimer(note)
             timer.setSingleShot(True)
             timer.timeout.connect(lambda: self._drop(note))
