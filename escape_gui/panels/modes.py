@@ -20,7 +20,6 @@ from PySide6.QtWidgets import (
 )
 
 from escape_gui.library import Shelf
-from escape_gui.maps import mask_of
 from escape_gui.panels.panel import Context, Panel, Shown
 from escape_gui.views.mode_detail import tiles
 from escape_gui.views.mode_mosaic import LIMIT
@@ -53,7 +52,7 @@ class ModesPanel(Panel):
         "The x and y slopes of every mode of the interaction matrix, each mode divided by its rms slope. "
         "Click a mode to see it in every matrix at hand, with difference, error and signal-to-noise ratio."
     )
-    streams: ClassVar[tuple[str, ...]] = ("matrix", "matrix_sigma")
+    streams: ClassVar[tuple[str, ...]] = ("valid", "matrix", "matrix_sigma")
     rate_hz = 4.0
     empty = (
         "No interaction matrix yet.\n\nStart DO-CRIME or ESCAPE in the Procedure panel, "
@@ -125,16 +124,21 @@ class ModesPanel(Panel):
 
     # ------------------------------------------------------------ data
     def take_state(self, state: State) -> None:
-        """Follow what the server holds."""
-        self._running = state.procedure is not None
+        """Follow what the server holds; once a measurement has ended, its product stands for it."""
+        running = state.procedure is not None
+        self._dirty |= running != self._running
+        self._running = running
         self.context.session.library.want(state.products)
 
     def take_sample(self, stream: str, sample: Sample) -> None:
         """The matrix grows."""
-        self._live[stream] = np.asarray(sample.data, np.float32)
-        method = str(sample.meta.get("method", ""))
-        self._method = METHOD_LABELS.get(method, method) or self._method
         self._dirty = True
+        if stream == "valid":
+            self._valid = sample.data > 0
+            return
+        self._live[stream] = np.asarray(sample.data, np.float32)
+        method = str(sample.meta.get("method") or sample.meta.get("stage", ""))
+        self._method = METHOD_LABELS.get(method, method) or self._method
         if self._running and stream == "matrix":
             self._chosen_by_hand = False
 
@@ -145,9 +149,6 @@ class ModesPanel(Panel):
             self._shelf, self._dirty = shelf, True
         if not self._dirty:
             return
-        data = self._live.get("matrix")
-        if data is not None and 2 * int(self._valid.sum()) != len(data):
-            self._valid = mask_of(source.geometry().valid)
         self._dirty = False
         self._fill_list()
         if self.matrices:
@@ -159,7 +160,7 @@ class ModesPanel(Panel):
         """All at hand by label; the one being measured first, while it is none of the others."""
         found = dict(self._shelf.matrices)
         live = self._live_matrix()
-        if live is None or any(np.array_equal(live.data, one.data) for one in found.values()):
+        if live is None or (found and not self._running):
             return found
         return {LIVE: live, **found}
 

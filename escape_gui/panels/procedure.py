@@ -196,6 +196,7 @@ class ProcedurePanel(Panel):
     def _edit(self) -> None:
         self._plan = None
         self._say_plan("")
+        self._enable()
         if self.chosen and self.context.session.commands is not None:
             self._timer.start()
 

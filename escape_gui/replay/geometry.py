@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from functools import singledispatch
-
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_gui.replay.streams import main_calibration
-from escape_hw.api.pyramid import PyramidPupils
-from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 from escape_hw.remote.state import Geometry
 from escape_hw.report.content import RunContent
-
-Outline = tuple[float, float, float]
+from escape_hw.server.views import outlines
 
 
 def geometry_of(run: RunContent) -> Geometry:
@@ -35,28 +30,6 @@ def geometry_of(run: RunContent) -> Geometry:
             "places_m": () if places is None else tuple((float(x), float(y)) for x, y in places),
         }
     )
-
-
-@singledispatch
-def outlines(grid: SensorGeometry) -> tuple[Outline, ...]:
-    """Outlines on the camera: (x, y, half width) in pixels.
-
-    Raises
-    ------
-    TypeError
-        A kind of sensor that nobody taught this to draw.
-    """
-    raise TypeError(f"there is no outline of a sensor of kind '{grid.kind}'")
-
-
-@outlines.register
-def _lenslets(grid: SubApertureGrid) -> tuple[Outline, ...]:
-    return tuple((float(x), float(y), grid.pitch_px / 2) for x, y in grid.centres_px())
-
-
-@outlines.register
-def _pupils(grid: PyramidPupils) -> tuple[Outline, ...]:
-    return tuple((float(x), float(y), grid.diameter_px / 2) for x, y in grid.centres_px)
 
 
 def _rows(mask: NDArray[np.bool_]) -> tuple[str, ...]:

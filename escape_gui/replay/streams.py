@@ -67,7 +67,11 @@ def _still(data: NDArray[Any], meta: Meta) -> Course:
 def _calibration(label: str, result: CalibrationResult) -> dict[str, Course]:
     matrix = result.measured or result.matrix
     meta: Meta = {"stage": label, "method": matrix.method, "frames": float(result.frames)}
-    found = {"matrix": _still(matrix.data, meta), "matrix_sigma": _still(matrix.sigma, meta)}
+    found = {
+        "valid": _still(matrix.valid, meta),
+        "matrix": _still(matrix.data, meta),
+        "matrix_sigma": _still(matrix.sigma, meta),
+    }
     if result.mean_frame is not None:
         found["frames"] = _still(result.mean_frame, {"stage": "mean frame"})
     if result.registration is not None:

@@ -90,7 +90,8 @@ class ErrorCurve:
         self, x: NDArray[Any], y: NDArray[np.float64], sigma: NDArray[np.float64] | None, cap: float = 0.0
     ) -> None:
         """Other points; errors that are not finite have no bar."""
-        self.line.setData(np.asarray(x, float), y)
+        drawn = np.isfinite(y).any()
+        self.line.setData(np.asarray(x, float) if drawn else np.zeros(0), y if drawn else np.zeros(0))
         known = np.isfinite(y) & np.isfinite(sigma) if sigma is not None else np.zeros(y.shape, bool)
         self.bars.setVisible(bool(known.any()))
         if sigma is not None and known.any():
