@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from escape_gui.theme import Theme
+from escape_gui.widgets.ownership import own_menu
 
 #: Safe for colour-blind eyes: signed values keep their sign, sizes their order, in every simulation.
 SIGNED, SIZE = "CET-D1A", "cividis"
@@ -38,7 +39,7 @@ class ColourScale(QWidget):
         super().__init__()
         self._theme = theme
         self._plot = pg.PlotWidget()
-        self._plot.setMenuEnabled(False)
+        own_menu(self._plot.getPlotItem())
         self._plot.setMouseEnabled(x=False, y=False)
         self._plot.hideButtons()
         self._plot.showAxis("right")

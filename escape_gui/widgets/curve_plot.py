@@ -12,6 +12,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor
 
 from escape_gui.theme import Theme
+from escape_gui.widgets.ownership import own_menu
 
 #: Markers and dashes by number of the curve, with the character that stands for each in words.
 MARKERS = (("o", "●"), ("s", "■"), ("t1", "▲"), ("d", "◆"), ("t", "▼"), ("star", "★"))
@@ -46,7 +47,7 @@ def style_axis(
 
 def style_plot(theme: Theme, plot: pg.PlotItem) -> None:
     """The common look of a plot."""
-    plot.setMenuEnabled(False)
+    own_menu(plot)
     plot.hideButtons()
     plot.showGrid(x=True, y=True, alpha=0.18)
 
