@@ -17,6 +17,7 @@ from escape_hw.cli import (
     doctor,
     emulate,
     gains,
+    keys,
     loop,
     modulator,
     perf,
@@ -47,6 +48,7 @@ app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.command("track")(track.track)
 app.command("serve")(serve.serve)
+app.add_typer(keys.app, name="keys")
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
 app.command("compare")(products.compare)

@@ -209,6 +209,8 @@ class Engine:
         """Tell those who wait for a flat mirror that it is, or why not."""
         with self._flat_lock:
             waiting, self._flat = self._flat, []
+        if waiting:
+            self.pulse.beat()
         fault = self.board.fault
         for reply in waiting:
             self.channel.post({"reply": reply, "answer": {"fault": None if fault is None else fault.reason}})
