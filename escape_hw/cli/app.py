@@ -25,6 +25,7 @@ from escape_hw.cli import (
     rehearse,
     reproduce,
     serve,
+    streams,
     systems,
     track,
     udev,
@@ -63,6 +64,7 @@ app.command("discover")(discover.discover)
 app.add_typer(udev.app, name="udev")
 app.command("emulate")(emulate.emulate)
 app.command("rehearse")(rehearse.rehearse)
+app.command("streams")(streams.streams)
 
 
 def _version(wanted: bool) -> None:

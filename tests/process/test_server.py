@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from serving import Served, serving, until_idle, wait_for
+from serving import SYSTEM, Served, serving, until_idle, wait_for
 
 from escape_hw.errors import Aborted, ConfigError, LeaseHeld, ProductError, RequestRefused
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Finish, Health, Phase
-from escape_hw.streams.segments import segments
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +68,7 @@ def test_a_run_ends_with_the_result_and_the_folder_of_the_command_line(bench: Co
 
 def test_state_devices_geometry_and_frames(bench: Connection, matrix: str) -> None:
     state = bench.state
-    assert state.system == "razor-shwfs"
+    assert state.system == SYSTEM
     assert state.simulated
     assert [one.name for one in state.devices] == ["dm", "wfs", "science", "screen"]
     assert {one.health for one in state.devices} == {Health.OK}
@@ -247,4 +246,3 @@ def test_a_run_whose_holder_vanished_is_aborted_and_the_fault_latched(system: Pa
             watcher.start("docrime")
         watcher.clear_fault()
         until_idle(watcher)
-        assert not [one for one in segments(system="razor-shwfs") if not one.alive]
