@@ -16,13 +16,15 @@ from escape_hw.api.taps import Taps
 from escape_hw.errors import StorageError
 from escape_hw.remote.source import STREAMS
 from escape_hw.remote.state import StreamEntry
-from escape_hw.streams.ring import RingWriter
+from escape_hw.streams.ring import SLOTS, RingWriter
 from escape_hw.streams.segments import segment_name
 
 log = logging.getLogger(__name__)
 
 #: Least room of a ring's entry, so that what grows seldom outgrows it.
 _LEAST_BYTES = 16384
+#: Entries kept of streams that are recorded at full rate: as long as a recorder may be held up.
+_SLOTS = {"frames": 16, "slopes": 64, "modes": 64, "commands": 64}
 
 
 class Publisher:
@@ -109,7 +111,7 @@ class Publisher:
             del self._rings[name]
             ring.close()
         try:
-            self._rings[name] = RingWriter(segment_name(self._system, name), room)
+            self._rings[name] = RingWriter(segment_name(self._system, name), room, _SLOTS.get(name, SLOTS))
         except StorageError as error:
             log.error("stream '%s' cannot be shown: %s", name, error)
             self._refused.add(name)

@@ -68,7 +68,10 @@ class Served:
         """Start it; it is ready some seconds later."""
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
-                [*ESCAPE, "serve", *map(str, self._words), "--set", f"system.name={SYSTEM}"], env=self.environment, stdout=log, stderr=log
+                [*ESCAPE, "serve", *map(str, self._words), "--set", f"system.name={SYSTEM}"],
+                env=self.environment,
+                stdout=log,
+                stderr=log,
             )
 
     def connect(self, **options: bool) -> Connection:
@@ -128,7 +131,7 @@ def serving(*words: object, folder: Path, more: Mapping[str, str] | None = None)
         else:
             os.environ["XDG_RUNTIME_DIR"] = before
     wait_for(lambda: not served.engines(), "engine and guardian end")
-    assert not segments(SYSTEM)
+    assert not [one for one in segments(SYSTEM) if not one.alive]
 
 
 def until_idle(bench: Connection) -> None:
