@@ -63,7 +63,7 @@ def setup_from_frames(
 
 def refined(bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]) -> SensorGeometry:
     """A geometry, better known by the mean raw frames of a run's parts."""
-    return kind_of(bench).refined(grid, [_calibrated(bench, mean, grid.background) for mean in means])
+    return kind_of(bench).refined(bench, grid, [_calibrated(bench, mean, grid.background) for mean in means])
 
 
 def _calibrated(bench: Bench, frame: NDArray[np.float32], background: float) -> NDArray[np.float32]:

@@ -12,6 +12,7 @@ from escape_hw.api.pyramid import PyramidPupils, boxes
 from escape_hw.api.registration import Registration
 from escape_hw.config.sensor_models import PyramidSection
 from escape_hw.errors import CalibrationError
+from escape_sim.air_scatter import air_scatter
 from escape_sim.fourier_filter import good_length
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
 from escape_sim.influence import InfluenceFunctions
@@ -26,7 +27,7 @@ from escape_sim.modulation import Modulation
 from escape_sim.prism import Prism
 from escape_sim.pyramid import PyramidOptics, Window
 from escape_sim.pyramid_response import slope_response
-from escape_sim.pyramid_turbulence import distances, strength
+from escape_sim.pyramid_turbulence import Pokes, distances, strength, unit_screens
 from escape_sim.surface_nodes import surface_nodes
 from escape_sim.turbulence_statistics import structure_function
 
@@ -102,17 +103,20 @@ class PyramidModel:
         self._pitch = pitch_on_pupil(config)
         self._coupling = config.devices.dm.coupling
         self._modulation = modulation or Modulation.circle(pupils.modulation)
+        # A surface changes the path by twice as much.
+        scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
+        pitches = config.devices.dm.pitches_across_pupil
+        self._pokes = Pokes.of(scale * pupils.pokes, config.basis.n_modes, pitches)
         if turbulence is None:
-            turbulence = strength(self.optics(), pupils, _OUTER_SCALE)
+            turbulence = strength(self.optics(), pupils, _OUTER_SCALE, self._pokes)
         self.turbulence = turbulence if turbulence >= _CALM else 0.0
         sigma = self._pitch / np.sqrt(2 * np.log(1 / self._coupling))
         self._nodes, self._carry = surface_nodes(pupil.coordinates_m, sigma)
-        # A surface changes the path by twice as much.
-        scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
         self._response = self._by_phase()
         self._response *= np.float32(scale)
         self._helper = ThreadPoolExecutor(1, "pyramid-model")
         self._variants: list[PyramidModel] | None = None
+        self._scatter: NDArray[np.float64] | None = None
 
     @property
     def n_act(self) -> int:
@@ -126,9 +130,9 @@ class PyramidModel:
 
     @property
     def registration_doubt(self) -> NDArray[np.float64]:
-        """The error of the pupil images' mean place, see :class:`DoubtfulModel`."""
+        """Errors of the pupil images' place and of the air's own, see :class:`DoubtfulModel`."""
         shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
-        return np.array([shift, shift, 0.0, 0.0, 0.0])
+        return np.asarray(np.hypot([shift, shift, 0.0, 0.0, 0.0], self._air_doubt()))
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
@@ -184,6 +188,21 @@ class PyramidModel:
         return list(self._variants)
 
     # ------------------------------------------------------------------ construction
+    def _air_doubt(self) -> NDArray[np.float64]:
+        """What the states of the air and of the mirror that were seen leave of :func:`air_scatter`."""
+        if not self._pupils.looks or not (self.turbulence or self._pokes.rms_rad):
+            return np.zeros(5)
+        if self._scatter is None:
+            x, optics = self._pupil.coordinates_m, self.optics()
+            phases = unit_screens(x.size, _OUTER_SCALE) * self.turbulence ** (5 / 6)
+            phases += self._pokes.phases(*phases.shape[:2])
+            paths = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
+            paths *= 2 * self._config.devices.dm.stroke_m
+            self._scatter = air_scatter(
+                optics, self._pupils, phases, paths, lambda m2c: self.modal_jacobian(Registration(), m2c)
+            )
+        return self._scatter / np.sqrt(self._pupils.looks)
+
     def _by_phase(self) -> NDArray[np.float32]:
         """The slopes' derivatives by the phase at the nodes ``(n_slopes, m * m)``."""
         pupils, pupil = self._pupils, self._pupil
@@ -192,9 +211,11 @@ class PyramidModel:
         grid = good_length(max(shape), samples)
         window = Window(pupils.centres_px, shape, grid, samples)
         structure = None
-        if self.turbulence:
+        if self.turbulence or self._pokes.rms_rad:
             apart = distances(n, pupil.pixel_m) / self._config.system.pupil_m
-            structure = structure_function(apart, 1 / self.turbulence, _OUTER_SCALE)
+            structure = self._pokes.structure(apart)
+            if self.turbulence:
+                structure += structure_function(apart, 1 / self.turbulence, _OUTER_SCALE)
         return slope_response(
             pupil.amplitude, Prism(window.shifts(n), pupil.n_sub * samples), grid * samples,
             pupils.corners_px - window.first, pupils.valid, self._modulation, structure,

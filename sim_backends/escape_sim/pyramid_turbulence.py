@@ -1,9 +1,12 @@
-"""How strong the turbulence is that makes a pyramid's slopes move so much."""
+"""What moves before a pyramid while it is calibrated: turbulence of unknown strength, and known pokes."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import j1
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.pipeline.pyramid_slopes import slopes_of_image
@@ -17,19 +20,61 @@ _PAIRS = 6
 _SIDE = 8
 
 
+@dataclass(frozen=True, slots=True)
+class Pokes:
+    """Random pokes of many modes at once, as a phase that is white up to a highest frequency.
+
+    Parameters
+    ----------
+    rms_rad
+        Rms phase over the pupil in radians.
+    cutoff
+        Highest frequency in radians per pupil diameter.
+    """
+
+    rms_rad: float
+    cutoff: float
+
+    @classmethod
+    def of(cls, rms_rad: float, n_modes: int, pitches: float) -> Pokes:
+        """Pokes on ``n_modes`` modes of a mirror with so many actuator pitches across the pupil.
+
+        ``n`` modes fill the frequencies up to ``4 sqrt(n)`` radians per diameter (area of the pupil
+        times area in frequency), but actuators make none beyond ``pi`` per pitch.
+        """
+        return cls(rms_rad, min(4 * float(np.sqrt(n_modes)), np.pi * pitches))
+
+    def structure(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Structure function in square radians at distances in pupil diameters.
+
+        ``2 sigma^2 (1 - 2 J1(k r) / (k r))``: a disk of frequencies, transformed.
+        """
+        x = np.maximum(self.cutoff * np.abs(distance), 1e-9)
+        return np.asarray(2 * self.rms_rad**2 * (1 - 2 * j1(x) / x))
+
+    def phases(self, count: int, n: int) -> NDArray[np.float64]:
+        """Random phases ``(count, n, n)`` in radians over a pupil of ``n`` samples; always the same."""
+        f = 2 * np.pi * np.fft.fftfreq(2 * n) * n
+        passed = np.hypot(f[:, None], f) <= self.cutoff
+        noise = np.random.default_rng(1).standard_normal((count, 2 * n, 2 * n))
+        smooth = np.fft.ifft2(np.fft.fft2(noise) * passed).real[:, :n, :n]
+        return np.asarray(smooth * (self.rms_rad / np.sqrt(passed.mean())))
+
+
 def distances(n: int, pixel_m: float) -> NDArray[np.float64]:
     """Distances in metres of all pairs of samples ``(2 n - 1, 2 n - 1)``, by their separation."""
     steps = np.arange(1 - n, n) * pixel_m
     return np.asarray(np.hypot(steps[:, None], steps))
 
 
-def strength(optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float) -> float:
-    """Pupil diameters over r0 at the sensor's wavelength, from ``pupils.motion``.
+def strength(optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float, pokes: Pokes) -> float:
+    """Pupil diameters over r0 at the sensor's wavelength, from how the slopes moved.
 
-    There is no formula: frames under a few random phases of each strength are made and their slopes'
-    rms over time compared. Always the same phases, so that equal motions give equal strengths. The
-    slopes of a pyramid saturate and finally move less again, so that from about 20 r0 across the
-    pupil the motion hardly tells the strength any more.
+    There is no formula: frames under a few random phases of each strength are made and their slopes
+    compared; always the same phases, so that equal motions give equal strengths. Beside random pokes,
+    which are new in every frame, the share of the slopes' variance that lasts tells the strength. Without
+    them the slopes' rms does; but the slopes of a pyramid saturate and finally move less again, so that
+    from about 20 r0 across the pupil it hardly tells any more.
 
     Parameters
     ----------
@@ -39,33 +84,47 @@ def strength(optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float) -
         Geometry, with the motion measured.
     outer_scale
         Outer scale of the turbulence in pupil diameters.
+    pokes
+        What the mirror did meanwhile.
 
     Returns
     -------
     float
-        Between 0 (no motion) and the strength that moves the slopes most.
+        Between 0 (no motion, or none that lasts) and the strongest that was tried.
     """
-    if not pupils.motion:
-        return 0.0
     n = optics.amplitude.shape[0]
-    paths = _unit_screens(n, outer_scale) * (optics.wavelength_m / (2 * np.pi))
-    moved = []
+    beside = bool(pokes.rms_rad and pupils.steady)
+    target = pupils.steady if beside else pupils.motion
+    if not target:
+        return 0.0
+    screens, poked = unit_screens(n, outer_scale), pokes.phases(4 * _PAIRS, n)
+    told: list[float] = []
     for ratio in _STRENGTHS:
-        slopes = [
-            slopes_of_image(optics.frame((path * ratio ** (5 / 6)).astype(np.float32)), pupils)
-            for path in paths
-        ]
-        moved.append(float(np.sqrt(np.var(slopes, axis=0, ddof=1).mean())))
-        if len(moved) > 1 and moved[-1] <= moved[-2]:
-            moved.pop()
+        air = screens * ratio ** (5 / 6)
+        if beside:
+            first, second = (_slopes(optics, pupils, air + half) for half in np.split(poked, 2))
+            told.append(float(np.mean(first * second) / np.sqrt(np.mean(first**2) * np.mean(second**2))))
+        else:
+            told.append(float(np.sqrt(np.square(_slopes(optics, pupils, air)).mean())))
+        if len(told) > 1 and told[-1] <= told[-2]:
+            told.pop()
             break
-    if pupils.motion <= moved[0]:
-        # Weak turbulence moves slopes in proportion to the phase.
-        return float(_STRENGTHS[0] * (pupils.motion / moved[0]) ** (6 / 5))
-    return float(2 ** np.interp(pupils.motion, moved, np.log2(_STRENGTHS[: len(moved)])))
+        if told[-1] > target:
+            break
+    if target <= told[0]:
+        # Weak turbulence moves slopes in proportion to the phase; a share goes by their squares.
+        return float(_STRENGTHS[0] * (target / told[0]) ** (3 / 5 if beside else 6 / 5))
+    return float(2 ** np.interp(target, told, np.log2(_STRENGTHS[: len(told)])))
 
 
-def _unit_screens(n: int, outer_scale: float) -> NDArray[np.float64]:
+def _slopes(optics: PyramidOptics, pupils: PyramidPupils, phases: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Slopes ``(count, n_slopes)`` about their mean under random phases ``(count, n, n)`` in radians."""
+    paths = (phases * (optics.wavelength_m / (2 * np.pi))).astype(np.float32)
+    slopes = np.array([slopes_of_image(optics.frame(path), pupils) for path in paths])
+    return np.asarray((slopes - slopes.mean(axis=0)) * np.sqrt(len(slopes) / (len(slopes) - 1)))
+
+
+def unit_screens(n: int, outer_scale: float) -> NDArray[np.float64]:
     """Von Kármán phases ``(2 * _PAIRS, n, n)`` in radians with a pupil of one r0."""
     size = _SIDE * n
     f = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.fftfreq(size))) * n
