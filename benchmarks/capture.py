@@ -3,7 +3,7 @@
     python benchmarks/capture.py --system razor-shwfs --plants 100 --out docs/figures
     python benchmarks/capture.py --system razor-pywfs --plants 100 --out docs/figures
 
-Each plant is a twin with all its imperfections, measured by push-pull on the calm beam, one frame per
+Each plant is a twin with all its imperfections, measured by push-pull on the calm beam, two frames per
 sign. SPRINT gets that matrix and a model built on the images found, and starts from zero. A plant is
 recovered when SPRINT says it converged and every parameter is right within the tolerance, flagged when
 it says it did not, and wrong otherwise. Writes ``capture-SYSTEM.json``; exits with 1 when a plant was wrong
@@ -45,7 +45,7 @@ def run_plant(system: str, number: int) -> dict[str, Any]:
     config = twins_of(system)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
     plant = far_plant(number, pitch)
-    changes = ["calibration.push_pull_frames=1", *plant_overrides(plant)]
+    changes = ["calibration.push_pull_frames=2", *plant_overrides(plant)]
     with System.from_config(twins_of(system, changes, seed=number + 1)) as bench:
         measured = bench.calibrate("push-pull")
         found = sprint(measured.matrix, bench.model(measured.grid), misfit=False, max_iterations=40)
@@ -55,7 +55,7 @@ def run_plant(system: str, number: int) -> dict[str, Any]:
     outcome = ("recovered" if right else "wrong") if found.converged else "flagged"
     return {
         "plant": number, "outcome": outcome, "planted": plant.to_array().tolist(), "error": error.tolist(),
-        "steps": len(found.history), "warnings": list(found.warnings),
+        "steps": len(found.iterations), "warnings": list(found.warnings),
     }  # fmt: skip
 
 

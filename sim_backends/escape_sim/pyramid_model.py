@@ -201,7 +201,7 @@ class PyramidModel:
             self._scatter = air_scatter(
                 optics, self._pupils, phases, paths, lambda m2c: self.modal_jacobian(Registration(), m2c)
             )
-        return self._scatter / np.sqrt(self._pupils.looks)
+        return np.asarray(self._scatter / np.sqrt(self._pupils.looks))
 
     def _by_phase(self) -> NDArray[np.float32]:
         """The slopes' derivatives by the phase at the nodes ``(n_slopes, m * m)``."""
