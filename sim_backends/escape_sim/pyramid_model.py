@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 _OUTER_SCALE = 4.0
 #: Turbulence weaker than this many r0 across the pupil leaves the response what it is at rest.
 _CALM = 0.5
+#: What scalings err by in common on a pyramid under turbulence and pokes, in % of the diameter: the mean
+#: over sixteen twins with the images at their true centres (docs/decisions/0018-pyramids-in-truth.md).
+_SCALING = 0.12
 #: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
 _STRENGTH_DOUBT, _ELLIPSE = 0.4, 0.05
 
@@ -132,7 +135,7 @@ class PyramidModel:
     def registration_doubt(self) -> NDArray[np.float64]:
         """Errors of the pupil images' place and of the air's own, see :class:`DoubtfulModel`."""
         shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
-        return np.asarray(np.hypot([shift, shift, 0.0, 0.0, 0.0], self._air_doubt()))
+        return np.asarray(np.hypot([shift, shift, 0.0, _SCALING, _SCALING], self._air_doubt()))
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""

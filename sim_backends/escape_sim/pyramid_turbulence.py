@@ -12,8 +12,8 @@ from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.pipeline.pyramid_slopes import slopes_of_image
 from escape_sim.pyramid import PyramidOptics
 
-#: Strengths tried, as pupil diameters over r0.
-_STRENGTHS = 2.0 ** np.arange(-1, 5.5, 0.5)
+#: Strengths tried, as pupil diameters over r0; beyond the last the slopes tell them apart no more.
+_STRENGTHS = 2.0 ** np.arange(-1, 5, 0.5)
 #: Pairs of phase screens tried with each.
 _PAIRS = 6
 #: Side of the screens in pupils: the outer scale must fit in.
@@ -67,7 +67,11 @@ def distances(n: int, pixel_m: float) -> NDArray[np.float64]:
     return np.asarray(np.hypot(steps[:, None], steps))
 
 
-def strength(optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float, pokes: Pokes) -> float:
+#: A mirror that is still.
+STILL = Pokes(0.0, 1.0)
+
+
+def strength(optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float, pokes: Pokes = STILL) -> float:
     """Pupil diameters over r0 at the sensor's wavelength, from how the slopes moved.
 
     There is no formula: frames under a few random phases of each strength are made and their slopes
