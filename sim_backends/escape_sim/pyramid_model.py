@@ -135,7 +135,8 @@ class PyramidModel:
     def registration_doubt(self) -> NDArray[np.float64]:
         """Errors of the pupil images' place and of the air's own, see :class:`DoubtfulModel`."""
         shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
-        return np.asarray(np.hypot([shift, shift, 0.0, _SCALING, _SCALING], self._air_doubt()))
+        scaling = _SCALING if self.turbulence or self._pokes.rms_rad else 0.0
+        return np.asarray(np.hypot([shift, shift, 0.0, scaling, scaling], self._air_doubt()))
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
