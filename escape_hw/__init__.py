@@ -30,9 +30,11 @@ if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult, LoopResult, Measured, RegistrationEstimate
     from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
     from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
-    from escape_hw.calibration.closed_loop import best_gain, closed_loop, measure_model_psf
+    from escape_hw.calibration.closed_loop import closed_loop
     from escape_hw.calibration.docrime import docrime
     from escape_hw.calibration.escape import escape
+    from escape_hw.calibration.gain_search import best_gain
+    from escape_hw.calibration.model_psf import measure_model_psf
     from escape_hw.calibration.push_pull import push_pull
     from escape_hw.calibration.sensor_setup import find_sensor, measure_dark
     from escape_hw.calibration.sprint import sprint
@@ -79,7 +81,7 @@ _HOME = {
     "SubApertureGrid": "escape_hw.api.sensor",
     "System": "escape_hw.runtime.system",
     "TipTiltModulator": "escape_hw.api.modulator",
-    "best_gain": "escape_hw.calibration.closed_loop",
+    "best_gain": "escape_hw.calibration.gain_search",
     "bundled_systems": "escape_hw.config.bundled",
     "closed_loop": "escape_hw.calibration.closed_loop",
     "docrime": "escape_hw.calibration.docrime",
@@ -89,7 +91,7 @@ _HOME = {
     "load_matrix": "escape_hw.io.fits",
     "load_system": "escape_hw.config.load",
     "measure_dark": "escape_hw.calibration.sensor_setup",
-    "measure_model_psf": "escape_hw.calibration.closed_loop",
+    "measure_model_psf": "escape_hw.calibration.model_psf",
     "open_system": "escape_hw.runtime.system",
     "push_pull": "escape_hw.calibration.push_pull",
     "register_device": "escape_hw.config.registry",

@@ -27,7 +27,8 @@ class InteractionMatrix:
     system
         Name of the system it was measured on.
     method
-        ``push-pull``, ``docrime``, ``docrime-whitened`` or ``escape``.
+        ``push-pull``, ``push-pull-fast``, ``modulated``, ``docrime``, ``docrime-whitened`` or ``escape``;
+        ``docrime-closed`` and ``push-pull-fast-closed`` were measured in closed loop.
     simulated
         True when any device that took part was simulated.
     metrics
@@ -71,10 +72,7 @@ class InteractionMatrix:
         The noise power is subtracted from the column's power, so pure noise gives 0, not 1.
         Infinite where no error is stated.
         """
-        noise = np.mean(np.square(self.sigma, dtype=float), axis=0)
-        power = np.mean(np.square(self.data, dtype=float), axis=0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(noise > 0, np.sqrt(np.maximum(power - noise, 0) / noise), np.inf)
+        return snr_of(self.data, self.sigma)
 
     def maps(self, mode: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Slope maps (x, y) of one mode, each ``(n_rows, n_columns)``, NaN outside the pupil."""
@@ -85,3 +83,11 @@ class InteractionMatrix:
             image[self.valid] = part
             both.append(image)
         return both[0], both[1]
+
+
+def snr_of(data: NDArray[np.floating], sigma: NDArray[np.floating]) -> NDArray[np.float64]:
+    """See :meth:`InteractionMatrix.snr`; any number of columns ``(n_slopes, n)``."""
+    noise = np.mean(np.square(sigma, dtype=float), axis=0)
+    power = np.mean(np.square(data, dtype=float), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(noise > 0, np.sqrt(np.maximum(power - noise, 0) / noise), np.inf)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,34 @@ class Progress:
         return self.elapsed_s * max(0, self.total - self.done) / self.done
 
 
+class Stop(Protocol):
+    """What tells a procedure to stop: a :class:`Flag`, or a :class:`threading.Event`."""
+
+    def is_set(self) -> bool:
+        """Whether to stop."""
+
+
+class Flag:
+    """A flag that a signal handler may set.
+
+    It takes no lock, unlike :class:`threading.Event`: a handler that interrupts itself in the midst
+    of setting an event waits for itself for ever.
+    """
+
+    __slots__ = ("_set",)
+
+    def __init__(self) -> None:
+        self._set = False
+
+    def set(self) -> None:
+        """Raise the flag."""
+        self._set = True
+
+    def is_set(self) -> bool:
+        """Whether it was raised."""
+        return self._set
+
+
 Procedure = Generator[Progress, None, T]
 Observer = Callable[[Progress], None]
 
@@ -102,7 +130,7 @@ def run(
     procedure: Procedure[T],
     *,
     observers: tuple[Observer, ...] = (),
-    abort: threading.Event | None = None,
+    abort: Stop | None = None,
 ) -> T:
     """Drive a procedure to its end and return its result.
 
@@ -129,10 +157,10 @@ def run(
     Aborted
         Stopped by ``abort`` or Ctrl-C; carries the partial result when the procedure made one.
     """
-    interrupted = threading.Event()
+    interrupted = Flag()
     try:
         with _ctrl_c_sets(interrupted):
-            return _drive(procedure, list(observers), abort or threading.Event(), interrupted)
+            return _drive(procedure, list(observers), abort or Flag(), interrupted)
     except KeyboardInterrupt:
         raise Aborted("interrupted by Ctrl-C") from None
     finally:
@@ -142,8 +170,8 @@ def run(
 def _drive(
     procedure: Procedure[T],
     watching: list[Observer],
-    abort: threading.Event,
-    interrupted: threading.Event,
+    abort: Stop,
+    interrupted: Flag,
 ) -> T:
     deadline = None
     while True:
@@ -177,7 +205,7 @@ def _tell(watching: list[Observer], progress: Progress) -> None:
             watching.remove(observer)
 
 
-def _aborted(interrupted: threading.Event, partial: object = None) -> Aborted:
+def _aborted(interrupted: Flag, partial: object = None) -> Aborted:
     if interrupted.is_set():
         return Aborted("interrupted by Ctrl-C", partial)
     return Aborted(partial=partial)
@@ -192,8 +220,8 @@ def _close(procedure: Procedure[T]) -> None:
 
 
 @contextmanager
-def _ctrl_c_sets(event: threading.Event) -> Iterator[None]:
-    """Let the first Ctrl-C set ``event``, and the next one interrupt as usual.
+def _ctrl_c_sets(flag: Flag) -> Iterator[None]:
+    """Let the first Ctrl-C set ``flag``, and the next one interrupt as usual.
 
     Leaves alone what another thread or the application has arranged.
     """
@@ -203,7 +231,7 @@ def _ctrl_c_sets(event: threading.Event) -> Iterator[None]:
         return
 
     def first(signum: int, frame: FrameType | None) -> None:
-        event.set()
+        flag.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     signal.signal(signal.SIGINT, first)

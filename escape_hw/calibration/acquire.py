@@ -101,6 +101,14 @@ class Motion:
         if poke is not None:
             self._pokes += float(poke @ poke)
 
+    def state(self) -> NDArray[np.float64]:
+        """Sums and sums of squares with the number of frames behind them ``(3, n_slopes)``."""
+        return np.stack([self._sum, self._squares, np.full(self.n_slopes, float(self._n))])
+
+    def restore(self, state: NDArray[np.float64]) -> None:
+        """Go on from what :meth:`state` gave."""
+        self._sum, self._squares, self._n = state[0].copy(), state[1].copy(), int(state[2, 0])
+
     def of(self, grid: SensorGeometry) -> SensorGeometry:
         """The geometry with the motion filled in."""
         if self._n < 2:

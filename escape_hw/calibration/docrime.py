@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure
@@ -15,18 +16,24 @@ from escape_hw.calibration.acquire import (
     measured_matrix,
     some_frames,
 )
-from escape_hw.calibration.docrime_estimator import DocrimeEstimator, DocrimeSolution
+from escape_hw.calibration.checkpoint import Checkpoint
+from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.docrime_solution import DocrimeSolution
+from escape_hw.calibration.poke_patterns import Pattern, RandomPokes
 from escape_hw.calibration.poke_session import PokeSession, Record
 from escape_hw.calibration.sensor_setup import (
     SETUP_FRAMES,
     modal_basis,
     poke_amplitudes,
 )
+from escape_hw.calibration.stopping import Judge, Looks, Target, no_accuracy
 from escape_hw.config.models import CalibrationSection
 from escape_hw.errors import Aborted, TooFewFrames
 
 #: Slopes up to which the correlation of their noise is followed.
 MOST_CORRELATED = 3000
+#: Share of the response in its last frame beyond which one may doubt that it ends there.
+_TAIL = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,11 +58,15 @@ def docrime_run(
     grid: SensorGeometry | None = None,
     record: bool = False,
     correlations: bool = True,
+    pattern: type[Pattern] = RandomPokes,
+    keep: Checkpoint | None = None,
+    judge: Judge | None = None,
 ) -> Procedure[DocrimeRun]:
     """As :func:`docrime`, with the solution beside the matrix, and with the telemetry if asked for.
 
     The solution knows how the noise of the slopes is correlated unless ``correlations`` is false, or
-    there are more than :data:`MOST_CORRELATED` slopes.
+    there are more than :data:`MOST_CORRELATED` slopes. ``pattern`` makes the pokes, ``judge`` says
+    when a solution will do.
     """
     c = bench.config.calibration
     n_frames = c.frames if frames is None else some_frames(frames)
@@ -70,8 +81,14 @@ def docrime_run(
         known = correlations and n_slopes <= MOST_CORRELATED
         return DocrimeEstimator(n_slopes, m2c.shape[1], order=order, lags=lags, correlations=known)
 
-    session = PokeSession(bench, m2c, grid, min(SETUP_FRAMES, n_frames), estimator, keep=record)
-    partial = yield from session.poke(n_frames, amplitude)
+    session = PokeSession(
+        bench, m2c, grid, min(SETUP_FRAMES, n_frames), estimator, keep=record, looks=Looks(keep, judge)
+    )
+    settings = {"poke": poke, "whiten": whiten, "correlations": correlations}
+    state = None if keep is None else keep.begin(bench, pattern.method, m2c, settings)
+    if state is not None:
+        session.restore(state)
+    partial = yield from session.poke(n_frames, pattern(amplitude, bench.rng), pattern.title)
     session.ready()
     if session.estimator is None or session.grid is None or session.motion is None:
         raise Aborted("aborted before the first frames")
@@ -81,24 +98,66 @@ def docrime_run(
         if partial:
             raise Aborted(f"aborted after {session.taken} frames, too few for a matrix") from None
         raise
-    matrix = measured_matrix(
-        bench, session.grid, m2c, solution.matrix, solution.sigma,
-        "docrime-whitened" if whiten else "docrime",
-        frames=solution.frames, lost_frames=solution.lost_frames, poke=float(poke),
-        shortened=session.shortened, delay_frames=solution.response.delay,
-        whitening_order=solution.whitener.size - 1, gain_sigma=solution.gain_sigma,
-    )  # fmt: skip
+    method = pattern.method + ("-whitened" if whiten and pattern is RandomPokes else "")
+    matrix = matrix_of(
+        bench, session.grid, m2c, solution, method, poke=float(poke), shortened=session.shortened
+    )
     return DocrimeRun(_result(session, matrix, solution, partial), solution, session.record())
+
+
+def matrix_of(
+    bench: Bench,
+    grid: SensorGeometry,
+    m2c: NDArray[np.float64],
+    solution: DocrimeSolution,
+    method: str,
+    **metrics: float | int | str,
+) -> InteractionMatrix:
+    """The matrix of a solution with its provenance and metrics."""
+    return measured_matrix(
+        bench, grid, m2c, solution.matrix, solution.sigma, method,
+        frames=solution.frames, lost_frames=solution.lost_frames, delay_frames=solution.response.delay,
+        whitening_order=solution.whitener.size - 1, gain_sigma=solution.gain_sigma, **metrics,
+    )  # fmt: skip
+
+
+def notes_on(solution: DocrimeSolution, matrix: InteractionMatrix) -> list[str]:
+    """What to know of a solution before using it."""
+    notes = []
+    if float(np.median(matrix.snr())) < 1:
+        notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
+    tail, error = solution.response.weights[-1], solution.response.sigma[-1]
+    if abs(tail) > max(_TAIL, 4 * error):
+        notes.append(
+            f"{tail:.0%} of the response come only {solution.response.weights.size - 1} frames after a "
+            "command, so some may come later still, which scales the matrix; raise calibration.lags"
+        )
+    return notes
+
+
+def snr_judge(bench: Bench, m2c: NDArray[np.float64], until: Target | None, method: str) -> Judge | None:
+    """Judges a solution by the signal-to-noise ratio asked for; ``None`` when none is.
+
+    Raises
+    ------
+    ConfigError
+        A registration's accuracy is asked for, too: a matrix alone has none.
+    """
+    no_accuracy(until)
+    if until is None:
+        return None
+
+    def judge(solution: DocrimeSolution, grid: SensorGeometry) -> Procedure[bool]:
+        yield from ()
+        return until.snr_met(matrix_of(bench, grid, m2c, solution, method))
+
+    return judge
 
 
 def _result(
     session: PokeSession, matrix: InteractionMatrix, solution: DocrimeSolution, partial: bool
 ) -> CalibrationResult:
     """The matrix with all that the run taught about the sensor."""
-    notes = []
-    if float(np.median(matrix.snr())) < 1:
-        notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
-    notes += session.notes()
     seconds = (solution.frames + solution.lost_frames) / session.bench.wfs.settings.frame_rate_hz
     return CalibrationResult(
         matrix,
@@ -109,7 +168,7 @@ def _result(
         solution.response,
         partial=partial,
         mean_frame=session.mean_frame,
-        notes=tuple(notes),
+        notes=(*notes_on(solution, matrix), *session.notes()),
     )
 
 
@@ -120,6 +179,9 @@ def docrime(
     poke: float | None = None,
     whiten: bool = True,
     grid: SensorGeometry | None = None,
+    pattern: type[Pattern] = RandomPokes,
+    until: Target | None = None,
+    keep: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
     """Measure the interaction matrix by random pokes, under turbulence or not.
 
@@ -137,6 +199,13 @@ def docrime(
         Subtract what the past predicts of the turbulence; false gives the paper's plain estimator.
     grid
         The sensor's grid, when it is known already.
+    pattern
+        Other pokes than random ones: :class:`~escape_hw.calibration.poke_patterns.PushPullPokes` make it
+        a fast push-pull.
+    until
+        Stop before that number of frames when this is reached.
+    keep
+        Where the state is kept meanwhile, and what to go on with.
 
     Returns
     -------
@@ -151,13 +220,17 @@ def docrime(
         Too few frames for the number of modes; nothing moved.
     CalibrationError
         No spots or pupil images, no light, no response, or pokes that do not span the modes.
+    ProductError
+        The state to go on with is damaged or of another run; nothing moved.
     Aborted
         Stopped before a matrix could be solved.
     """
+    judge = None if until is None else snr_judge(bench, modal_basis(bench), until, pattern.method)
     # Nobody asks a matrix how the noise of its slopes is correlated.
     run = yield from docrime_run(
-        bench, frames=frames, poke=poke, whiten=whiten, grid=grid, correlations=False
-    )
+        bench, frames=frames, poke=poke, whiten=whiten, grid=grid, correlations=False, pattern=pattern,
+        keep=keep, judge=judge,
+    )  # fmt: skip
     return run.result
 
 

@@ -6,70 +6,24 @@ The paper's estimator, ``D = <s c^T> <c c^T>^-1``, is the special case of a filt
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from escape_hw.api.results import TemporalResponse
-from escape_hw.calibration.regression import RegressionSums
-from escape_hw.calibration.response import (
-    SLOPES,
-    ResponseTracker,
-    autocovariance,
-    filtered,
-    fit_response,
-    usable_rows,
-)
-from escape_hw.calibration.significance import require_response, spread
+from escape_hw.calibration.docrime_fit import MIN_FREEDOM, empty_sums, first_fit, require_excitation
+from escape_hw.calibration.docrime_solution import DocrimeSolution
+from escape_hw.calibration.response import ResponseTracker, covariances, filtered
+from escape_hw.calibration.significance import require_response
 from escape_hw.calibration.telemetry import Recorder, Telemetry
-from escape_hw.calibration.whitening import apply_filter, prediction_error_filter
-from escape_hw.errors import CalibrationError, TooFewFrames
+from escape_hw.errors import TooFewFrames
 
 #: Frames kept to fit the whitening filter before the sums start.
 BURN_IN = 1000
 #: Frames gathered before the sums are updated: large enough for matrix products to be efficient.
 BLOCK = 500
-#: Degrees of freedom without which no standard error is worth stating.
-MIN_FREEDOM = 20
-#: Slopes that the filter, common to all, is found from.
-_FEW_SLOPES = 32
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DocrimeSolution:
-    """A solved DO-CRIME run.
-
-    Parameters
-    ----------
-    matrix, sigma
-        ``(n_slopes, n_modes)``: slopes per unit mode, and standard errors of single elements beside a
-        gain that they share.
-    covariance
-        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; ``None`` where
-        correlations were not asked for.
-    gram
-        Sum over frames of filtered pokes times filtered pokes ``(n_modes, n_modes)``.
-    variance
-        Variance of each slope's filtered noise, with what its correlation over time adds ``(n_slopes,)``.
-    whitener
-        The filter used, ``[1]`` for the plain estimator.
-    gain_sigma
-        Relative standard error of the gain that all elements share: an error of the temporal response,
-        which is scaled to sum 1, scales the whole matrix.
-    """
-
-    matrix: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    response: TemporalResponse
-    covariance: NDArray[np.float64] | None
-    gram: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    whitener: NDArray[np.float64]
-    frames: int
-    lost_frames: int
-    gain_sigma: float
 
 
 class DocrimeEstimator:
@@ -86,29 +40,46 @@ class DocrimeEstimator:
     correlations
         Find how the noise of the slopes is correlated, which SPRINT's error bars want; costs as much
         as the rest when there are many slopes.
+    closed
+        Frames come with the poke beside the whole command of a closed loop, and pokes are the
+        instruments of the commands (:class:`~escape_hw.calibration.regression.InstrumentSums`).
     """
 
     def __init__(
-        self, n_slopes: int, n_modes: int, *, order: int = 6, lags: int = 5, correlations: bool = True
+        self,
+        n_slopes: int,
+        n_modes: int,
+        *,
+        order: int = 6,
+        lags: int = 5,
+        correlations: bool = True,
+        closed: bool = False,
     ) -> None:
-        if order < 0 or lags < 1:
-            raise ValueError(f"order is {order} and lags {lags}; they must be at least 0 and 1")
+        least = 1 if closed else 0
+        if order < least or lags < 1:
+            raise ValueError(f"order is {order} and lags {lags}; they must be at least {least} and 1")
         self.n_slopes, self.n_modes, self.order, self.lags = n_slopes, n_modes, order, lags
-        self._recorder = Recorder(n_slopes, n_modes, BURN_IN)
+        self.closed = closed
+        self._recorder = Recorder(n_slopes, n_modes, BURN_IN, closed=closed)
         self._shapes = (n_slopes,), (n_modes,)
+        self._driven = np.zeros(2 * n_modes)
         self._next: int | None = None
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
         self._response_covariance = np.zeros((lags, lags))
         self._tracker: ResponseTracker | None = None
         self._spread = 1.0
-        self._sums = RegressionSums.zeros(n_slopes, n_modes, correlations=correlations)
+        self._sums = empty_sums(n_slopes, n_modes, closed, correlations=correlations)
         self.frames = self.lost_frames = 0
 
     def partial_fit(
-        self, index: int, slopes: NDArray[np.float32], poke: NDArray[np.float64]
+        self,
+        index: int,
+        slopes: NDArray[np.float32],
+        command: NDArray[np.float64],
+        poke: NDArray[np.float64] | None = None,
     ) -> DocrimeEstimator:
-        """Take one frame and the poke that was sent when it had arrived.
+        """Take one frame and the command that was sent when it had arrived.
 
         Parameters
         ----------
@@ -116,22 +87,30 @@ class DocrimeEstimator:
             Frame index; it must rise. A gap loses the pairs that it touches and shifts none.
         slopes
             ``(n_slopes,)``.
+        command
+            ``(n_modes,)``, as it really was sent: a poke, or in closed loop controller and poke together.
         poke
-            ``(n_modes,)``, as it really was sent.
+            In closed loop, the poke in it ``(n_modes,)``, as it was drawn.
 
         Raises
         ------
         ValueError
             Wrong shape, not finite, or an index that does not rise.
         """
-        if slopes.shape != self._shapes[0] or poke.shape != self._shapes[1]:
+        if slopes.shape != self._shapes[0] or command.shape != self._shapes[1]:
             raise ValueError(
-                f"slopes {slopes.shape} and poke {poke.shape} do not fit "
+                f"slopes {slopes.shape} and command {command.shape} do not fit "
                 f"({self.n_slopes},) and ({self.n_modes},)"
             )
+        driven = command
+        if self.closed:
+            if poke is None or poke.shape != self._shapes[1]:
+                raise ValueError(f"in closed loop a poke ({self.n_modes},) stands beside the command")
+            driven = self._driven
+            driven[: self.n_modes], driven[self.n_modes :] = command, poke
         if index != self._next:
-            return self.extend(np.array([index]), slopes[None], poke[None])
-        room = self._recorder.take_one(slopes, poke)
+            return self.extend(np.array([index]), slopes[None], driven[None])
+        room = self._recorder.take_one(slopes, driven)
         if room < 0:
             raise _not_finite(index)
         self._next = index + 1
@@ -140,7 +119,7 @@ class DocrimeEstimator:
         return self
 
     def extend(
-        self, index: NDArray[np.int64], slopes: NDArray[np.floating], pokes: NDArray[np.floating]
+        self, index: NDArray[np.int64], slopes: NDArray[np.floating], driven: NDArray[np.floating]
     ) -> DocrimeEstimator:
         """Take many recorded frames at once, or none of them; see :meth:`partial_fit`.
 
@@ -148,19 +127,20 @@ class DocrimeEstimator:
         ----------
         index
             Frame indices ``(n,)``, rising.
-        slopes, pokes
-            ``(n, n_slopes)`` and ``(n, n_modes)``.
+        slopes, driven
+            ``(n, n_slopes)`` and commands ``(n, n_modes)``, in closed loop with the pokes beside them
+            ``(n, 2 n_modes)``.
         """
-        n = len(index)
-        if slopes.shape != (n, self.n_slopes) or pokes.shape != (n, self.n_modes):
+        n, columns = len(index), self.n_modes * (2 if self.closed else 1)
+        if slopes.shape != (n, self.n_slopes) or driven.shape != (n, columns):
             raise ValueError(
-                f"slopes {slopes.shape} and pokes {pokes.shape} do not fit {n} frames of "
-                f"{self.n_slopes} slopes and {self.n_modes} modes"
+                f"slopes {slopes.shape} and commands {driven.shape} do not fit {n} frames of "
+                f"{self.n_slopes} slopes and {columns} commands"
             )
         if not n:
             return self
-        if not math.isfinite(np.vdot(slopes, slopes) + np.vdot(pokes, pokes)):
-            fine = np.isfinite(slopes).all(axis=1) & np.isfinite(pokes).all(axis=1)
+        if not math.isfinite(np.vdot(slopes, slopes) + np.vdot(driven, driven)):
+            fine = np.isfinite(slopes).all(axis=1) & np.isfinite(driven).all(axis=1)
             raise _not_finite(int(index[np.argmin(fine)]))
         before = index[0] - 1 if self._next is None else self._next - 1
         steps = np.diff(index, prepend=before)
@@ -173,11 +153,21 @@ class DocrimeEstimator:
             self._lose(int(steps[start]) - 1)
             done = start
             while done < end:
-                done += self._recorder.take(slopes[done:end], pokes[done:end])
+                done += self._recorder.take(slopes[done:end], driven[done:end])
                 if self._recorder.full:
                     self._absorb()
         self._next = int(index[-1]) + 1
         return self
+
+    def break_off(self) -> None:
+        """The run pauses, the mirror goes flat, and the next frame may have any index."""
+        if self._next is None:
+            return
+        for _ in range(self._memory() + self.order + self.lags):
+            self._recorder.lose_one(flat=True)
+            if self._recorder.full:
+                self._absorb()
+        self._next = None
 
     def _lose(self, frames: int) -> None:
         """Lay out lost frames; a gap longer than all memory separates the stretches for good."""
@@ -190,6 +180,86 @@ class DocrimeEstimator:
     def _memory(self) -> int:
         """Rows before a row that its filtered slopes and pokes are made of."""
         return 2 * self.order + self.lags
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Plain values and arrays from which :meth:`restore` makes this estimator again, for another run.
+
+        These are the sums or, before there is a filter, the frames themselves.
+        """
+        if self._whitener is None or self._response is None or self._tracker is None:
+            # A filter found now would be that of too few frames.
+            waiting = self._recorder.telemetry()
+            return {}, {"rows": waiting.rows.copy(), "present": waiting.present.copy()}
+        self._absorb()
+        arrays: dict[str, NDArray[Any]] = {
+            "whitener": self._whitener,
+            "response": self._response.weights,
+            "response_sigma": self._response.sigma,
+            "response_covariance": self._response_covariance,
+            **{f"sums.{name}": array.copy() for name, array in self._sums.arrays().items()},
+            **{f"tracker.{name}": array.copy() for name, array in self._tracker.arrays().items()},
+        }
+        values = {
+            "frames": self.frames,
+            "lost_frames": self.lost_frames,
+            "spread": self._spread,
+            "count": self._sums.count,
+            "first_rows": self._tracker.first_rows,
+            "later_rows": self._tracker.rows,
+        }
+        return values, arrays
+
+    def restore(self, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what :meth:`state` of an equal estimator gave; the mirror was flat meanwhile.
+
+        Raises
+        ------
+        ValueError
+            The estimator has taken frames, or the arrays have other shapes.
+        """
+        if self.frames or self._recorder.filled:
+            raise ValueError("an estimator that has taken frames cannot be restored")
+        if "rows" in arrays:
+            self._replay(arrays["rows"], arrays["present"])
+            return
+        self.frames, self.lost_frames = int(values["frames"]), int(values["lost_frames"])
+        self._whitener, self._spread = arrays["whitener"], float(values["spread"])
+        self._response = TemporalResponse(arrays["response"], arrays["response_sigma"])
+        self._response_covariance = arrays["response_covariance"]
+        self._tracker = ResponseTracker(
+            np.zeros((self.n_slopes, self.n_modes)), self._response, self._response_covariance,
+            int(values["first_rows"]), arrays["tracker.spectra"],
+        )  # fmt: skip
+        self._tracker.rows, self._sums.count = int(values["later_rows"]), int(values["count"])
+        for prefix, own in (("sums", self._sums.arrays()), ("tracker", self._tracker.arrays())):
+            for name, array in own.items():
+                if array.shape != arrays[f"{prefix}.{name}"].shape:
+                    raise ValueError(
+                        f"{prefix}.{name} is {arrays[f'{prefix}.{name}'].shape}, not {array.shape}"
+                    )
+                array[...] = arrays[f"{prefix}.{name}"]
+        self._recorder.resize(BLOCK + self._memory())
+        # Rows before the first that is new: the mirror was flat, no slopes are known.
+        self._recorder.lose_one(flat=True)
+        self._next = 0
+        self.break_off()
+
+    def _replay(self, rows: NDArray[np.float32], present: NDArray[np.bool_]) -> None:
+        """Take kept frames again, by their places on the time line."""
+        at = np.flatnonzero(present)
+        if at.size:
+            self.extend(at, rows[at, : self.n_slopes], rows[at, self.n_slopes :])
+        self.break_off()
+
+    @property
+    def taken(self) -> int:
+        """Frames taken, those that are not in the sums yet included."""
+        return self.frames + self._recorder.fresh
+
+    @property
+    def settled(self) -> bool:
+        """Whether the filter is found, so that a solution in the middle of a run costs nothing later."""
+        return self._tracker is not None
 
     def solve(self) -> DocrimeSolution:
         """The matrix, its standard errors and the temporal response so far.
@@ -209,12 +279,13 @@ class DocrimeEstimator:
                 f"at least {needed + self.order + self.lags} frames are needed"
             )
         sums = self._sums.centred()
-        _require_excitation(sums.gram)
+        information = sums.information()
+        require_excitation(information)
         matrix = sums.solve()
-        freedom = sums.count - self.n_modes - self.lags
+        freedom = sums.freedom() - self.lags
         if self.order:
             rows, power = sums.sample(matrix)
-            require_response(sums.gram, rows, power / freedom, self.lags)
+            require_response(information, rows, power / freedom, self.lags)
         residual = sums.residual_power(matrix) / freedom
         covariance = residual if residual.ndim == 2 else None
         variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * self._spread
@@ -222,10 +293,10 @@ class DocrimeEstimator:
         scale = self._tracker.scale()
         return DocrimeSolution(
             matrix * scale,
-            sigma * abs(scale),
+            sigma * np.abs(scale),
             self._tracker.response(),
             covariance,
-            sums.gram / scale**2,
+            information / np.multiply.outer(scale, scale),
             variance,
             self._whitener,
             self.frames,
@@ -240,7 +311,10 @@ class DocrimeEstimator:
         self.frames += recorder.fresh
         if self._response is None:
             start = 0
-            self._fit(data)
+            found = first_fit(data, self.order, self.lags)
+            if found is not None:
+                self._whitener, self._spread = found.whitener, found.spread
+                self._response, self._response_covariance = found.response, found.covariance
         if self._response is not None:
             self._sum(data, start)
         recorder.keep(recorder.filled if self._response is None else self._memory())
@@ -257,77 +331,15 @@ class DocrimeEstimator:
         block = filtered(data, self._whitener, self.lags, start)
         if not block.now.size:
             return
-        self._sums.add(block.slopes, block.pokes_through(self._response.weights))
+        self._sums.add(block.slopes, block.driven(self._response.weights))
         if self._tracker is None:
             self._tracker = ResponseTracker(
                 self._sums.centred().solve(), self._response, self._response_covariance, block.now.size,
-                autocovariance(block, self.lags),
+                covariances(block, self.lags),
             )  # fmt: skip
         elif self.order:
             # Without the filter later frames would tell less than the first ones' differences did.
             self._tracker.add(block)
-
-    def _fit(self, data: Telemetry) -> None:
-        """Temporal response and filter from the first frames: by frame differences, then by the filter.
-
-        Too few frames leave both unset; the next call sees these frames again.
-        """
-        if usable_rows(data, max(self.order, 1), self.lags).size < self.n_modes + self.lags + MIN_FREEDOM:
-            return
-        _require_excitation(data.pokes.T @ data.pokes)
-        # Differences tell the response well even where the plain estimator is asked for.
-        difference, few = np.array([1.0, -1.0]), data.thinned(_FEW_SLOPES if self.order else SLOPES)
-        (response, covariance), whitener = fit_response(few, difference, self.lags), np.ones(1)
-        if self.order:
-            residuals, usable = self._residuals(few, difference, response)
-            whitener = prediction_error_filter(residuals, usable, self.order)
-            response, covariance = fit_response(data, whitener, self.lags)
-        else:
-            self._spread = self._plain_spread(few, difference, response)
-        self._whitener, self._response, self._response_covariance = whitener, response, covariance
-
-    def _plain_spread(
-        self, few: Telemetry, difference: NDArray[np.float64], response: TemporalResponse
-    ) -> float:
-        """Factor on the plain estimator's variance; the differences must show that there is a response."""
-        block = filtered(few, difference, self.lags)
-        slopes, seen, now = block.slopes, block.pokes_through(response.weights), block.now
-        sums = RegressionSums.zeros(slopes.shape[1], self.n_modes, correlations=True)
-        matrix = sums.add(slopes, seen).centred().solve()
-        left = slopes - seen @ matrix.T.astype(np.float32)
-        covariance = left.T @ left / (len(left) - self.n_modes - self.lags)
-        require_response(sums.gram, matrix, covariance * spread(left, seen, now, self.lags), self.lags)
-        residuals, usable = self._residuals(few, difference, response)
-        at = np.flatnonzero(usable)
-        return spread(
-            residuals[at], apply_filter(few.rows, response.weights, at, few.n_slopes), at, self.lags
-        )
-
-    def _residuals(
-        self, data: Telemetry, whitener: NDArray[np.float64], response: TemporalResponse
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Slopes less what the pokes explain ``(n_times, n_slopes)``, and the rows where that is known."""
-        block = filtered(data, whitener, self.lags)
-        sums = RegressionSums.zeros(data.n_slopes, self.n_modes, correlations=False)
-        matrix = sums.add(block.slopes, block.pokes_through(response.weights)).centred().solve()
-        at = data.complete(0, self.lags)
-        residuals = np.zeros_like(data.slopes)
-        explained = apply_filter(data.rows, response.weights, at, data.n_slopes) @ matrix.T.astype(np.float32)
-        residuals[at] = data.slopes[at] - explained
-        usable = np.zeros_like(data.present)
-        usable[at] = True
-        return residuals, usable
-
-
-def _require_excitation(gram: NDArray[np.floating]) -> None:
-    """Raise :class:`CalibrationError` unless pokes with these sums of squares span the modes."""
-    # Factor and estimated condition: a twentieth of the time of the eigenvalues.
-    size = np.abs(gram).sum(axis=0).max()
-    factor, failed = lapack.dpotrf(gram)
-    if failed or lapack.dpocon(factor, size)[0] <= 1e-7:
-        raise CalibrationError(
-            "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
-        )
 
 
 def _not_finite(index: int) -> ValueError:

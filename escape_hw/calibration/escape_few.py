@@ -11,6 +11,7 @@ from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix, some_frames
+from escape_hw.calibration.poke_patterns import RandomPokes
 from escape_hw.calibration.poke_session import PokeSession
 from escape_hw.calibration.pseudo_synthetic import synthesise
 from escape_hw.calibration.sensor_setup import SETUP_FRAMES, modal_basis, poke_amplitudes
@@ -61,7 +62,7 @@ def escape_from_few(
     m2c = modal_basis(bench)
     amplitude = poke_amplitudes(bench, m2c, poke)
     session = PokeSession(bench, m2c, grid, min(SETUP_FRAMES, frames), None, keep=True)
-    if (yield from session.poke(frames, amplitude)):
+    if (yield from session.poke(frames, RandomPokes(amplitude, bench.rng))):
         raise Aborted(f"aborted after {session.taken} of {frames} frames, too few for a registration")
     session.ready()
     record = session.record()

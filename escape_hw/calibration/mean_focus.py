@@ -53,18 +53,28 @@ class MeanFocus:
             self._blocks.append(self._weights @ (self._sum / np.float32(self._size)))
             self._sum[:], self._count = 0, 0
 
+    def state(self) -> NDArray[np.float32]:
+        """All blocks so far ``(n, 5)``, for :meth:`restore`."""
+        return np.array(self._blocks, np.float32).reshape(-1, len(self._weights))
+
+    def restore(self, blocks: NDArray[np.float32]) -> None:
+        """Go on from the blocks of a run that was broken off; what came between is not known."""
+        self._blocks = [*blocks, np.full(len(self._weights), np.nan, np.float32)]
+
     def still(self) -> float | None:
         """Focus that stands still, as slope per sub-aperture from the middle; ``None`` if unknown.
 
         It is unknown when the run is too short, and when the wind does not explain how focus changes:
         several layers, or no turbulence.
         """
-        if len(self._blocks) - 2 < _LEAST_ROWS:
-            return None
-        blocks = np.array(self._blocks, dtype=np.float64)
+        blocks = np.array(self._blocks, dtype=np.float64).reshape(-1, len(self._weights))
         # Smoothed alike, so that rates and values belong together.
         value = (blocks[:-2] + 2 * blocks[1:-1] + blocks[2:]) / 4
         rate = (blocks[2:, :_FOCUS] - blocks[:-2, :_FOCUS]) / 2
+        known = np.isfinite(value).all(axis=1) & np.isfinite(rate).all(axis=1)
+        value, rate = value[known], rate[known]
+        if len(value) < _LEAST_ROWS:
+            return None
         terms = np.column_stack([np.ones(len(value)), rate, value[:, _FOCUS + 1 :]])
         focus = value[:, _FOCUS]
         shares = np.linalg.lstsq(terms, focus, rcond=None)[0]

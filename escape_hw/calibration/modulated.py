@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.matrix import snr_of
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult, TemporalResponse
-from escape_hw.api.sensor import SensorGeometry, SlopeFunction
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import LightWatch, Motion, measured_matrix, next_frame, some_frames
+from escape_hw.calibration.acquire import measured_matrix, next_frame, some_frames
+from escape_hw.calibration.checkpoint import Checkpoint
 from escape_hw.calibration.demodulation import Lines, find_delay, find_lines, line_frequencies, matrix_from
-from escape_hw.calibration.sensor_setup import (
-    extractor,
-    find_sensor,
-    modal_basis,
-    poke_amplitudes,
-    prepare_sensor,
-)
+from escape_hw.calibration.sensor_setup import extractor, modal_basis, poke_amplitudes, ready_sensor
+from escape_hw.calibration.stepwise import ROUNDS, StepwiseRun
+from escape_hw.calibration.stopping import Target, no_accuracy
 from escape_hw.errors import Aborted, CalibrationError
+from escape_hw.io.state_file import RunState
 
 #: Band of the lines in cycles per frame: above most of the turbulence and of the bench's vibrations,
 #: below where the response of two frames' delay and a frame's hold has faded.
@@ -35,6 +36,8 @@ def modulated(
     frames: int | None = None,
     poke: float | None = None,
     grid: SensorGeometry | None = None,
+    until: Target | None = None,
+    keep: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
     """Drive batches of modes as sinusoids and detect them in step (Esposito et al. 2006; Pinna et al. 2012).
 
@@ -50,6 +53,11 @@ def modulated(
         Amplitude of each mode, rms surface as fraction of full stroke; as configured by default.
     grid
         The sensor's geometry; found first when not given.
+    until
+        Drive each batch again until all its modes have this signal-to-noise ratio, up to
+        :data:`~escape_hw.calibration.stepwise.ROUNDS` times.
+    keep
+        Where the state is kept meanwhile, and what to go on with.
 
     Returns
     -------
@@ -60,7 +68,9 @@ def modulated(
     Raises
     ------
     ConfigError
-        A number of frames or a poke that means nothing; nothing moved.
+        A number of frames, a poke or a target that means nothing; nothing moved.
+    ProductError
+        The state to go on with is damaged or of another run; nothing moved.
     TooFewFrames
         Too few frames for a single line.
     CalibrationError
@@ -75,63 +85,97 @@ def modulated(
     n_modes = m2c.shape[1]
     at_once = line_frequencies(n_modes, n_frames, BAND).size
     batches = np.array_split(np.arange(n_modes), -(-n_modes // at_once))
+    no_accuracy(until)
+    settings = {"poke": float(amplitude.max()), "frames": n_frames}
+    state = None if keep is None else keep.begin(bench, "modulated", m2c, settings)
     try:
-        bench.dm.flatten()
-        prepare_sensor(bench)
-        mean_frame = None
-        if grid is None:
-            setup = yield from find_sensor(bench)
-            grid, mean_frame = setup.grid, setup.mean_frame
-        slopes_of = extractor(bench, grid)
-        motion, light = Motion(grid.n_slopes), LightWatch(bench.wfs.name, grid)
-        start, partial = bench.wfs.status(), False
+        grid, mean_frame = yield from ready_sensor(bench, grid if state is None else state.grid)
         report = Reporter("modulation", len(batches) * (n_frames + _RUN_IN))
-        found: list[Lines] = []
+        run = _Run(bench, extractor(bench, grid), report, mean_frame, keep, frames=n_frames)
+        if state is not None:
+            run.restore(state)
+        partial = False
         try:
-            for modes in batches:
-                found.append(
-                    (
-                        yield from _batch(
-                            bench, slopes_of, m2c[:, modes], amplitude[modes], n_frames, motion, light, report
-                        )
-                    )
-                )
+            for modes in batches[len(run.found) :]:
+                yield from run.measure(m2c[:, modes], amplitude[modes], until)
         except Aborted:
-            if not found:
+            run.kept(always=True)
+            if not run.found:
                 raise
             partial = True
-        status = bench.wfs.status()
     finally:
         bench.dm.flatten()
+    found = run.found
     lines = _joined(found)
     delay, error = find_delay(lines, c.lags - 1)
     data, sigma = matrix_from(lines, delay)
     if np.mean(np.square(data / np.maximum(sigma, 1e-300))) < _LEAST_POWER:
         raise CalibrationError("the sensor does not respond to the mirror; is the light on, does it move?")
-    delivered, lost = status.delivered - start.delivered, status.lost - start.lost
+    delivered, lost = run.counts()
     matrix = measured_matrix(
         bench, grid, m2c[:, : data.shape[1]], data, sigma, "modulated",
         frames=delivered, lost_frames=lost, poke=float(amplitude.max()), batches=len(found),
         delay_frames=delay, delay_sigma=error,
     )  # fmt: skip
     return CalibrationResult(
-        matrix, motion.of(grid), delivered, lost,
+        matrix, run.motion.of(grid), delivered, lost,
         (delivered + lost) / bench.wfs.settings.frame_rate_hz, _response(delay, error, c.lags),
-        partial=partial, mean_frame=mean_frame,
+        partial=partial, mean_frame=run.mean_frame,
     )  # fmt: skip
 
 
-def _batch(
-    bench: Bench,
-    slopes_of: SlopeFunction,
-    m2c: NDArray[np.float64],
-    amplitude: NDArray[np.float64],
-    frames: int,
-    motion: Motion,
-    light: LightWatch,
-    report: Reporter,
-) -> Procedure[Lines]:
+class _Run(StepwiseRun):
+    """The batches measured so far, of ``frames`` frames each."""
+
+    def __init__(self, *args: Any, frames: int) -> None:
+        super().__init__(*args)
+        self.frames = frames
+        self.found: list[Lines] = []
+
+    def restore(self, state: RunState) -> None:
+        """Go on from a kept state."""
+        super().restore(state)
+        parts = state.arrays
+        self.found = [
+            Lines(parts[f"real{k}"] + 1j * parts[f"imaginary{k}"], parts[f"sigma{k}"], parts[f"frequency{k}"])
+            for k in range(int(state.values["batches"]))
+        ]
+
+    def measure(
+        self, m2c: NDArray[np.float64], amplitude: NDArray[np.float64], until: Target | None
+    ) -> Procedure[None]:
+        """Drive one batch, again until its modes are known as well as asked."""
+        rounds: list[Lines] = []
+        for _ in range(ROUNDS if until is not None else 1):
+            rounds.append((yield from _batch(self, m2c, amplitude)))
+            lines = _mean(rounds)
+            # Of real and imaginary part alike: the response turns one into the other.
+            size = np.sqrt(np.maximum(np.square(np.abs(lines.amplitude)) - np.square(lines.sigma), 0.0))
+            if until is None or until.snr is None or snr_of(size, lines.sigma).min() >= until.snr:
+                break
+        self.found.append(lines)
+        self.kept()
+
+    def kept(self, *, always: bool = False) -> None:
+        """Keep the state if it is time."""
+        arrays: dict[str, NDArray[Any]] = {}
+        for k, lines in enumerate(self.found):
+            arrays[f"real{k}"], arrays[f"imaginary{k}"] = lines.amplitude.real, lines.amplitude.imag
+            arrays[f"sigma{k}"], arrays[f"frequency{k}"] = lines.sigma, lines.frequency
+        if self.found:
+            self.keep({"batches": len(self.found)}, arrays, always)
+
+
+def _mean(rounds: list[Lines]) -> Lines:
+    """The same lines from several rounds."""
+    variance = np.sum([np.square(lines.sigma) for lines in rounds], axis=0)
+    amplitude = np.mean([lines.amplitude for lines in rounds], axis=0)
+    return Lines(amplitude, np.sqrt(variance) / len(rounds), rounds[0].frequency)
+
+
+def _batch(run: _Run, m2c: NDArray[np.float64], amplitude: NDArray[np.float64]) -> Procedure[Lines]:
     """Drive some modes for a while and find their lines."""
+    bench, frames = run.bench, run.frames
     frequency = line_frequencies(amplitude.size, frames, BAND)
     # Phases that grow with the square of the number keep the sum of many sinusoids low (Schroeder 1970).
     phase = np.pi * np.arange(amplitude.size) ** 2 / amplitude.size
@@ -146,13 +190,13 @@ def _batch(
         first = frame.index if first is None else first
         # Steps go by the camera's count: a lost frame delays one shape and puts none out of step.
         step = frame.index - first
-        slopes = slopes_of(frame.data)
-        light(slopes_of.flux)
-        motion.add(slopes)
+        slopes = run.slopes_of(frame.data)
+        run.light(run.slopes_of.flux)
+        run.motion.add(slopes)
         times.append(step)
         kept.append(slopes)
         bench.dm.send(shapes[min(step, len(shapes) - 1)] * share)
-        if progress := report.step():
+        if progress := run.report.step():
             yield progress
     bench.dm.flatten()
     time = np.array(times, np.int64)

@@ -1,9 +1,10 @@
-"""Random pokes on every mode, one per frame, and the slopes that they make."""
+"""Pokes, one per frame, and the slopes that they make."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,13 @@ from escape_hw.api.sensor import SensorGeometry, SlopeFunction, SubApertureGrid
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, Motion, next_frame, reachable
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.loop_run import Injection
 from escape_hw.calibration.mean_focus import MeanFocus
 from escape_hw.calibration.sensor_kinds import kind_of
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, refined, setup_from_frames
+from escape_hw.calibration.stopping import Looks
 from escape_hw.errors import Aborted
+from escape_hw.io.state_file import RunState
 
 #: Seconds of turbulence over which what it leaves in the geometry averages out well enough.
 _REFERENCE_S = 10.0
@@ -46,6 +50,8 @@ class PokeSession:
         Makes the estimator that takes the slopes, from their number; ``None``: there is none.
     keep
         Whether to keep slopes and pokes.
+    looks
+        What is done with the estimate on the way.
     """
 
     bench: Bench
@@ -54,6 +60,7 @@ class PokeSession:
     setup_frames: int
     make_estimator: Callable[[int], DocrimeEstimator] | None
     keep: bool = False
+    looks: Looks | None = None
     mean_frame: NDArray[np.float32] | None = None
     slopes_of: SlopeFunction | None = None
     estimator: DocrimeEstimator | None = None
@@ -69,42 +76,81 @@ class PokeSession:
     looked: dict[int, tuple[NDArray[np.float64], int]] = field(default_factory=dict)
     kept: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] = field(default_factory=list)
 
-    def poke(self, frames: int, amplitude: NDArray[np.float64]) -> Procedure[bool]:
-        """Send random pokes, one per frame, and take the frames; the mirror ends flat.
+    def poke(self, frames: int, pokes: Injection, stage: str = "DO-CRIME") -> Procedure[bool]:
+        """Send pokes, one per frame, and take the frames; the mirror ends flat.
 
         Parameters
         ----------
         frames
-            How many.
-        amplitude
-            Pokes of each mode are uniform within plus and minus this ``(n_modes,)``.
+            How many, with those of the run that this one goes on with.
+        pokes
+            Gives the modal poke of each frame ``(n_modes,)``.
+        stage
+            Name of the stage in progress reports.
 
         Returns
         -------
         bool
-            Whether it was stopped early.
+            Whether the operator stopped it early; that the estimate will do is no reason to complain.
         """
         bench, to_modes = self.bench, np.linalg.pinv(self.m2c)
         self.planned = frames
-        report = Reporter("DO-CRIME", frames)
+        report = Reporter(stage, frames)
         try:
             bench.dm.flatten()
             prepare_sensor(bench)
             try:
-                for done in range(frames):
+                for done in range(self.taken, frames):
                     frame = next_frame(bench)
-                    wanted = self.m2c @ (amplitude * bench.rng.uniform(-1.0, 1.0, amplitude.size))
+                    wanted = self.m2c @ pokes()
                     allowed = reachable(bench.dm, wanted)
                     self.shortened += not np.array_equal(wanted, allowed)
                     # What was really sent, not what was asked for: a shortened poke is still a known poke.
                     self._take(frame, to_modes @ bench.dm.send(allowed).sent)
+                    if self.looks is not None and self.looks.due(self.fed) and (yield from self._look_at()):
+                        return False
                     if report.due():
                         yield report(done + 1, shortened=float(self.shortened))
             except Aborted:
+                yield from self._look_at(last=True)
                 return True
         finally:
             bench.dm.flatten()
         return False
+
+    def _look_at(self, last: bool = False) -> Procedure[bool]:
+        """Keep the state and judge the estimate, as far as either is due."""
+        if self.looks is None or self.estimator is None or self.grid is None or self.motion is None:
+            return False
+        parts = {str(part): count for part, (_, count) in self.looked.items()}
+        values = {"taken": self.taken, "fed": self.fed, "shortened": self.shortened, "looked": parts}
+        arrays: dict[str, NDArray[Any]] = {"motion": self.motion.state()}
+        if self.mean_frame is not None:
+            arrays["mean_frame"] = self.mean_frame
+        if self.focus is not None:
+            arrays["focus"] = self.focus.state()
+        arrays |= {f"looked.{part}": total for part, (total, _) in self.looked.items()}
+        return (yield from self.looks.look(self.estimator, self.grid, self.fed, values, arrays, always=last))
+
+    def restore(self, state: RunState) -> None:
+        """Go on from what a run that was broken off has kept."""
+        if state.grid is None:
+            raise RuntimeError("a state without a geometry was kept")
+        self.grid = state.grid
+        self.mean_frame = state.arrays.get("mean_frame")
+        self._set_up()
+        if self.motion is None or self.estimator is None:
+            raise RuntimeError("the sensor was never set up")
+        self.taken, self.fed = int(state.values["taken"]), int(state.values["fed"])
+        self.shortened = int(state.values["shortened"])
+        self.motion.restore(state.arrays["motion"])
+        if self.focus is not None and "focus" in state.arrays:
+            self.focus.restore(state.arrays["focus"])
+        self.looked = {
+            int(part): (state.arrays[f"looked.{part}"], int(count))
+            for part, count in state.values["looked"].items()
+        }
+        self.estimator.restore(state.values, state.arrays)
 
     def _take(self, frame: Frame, poke: NDArray[np.float64]) -> None:
         self.taken += 1
@@ -126,15 +172,21 @@ class PokeSession:
             mean = (total / len(self.waiting)).astype(np.float32)
             setup = setup_from_frames(self.bench, mean)
             self.grid, self.mean_frame = setup.grid, setup.mean_frame
+        self._set_up()
+        for frame, poke in self.waiting:
+            self._feed(frame, poke)
+        self.waiting = []
+
+    def _set_up(self) -> None:
+        """Everything that needs the geometry."""
+        if self.grid is None:
+            raise RuntimeError("the geometry is not known")
         self.slopes_of, self.long_look = extractor(self.bench, self.grid), kind_of(self.bench).long_look
         self.motion, self.light = Motion(self.grid.n_slopes), LightWatch(self.bench.wfs.name, self.grid)
         if self.mean_frame is not None and isinstance(self.grid, SubApertureGrid):
             self.focus = MeanFocus(self.grid, self.bench.wfs.settings.frame_rate_hz)
         if self.make_estimator is not None:
             self.estimator = self.make_estimator(self.grid.n_slopes)
-        for frame, poke in self.waiting:
-            self._feed(frame, poke)
-        self.waiting = []
 
     def finished_grid(self) -> SensorGeometry:
         """The grid with all that the run taught about it; given references stay as they were."""

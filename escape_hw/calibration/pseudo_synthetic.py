@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.model import SyntheticModel
+from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix
-from escape_hw.calibration.derivatives import modal_jacobian
+from escape_hw.calibration.derivatives import modal_jacobian, modal_matrix
 
 
 def pseudo_synthetic(
@@ -59,3 +60,20 @@ def synthesise(
     data, sigma = pseudo_synthetic(bench.model(grid), estimate, m2c)
     matrix = measured_matrix(bench, grid, m2c, data, sigma, "escape", gain=estimate.gain.value)
     return CalibrationResult(matrix, grid, 0, 0, 0.0, registration=estimate)
+
+
+def simulated(bench: Bench, grid: SensorGeometry, m2c: NDArray[np.float64]) -> CalibrationResult:
+    """What the model says of a mirror that stands where the design has it; nothing moves, nothing is fitted.
+
+    Parameters
+    ----------
+    bench
+        Gives the model.
+    grid
+        The sensor's grid.
+    m2c
+        Modal basis ``(n_act, n_modes)``.
+    """
+    data = modal_matrix(bench.model(grid), Registration(), m2c)
+    matrix = measured_matrix(bench, grid, m2c, data, np.zeros_like(data), "simulated")
+    return CalibrationResult(matrix, grid, 0, 0, 0.0)

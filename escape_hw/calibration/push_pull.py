@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.matrix import snr_of
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquire import LightWatch, Motion, go_to, measured_matrix, next_frame, some_frames
+from escape_hw.calibration.acquire import LightWatch, go_to, measured_matrix, next_frame, some_frames
+from escape_hw.calibration.checkpoint import Checkpoint
 from escape_hw.calibration.sensor_kinds import kind_of
-from escape_hw.calibration.sensor_setup import (
-    extractor,
-    find_sensor,
-    modal_basis,
-    poke_amplitudes,
-    prepare_sensor,
-)
+from escape_hw.calibration.sensor_setup import extractor, modal_basis, poke_amplitudes, ready_sensor
+from escape_hw.calibration.stepwise import ROUNDS, StepwiseRun
+from escape_hw.calibration.stopping import Target, no_accuracy
 from escape_hw.errors import Aborted, CalibrationError
+from escape_hw.io.state_file import RunState
 
 #: Frames watched after a test step, to see when the sensor has settled.
 _STEP_FRAMES = 30
@@ -61,6 +62,8 @@ def push_pull(
     poke: float | None = None,
     frames: int | None = None,
     grid: SensorGeometry | None = None,
+    until: Target | None = None,
+    keep: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
     """Push and pull every mode and average the slopes.
 
@@ -77,6 +80,11 @@ def push_pull(
         Frames averaged per push and per pull; as configured by default.
     grid
         The sensor's grid; found first when not given.
+    until
+        Push and pull each mode again until it has this signal-to-noise ratio, up to
+        :data:`~escape_hw.calibration.stepwise.ROUNDS` times.
+    keep
+        Where the state is kept meanwhile, and what to go on with.
 
     Returns
     -------
@@ -87,7 +95,9 @@ def push_pull(
     Raises
     ------
     ConfigError
-        A number of frames or a poke that means nothing; nothing moved.
+        A number of frames, a poke or a target that means nothing; nothing moved.
+    ProductError
+        The state to go on with is damaged or of another run; nothing moved.
     CalibrationError
         No spots or pupil images, no light, or no response.
     Aborted
@@ -98,71 +108,91 @@ def push_pull(
     poke = c.push_pull_poke if poke is None else poke
     m2c = modal_basis(bench)
     amplitude = poke_amplitudes(bench, m2c, poke)
+    no_accuracy(until)
+    state = None if keep is None else keep.begin(bench, "push-pull", m2c, {"poke": poke, "frames": n_frames})
+    known = grid if state is None else state.grid
     try:
-        bench.dm.flatten()
-        prepare_sensor(bench)
-        mean_frame = None
-        if grid is None:
-            setup = yield from find_sensor(bench, references=kind_of(bench).source_references)
-            grid, mean_frame = setup.grid, setup.mean_frame
+        grid, mean_frame = yield from ready_sensor(bench, known, kind_of(bench).source_references)
         slopes_of = extractor(bench, grid)
         skip = yield from settling_frames(bench, slopes_of, m2c[:, 0] * amplitude[0] * 3)
-        start = bench.wfs.status()
-        columns: list[NDArray[np.float64]] = []
-        errors: list[NDArray[np.float64]] = []
-        partial = False
-        motion, light = Motion(grid.n_slopes), LightWatch(bench.wfs.name, grid)
         report = Reporter("push-pull", m2c.shape[1] * 2 * (skip + n_frames))
+        run = _Run(bench, slopes_of, report, mean_frame, keep, skip=skip, frames=n_frames)
+        if state is not None:
+            run.restore(state)
+        partial = False
         try:
-            for mode in range(m2c.shape[1]):
-                column, error = yield from _one_mode(
-                    bench, slopes_of, m2c[:, mode], amplitude[mode], skip, n_frames, motion, light, report
-                )
-                columns.append(column)
-                errors.append(error)
+            for mode in range(len(run.columns), m2c.shape[1]):
+                yield from run.measure(m2c[:, mode], amplitude[mode], until)
         except Aborted:
-            if not columns:
+            run.kept(always=True)
+            if not run.columns:
                 raise
             partial = True
-        status = bench.wfs.status()
     finally:
         bench.dm.flatten()
-    delivered = status.delivered - start.delivered
-    lost = status.lost - start.lost
+    delivered, lost = run.counts()
     matrix = measured_matrix(
-        bench, grid, m2c[:, : len(columns)], np.stack(columns, 1), np.stack(errors, 1), "push-pull",
-        frames=delivered, lost_frames=lost, poke=float(poke), settling_frames=skip,
+        bench, grid, m2c[:, : len(run.columns)], np.stack(run.columns, 1), np.stack(run.errors, 1),
+        "push-pull", frames=delivered, lost_frames=lost, poke=float(poke), settling_frames=skip,
     )  # fmt: skip
     return CalibrationResult(
-        matrix, motion.of(grid), delivered, lost,
-        (delivered + lost) / bench.wfs.settings.frame_rate_hz, partial=partial, mean_frame=mean_frame,
+        matrix, run.motion.of(grid), delivered, lost,
+        (delivered + lost) / bench.wfs.settings.frame_rate_hz, partial=partial, mean_frame=run.mean_frame,
     )  # fmt: skip
+
+
+class _Run(StepwiseRun):
+    """The modes measured so far: ``skip`` and ``frames`` are let pass after a step, and averaged."""
+
+    def __init__(self, *args: Any, skip: int, frames: int) -> None:
+        super().__init__(*args)
+        self.skip, self.frames = skip, frames
+        self.columns: list[NDArray[np.float64]] = []
+        self.errors: list[NDArray[np.float64]] = []
+
+    def restore(self, state: RunState) -> None:
+        """Go on from a kept state."""
+        super().restore(state)
+        self.columns, self.errors = list(state.arrays["columns"]), list(state.arrays["errors"])
+
+    def measure(self, shape: NDArray[np.float64], amplitude: float, until: Target | None) -> Procedure[None]:
+        """Push and pull one mode, again until it is known as well as asked."""
+        columns, variances = [], []
+        for _ in range(ROUNDS if until is not None else 1):
+            column, error = yield from _one_mode(self, shape, amplitude)
+            columns.append(column)
+            variances.append(np.square(error))
+            column = np.mean(columns, axis=0)
+            error = np.sqrt(np.sum(variances, axis=0)) / len(columns)
+            if until is None or until.snr is None or snr_of(column, error) >= until.snr:
+                break
+        self.columns.append(column)
+        self.errors.append(error)
+        self.kept()
+
+    def kept(self, *, always: bool = False) -> None:
+        """Keep the state if it is time."""
+        if self.columns:
+            self.keep({}, {"columns": np.array(self.columns), "errors": np.array(self.errors)}, always)
 
 
 def _one_mode(
-    bench: Bench,
-    slopes_of: SlopeFunction,
-    shape: NDArray[np.float64],
-    amplitude: float,
-    skip: int,
-    frames: int,
-    motion: Motion,
-    light: LightWatch,
-    report: Reporter,
+    run: _Run, shape: NDArray[np.float64], amplitude: float
 ) -> Procedure[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Column and its standard errors for one mode, each ``(n_slopes,)``."""
     means, variances, sent = [], [], []
     for sign in (1.0, -1.0):
         # What the limits took off was not poked: the amplitude is that of the shape really sent.
-        taken = go_to(bench.dm, sign * amplitude * shape).sent
+        taken = go_to(run.bench.dm, sign * amplitude * shape).sent
         sent.append(float(taken @ shape / (shape @ shape)))
-        stack = (yield from _slopes(bench, slopes_of, skip + frames, report, light))[skip:]
+        stack = yield from _slopes(run.bench, run.slopes_of, run.skip + run.frames, run.report, run.light)
+        stack = stack[run.skip :]
         for slopes in stack:
-            motion.add(slopes)
+            run.motion.add(slopes)
         means.append(stack.mean(axis=0, dtype=np.float64))
         variances.append(
-            stack.var(axis=0, ddof=1, dtype=np.float64) / frames
-            if frames > 1
+            stack.var(axis=0, ddof=1, dtype=np.float64) / run.frames
+            if run.frames > 1
             else np.full(stack.shape[1], np.nan)
         )
     span = sent[0] - sent[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ class RegressionSums:
     count: int = 0
 
     @classmethod
-    def zeros(cls, n_slopes: int, n_modes: int, *, correlations: bool) -> RegressionSums:
+    def zeros(cls, n_slopes: int, n_modes: int, *, correlations: bool) -> Self:
         """Empty sums."""
         n_few = len(range(0, n_slopes, _step(n_slopes)))
         return cls(
@@ -43,7 +44,7 @@ class RegressionSums:
             np.zeros(n_modes),
         )
 
-    def add(self, slopes: NDArray[np.float32], pokes: NDArray[np.float32]) -> RegressionSums:
+    def add(self, slopes: NDArray[np.float32], pokes: NDArray[np.float32]) -> Self:
         """Add rows ``(n, n_slopes)`` and ``(n, n_modes)``.
 
         Single precision carries the products within a block (as the slopes themselves do), double
@@ -60,12 +61,12 @@ class RegressionSums:
         self.count += len(slopes)
         return self
 
-    def centred(self) -> RegressionSums:
+    def centred(self) -> Self:
         """The same sums about the means of slopes and pokes."""
         n = max(self.count, 1)
         few = self.slopes[:: _step(self.slopes.size)]
         square = np.outer(self.slopes, self.slopes) if self.power.ndim == 2 else np.square(self.slopes)
-        return RegressionSums(
+        return type(self)(
             self.cross - np.outer(self.slopes, self.pokes) / n,
             self.gram - np.outer(self.pokes, self.pokes) / n,
             self.power - square / n,
@@ -75,17 +76,32 @@ class RegressionSums:
             self.count,
         )
 
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """All sums by name, themselves and no copies: written into, they are restored."""
+        names = ("cross", "gram", "power", "few", "slopes", "pokes")
+        return {name: getattr(self, name) for name in names}
+
+    def information(self) -> NDArray[np.float64]:
+        """What the frames tell of the modes ``(n_modes, n_modes)``.
+
+        Its inverse is the covariance of a row of the matrix, per variance of that slope's noise.
+        """
+        return self.gram
+
+    def freedom(self) -> float:
+        """Degrees of freedom of the residuals: their power over the noise's variance, expected."""
+        return float(self.count - len(self.gram))
+
     def solve(self) -> NDArray[np.float64]:
         """Least-squares matrix ``(n_slopes, n_modes)``."""
-        return np.asarray(cho_solve(self._factor(), self.cross.T, check_finite=False).T)
+        factor = cho_factor(self.gram, check_finite=False)
+        return np.asarray(cho_solve(factor, self.cross.T, check_finite=False).T)
 
     def inverse_diagonal(self) -> NDArray[np.float64]:
-        """Diagonal of the inverse of ``gram`` ``(n_modes,)``."""
-        whole = cho_solve(self._factor(), np.eye(len(self.gram)), check_finite=False)
+        """Diagonal of the inverse of the information ``(n_modes,)``."""
+        information = self.information()
+        whole = cho_solve(cho_factor(information, check_finite=False), np.eye(len(information)))
         return np.asarray(np.diag(whole))
-
-    def _factor(self) -> tuple[NDArray[np.float64], bool]:
-        return cho_factor(self.gram, check_finite=False)  # type: ignore[no-any-return]
 
     def residual_power(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum of residuals times residuals for the least-squares matrix, of the shape of ``power``."""
@@ -97,6 +113,65 @@ class RegressionSums:
         """Some rows of the least-squares matrix, and the sum of their residuals times residuals."""
         step = _step(len(matrix))
         return matrix[::step], np.asarray(self.few - self.cross[::step] @ matrix[::step].T)
+
+
+class InstrumentSums(RegressionSums):
+    """The same sums with pokes as instruments of the commands they are part of.
+
+    In closed loop a command answers the turbulence that the slopes show, and least squares would take
+    part of the turbulence for a response. Pokes know nothing of it: with slopes ``y``, commands ``x``
+    and pokes ``z``, ``D = (sum y z^T) (sum x z^T)^-1`` (instrumental variables; Söderström & Stoica
+    1983), whatever the controller does. Rows are added with ``x`` and ``z`` side by side
+    ``(n, 2 n_modes)``.
+    """
+
+    def information(self) -> NDArray[np.float64]:
+        """``X Z^-1 X^T`` with ``X = sum x z^T`` and ``Z = sum z z^T``."""
+        _, link, pokes = self._parts()
+        return np.asarray(link @ cho_solve(cho_factor(pokes, check_finite=False), link.T, check_finite=False))
+
+    def freedom(self) -> float:
+        """As least squares has them, and what the commands' own motion adds to the residuals.
+
+        ``sum |y - D x|^2`` is ``N - 2 m + tr(sum x x^T (X Z^-1 X^T)^-1)`` variances of the noise.
+        """
+        commands, link, _ = self._parts()
+        return float(self.count - 2 * len(link) + np.trace(np.linalg.solve(self.information(), commands)))
+
+    def solve(self) -> NDArray[np.float64]:
+        """The matrix ``(n_slopes, n_modes)``."""
+        _, link, _ = self._parts()
+        return np.asarray(np.linalg.solve(link.T, self.cross[:, len(link) :].T).T)
+
+    def residual_power(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum of residuals times residuals, of the shape of ``power``."""
+        return _residual_power(self.power, self.cross[:, : matrix.shape[1]], self._parts()[0], matrix)
+
+    def sample(self, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Some rows of the matrix, and the sum of their residuals times residuals."""
+        step = _step(len(matrix))
+        rows, cross = matrix[::step], self.cross[::step, : matrix.shape[1]]
+        return rows, _residual_power(self.few, cross, self._parts()[0], rows)
+
+    def _parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """``sum x x^T``, ``sum x z^T`` and ``sum z z^T``."""
+        m = len(self.gram) // 2
+        return self.gram[:m, :m], self.gram[:m, m:], self.gram[m:, m:]
+
+
+def _residual_power(
+    power: NDArray[np.float64],
+    cross: NDArray[np.float64],
+    gram: NDArray[np.float64],
+    matrix: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """``sum (y - D x) (y - D x)^T`` from its parts, or the diagonal of it."""
+    if power.ndim == 1:
+        return np.asarray(
+            power - 2 * np.einsum("sm,sm->s", cross, matrix) + np.einsum("sm,sm->s", matrix @ gram, matrix)
+        )
+    mixed = cross @ matrix.T
+    return np.asarray(power - mixed - mixed.T + matrix @ gram @ matrix.T)
 
 
 def _step(n_slopes: int) -> int:

@@ -123,6 +123,39 @@ def find_sensor(
     return setup_from_frames(bench, (total / frames).astype(np.float32), references)
 
 
+def ready_sensor(
+    bench: Bench, grid: SensorGeometry | None, references: str = "design"
+) -> Procedure[tuple[SensorGeometry, NDArray[np.float32] | None]]:
+    """Flatten the mirror, make the sensor ready, and find its geometry unless it is known.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    grid
+        The geometry, when it is known.
+    references
+        As for :func:`find_sensor`.
+
+    Returns
+    -------
+    grid : SensorGeometry
+    mean_frame : ndarray or None
+        The mean frame it was found on; ``None`` if it was known.
+
+    Raises
+    ------
+    CalibrationError
+        No spots or pupil images where the design says there should be.
+    """
+    bench.dm.flatten()
+    prepare_sensor(bench)
+    if grid is not None:
+        return grid, None
+    setup = yield from find_sensor(bench, references=references)
+    return setup.grid, setup.mean_frame
+
+
 def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.float32]]:
     """Mean dark frame, with the beam stop in; kept as ``bench.dark``.
 

@@ -167,7 +167,7 @@ def telemetry_sprint(
             )
         response = _first_response(block, lags) if matrix is None else _response(block, matrix, lags)
         slopes = block.slopes.astype(float)
-        seen = block.pokes_through(response.weights).astype(float)
+        seen = block.driven(response.weights).astype(float)
         slopes, seen = slopes - slopes.mean(axis=0), seen - seen.mean(axis=0)
         left = slopes if matrix is None else slopes - seen @ matrix.T
         variance = np.square(left).mean(axis=0)

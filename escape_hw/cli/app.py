@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli import calibrate, loop, perf, products, reproduce, systems
+from escape_hw.cli import calibrate, gains, loop, perf, products, reproduce, systems
 
 app = typer.Typer(
     name="escape",
@@ -24,6 +24,7 @@ app.command("systems")(systems.systems)
 app.add_typer(systems.config_app, name="config")
 app.command("calibrate")(calibrate.calibrate)
 app.command("sprint")(calibrate.sprint)
+app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)

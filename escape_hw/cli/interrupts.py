@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, Self
 
+from escape_hw.api.procedure import Flag
+
 
 class Interrupts:
     """Turns SIGINT and SIGTERM into an orderly stop.
@@ -21,11 +23,11 @@ class Interrupts:
     Parameters
     ----------
     tell
-        Called with a line for the operator.
+        Called with a line for the operator, out of a signal handler.
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        self.abort = threading.Event()
+        self.abort = Flag()
         self._tell = tell
         self._in_procedure = False
         self._shielded = ""
@@ -47,8 +49,8 @@ class Interrupts:
         self._previous.clear()
 
     @contextmanager
-    def procedure(self) -> Iterator[threading.Event]:
-        """While a procedure runs: yields the event that aborts it."""
+    def procedure(self) -> Iterator[Flag]:
+        """While a procedure runs: yields the flag that aborts it."""
         self._in_procedure = True
         try:
             yield self.abort

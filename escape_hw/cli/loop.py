@@ -103,7 +103,8 @@ def _procedure(
     bench: Bench, product: MatrixProduct, frames: int, best: bool, strehl: bool
 ) -> Procedure[LoopResult]:
     """Model PSF where the bench can take one, best gain when asked, then the loop itself."""
-    from escape_hw.calibration.closed_loop import best_gain, closed_loop
+    from escape_hw.calibration.closed_loop import closed_loop
+    from escape_hw.calibration.gain_search import best_gain
     from escape_hw.runtime.procedures import model_psf
 
     matrix, grid = product.matrix, product.grid

@@ -27,8 +27,9 @@ def _show_product(one: Session, file: Path) -> None:
     from escape_hw.cli.views import bands, calibration_lines, rich_table
     from escape_hw.io import documents, fits_file
     from escape_hw.io.fits import KIND_MATRIX, load_matrix
+    from escape_hw.io.gains import KIND_GAINS, load_gains
     from escape_hw.io.psf import load_loop
-    from escape_hw.report.tables import Table, registration_table, strehl_table
+    from escape_hw.report.tables import Table, registration_table, rounds_table, strehl_table
 
     hdus, _ = fits_file.read(file)
     header = fits_file.header_dict(hdus)
@@ -43,6 +44,11 @@ def _show_product(one: Session, file: Path) -> None:
         one.show(*calibration_lines(matrix.result))
         if matrix.registration is not None:
             one.show(rich_table(registration_table({"": matrix.registration})))
+    elif header["KIND"] == KIND_GAINS:
+        gains = load_gains(file)
+        document |= documents.gains_document(gains.result)
+        sha256 = gains.sha256
+        one.show(rich_table(rounds_table(gains.result)))
     else:
         loop = load_loop(file)
         document |= documents.loop_document(loop.result)
@@ -56,13 +62,15 @@ def _show_product(one: Session, file: Path) -> None:
 def _show_run(one: Session, folder: Path) -> None:
     from escape_hw.cli.views import bands, checks_view, products_view, rich_table
     from escape_hw.report.content import read_run
-    from escape_hw.report.tables import registration_table, strehl_table
+    from escape_hw.report.tables import registration_table, rounds_table, strehl_table
 
     run = read_run(folder)
     document = run.document
     one.show(f"{document['command']} on {document['system']}", bands(run.simulated, run.partial()))
     if run.estimates():
         one.show(rich_table(registration_table(run.estimates(), run.planted)))
+    for gains in run.gains.values():
+        one.show(rich_table(rounds_table(gains)))
     if run.loops:
         one.show(rich_table(strehl_table(run.loops)))
     one.show(*checks_view(document.get("criteria", [])), *products_view(document["products"]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,14 +33,52 @@ def shwfs(
 ) -> None:
     """Calibrate with and without a source, close the loop with every matrix, compare."""
     with session("reproduce shwfs", json=json, quiet=quiet) as one:
-        from escape_hw.runtime.reproduce import reproduce_shwfs
-        from escape_hw.runtime.reproduce_keep import keep_shwfs
+        counts = {"frames": frames, "loop_frames": loop_frames, "plants": plants}
+        result, document = _case(one, "shwfs", counts, options.Choice.of(system, set, seed, mode), out)
+        _show_comparison(one, result, document)
 
-        def start(bench: Any) -> Any:
-            return reproduce_shwfs(bench, frames=frames, loop_frames=loop_frames, plants=plants)
 
-        result, document = _run(one, _paper_case(system, set, seed, mode), "shwfs", out, start, keep_shwfs)
-        _show_shwfs(one, result, document)
+@app.command("pywfs")
+def pywfs(
+    system: Annotated[str, typer.Option("--system", help="System to run on.")] = "razor-pywfs",
+    frames: Annotated[
+        int, typer.Option("--frames", min=1, help="Frames of the open-loop DO-CRIME.")
+    ] = 100_000,
+    closed_frames: Annotated[
+        int, typer.Option("--closed-frames", min=1, help="Frames of each round in closed loop, at most.")
+    ] = 20_000,
+    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 20_000,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Matrices, optical gains and loops with and without them, on the pyramid bench."""
+    with session("reproduce pywfs", json=json, quiet=quiet) as one:
+        counts = {"frames": frames, "closed_frames": closed_frames, "loop_frames": loop_frames}
+        result, document = _case(one, "pywfs", counts, options.Choice.of(system, set, seed, mode), out)
+        _show_comparison(one, result, document)
+
+
+@app.command("maps")
+def maps(
+    system: Annotated[str, typer.Option("--system", help="System to run on.")] = "maps-nir",
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")] = 60_000,
+    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 10_000,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """A matrix measured on the sky beside its simulation, and the loop on ESCAPE's, with a dirty mirror."""
+    with session("reproduce maps", json=json, quiet=quiet) as one:
+        counts = {"frames": frames, "loop_frames": loop_frames}
+        result, document = _case(one, "maps", counts, options.Choice.of(system, set, seed, mode), out)
+        _show_comparison(one, result, document)
 
 
 @app.command("table1")
@@ -56,15 +95,48 @@ def table1(
 ) -> None:
     """Registration from 20 seconds and from 3 minutes of data (paper, Table 1)."""
     with session("reproduce table1", json=json, quiet=quiet) as one:
-        from escape_hw.runtime.reproduce import reproduce_table1
-        from escape_hw.runtime.reproduce_keep import keep_table1
-
-        def start(bench: Any) -> Any:
-            return reproduce_table1(bench, frames={"SHORT": short, "LONG": long})
-
-        result, document = _run(one, _paper_case(system, set, seed, mode), "table1", out, start, keep_table1)
+        counts = {"short": short, "long": long}
+        result, document = _case(one, "table1", counts, options.Choice.of(system, set, seed, mode), out)
         _show_registration(one, result.calibrations, document)
         _show_end(one, document)
+
+
+@app.command("all")
+def everything(
+    out: Annotated[Path, typer.Option("--out", help="Folder; each part gets a folder of its own in it.")],
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="A part (table1, shwfs, pywfs, maps); repeatable.")
+    ] = None,
+    share: Annotated[
+        float,
+        typer.Option("--share", min=0.001, max=1.0, help="Share of the frames: 0.1 to see that it works."),
+    ] = 1.0,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Every table and figure one after the other, and a page that leads to their reports."""
+    with session("reproduce all", json=json, quiet=quiet) as one:
+        from escape_hw.cli.views import checks_view
+        from escape_hw.io import documents
+        from escape_hw.report.index import write_index
+        from escape_hw.runtime.paper import chosen
+
+        parts: dict[str, Any] = {}
+        try:
+            for case in chosen(only):
+                one.tell(f"{case.kind}: {case.title}")
+                choice = options.Choice.of(case.system, set, seed, None)
+                _, parts[case.kind] = _case(one, case.kind, case.shortened(share), choice, out / case.kind)
+                one.show(*checks_view(parts[case.kind]["criteria"]))
+        finally:
+            if parts:
+                one.show(f"index: {write_index(out, parts)}")
+        met = all(check["met"] for part in parts.values() for check in part["criteria"])
+        simulated = any(part["simulated"] for part in parts.values())
+        head = documents.head("reproduce all", None, simulated, seed)
+        one.result({**head, "parts": parts, "index": str(out.absolute() / "index.html")}, met=met)
 
 
 @app.command("sky-time")
@@ -113,40 +185,39 @@ def _curves_table(rows: Any) -> Any:
     return table
 
 
-def _paper_case(
-    system: str, overrides: list[str] | None, seed: int | None, mode: str | None
-) -> options.Choice:
-    """The paper's registration in the twin, unless the user plants another."""
-    from escape_hw.runtime.reproduce import PAPER_CASE
-
-    return options.Choice.of(system, [*PAPER_CASE, *(overrides or [])], seed, mode)
-
-
-def _run(
-    one: Session, choice: options.Choice, kind: str, out: Path | None, start: Any, keep: Any
+def _case(
+    one: Session, kind: str, counts: dict[str, int], choice: options.Choice, out: Path | None
 ) -> tuple[Any, dict[str, Any]]:
-    """Open, run, close, keep; what an aborted run has measured is kept before it says so."""
+    """Open, run, close, keep; what an aborted run has measured is kept before it says so.
+
+    What the user sets goes after what the case plants in the twin.
+    """
+    from escape_hw.runtime.paper import CASES
+
+    case = CASES[kind]
+    choice = replace(choice, set=(*case.overrides, *choice.set))
     config = one.configured(choice)
     with one.run_folder(config, f"reproduce-{kind}", out) as folder:
         with one.bench(choice) as bench:
             from escape_hw.runtime.records import BenchRecord
 
             record = BenchRecord.of(bench)
-            result, stop = one.attempt(start(bench))
+            result, stop = one.attempt(case.procedure(bench, **counts))
         with one.saving(stop):
-            document = keep(folder, record, result, one.wall_seconds)
+            document = case.keep(folder, record, result, one.wall_seconds)
         one.result(document, met=all(entry["met"] for entry in document["criteria"]))
         if stop is not None:
             raise stop
     return result, document
 
 
-def _show_shwfs(one: Session, result: Any, document: dict[str, Any]) -> None:
+def _show_comparison(one: Session, result: Any, document: dict[str, Any]) -> None:
     from escape_hw.cli.views import bands, rich_table
     from escape_hw.report.tables import strehl_table
 
     one.show(bands(document["simulated"], False))
-    _show_registration(one, {"": result.calibrations["ESCAPE"]}, document)
+    if "ESCAPE" in result.calibrations:
+        _show_registration(one, {"": result.calibrations["ESCAPE"]}, document)
     one.show(rich_table(strehl_table(result.loops)))
     one.show(*result.notes)
     _show_end(one, document)

@@ -43,7 +43,7 @@ class Session:
         self.errors = Console(stderr=True)
         # In a pipe or a log nobody's terminal limits the width.
         self.tables = Console(file=self._stdout, width=None if self._stdout.isatty() else _PIPE_WIDTH)
-        self.interrupts = Interrupts(self.tell)
+        self.interrupts = Interrupts(self._tell_at_once)
         self.folder: RunFolder | None = None
         self._concerns: dict[str, Any] = {"system": None, "simulated": None, "seed": None}
         self.was_opened = self._deaf = False
@@ -59,6 +59,17 @@ class Session:
     def tell(self, line: str) -> None:
         """A line for the operator, on standard error."""
         self.errors.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def _tell_at_once(self, line: str) -> None:
+        """As :meth:`tell`, out of a signal handler: a stream refuses a handler that interrupted its write."""
+        try:
+            descriptor = sys.stderr.fileno()
+        except (OSError, ValueError):
+            self.tell(line)
+            return
+        with contextlib.suppress(OSError):
+            # When nobody reads standard error any more, stopping is what counts.
+            os.write(descriptor, f"{line}\n".encode())
 
     def show(self, *what: RenderableType) -> None:
         """Results for people, on standard output; silent with ``--json``."""

@@ -98,6 +98,9 @@ class CalibrationSection(Section):
         6, ge=0, le=64, description="past frames that predict the turbulence; 0: plain estimator"
     )
     lags: int = Field(5, ge=1, le=64, description="frames over which the temporal response is estimated")
+    checkpoint_s: float = Field(
+        5.0, gt=0, description="seconds after which a calibration keeps its state again, to be resumed from"
+    )
     estimator: Estimator = Field(
         "auto",
         description="what SPRINT fits: the 'matrix' or the whitened 'telemetry'; 'auto': the telemetry",

@@ -11,8 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from escape_hw.api.gains import GainRound, GainsResult
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.results import CalibrationResult, LoopResult, Measured, RegistrationEstimate
+from escape_hw.api.results import (
+    CalibrationResult,
+    LoopResult,
+    Measured,
+    RegistrationEstimate,
+    StrehlEstimate,
+)
 
 #: Version of the documents' fields.
 SCHEMA = 1
@@ -95,25 +102,23 @@ def calibration_document(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
+def strehl_document(strehl: StrehlEstimate | None) -> dict[str, Any] | None:
+    """The Strehl ratio three ways; ``None`` where it was not measured."""
+    if strehl is None:
+        return None
+    ways = {"peak": strehl.peak, "otf": strehl.otf, "encircled": strehl.encircled}
+    return {name: {"value": one.value, "sigma": one.sigma} for name, one in ways.items()}
+
+
 def loop_document(result: LoopResult) -> dict[str, Any]:
     """A closed-loop run in plain values."""
-    strehl = result.strehl
     return {
         "method": result.method,
         "gain": result.gain,
         "leak": result.leak,
         "dropped_modes": result.dropped_modes,
         "frames": result.frames,
-        "strehl": None
-        if strehl is None
-        else {
-            name: {"value": value.value, "sigma": value.sigma}
-            for name, value in (
-                ("peak", strehl.peak),
-                ("otf", strehl.otf),
-                ("encircled", strehl.encircled),
-            )
-        },
+        "strehl": strehl_document(result.strehl),
         "residual_rms_nm": result.residual_rms_nm,
         "rate_hz": result.rate_hz,
         "latency_us": dict(result.latency_us),
@@ -121,4 +126,45 @@ def loop_document(result: LoopResult) -> dict[str, Any]:
         "stable": result.stable,
         "partial": result.partial,
         "notes": list(result.notes),
+    }
+
+
+def gains_document(result: GainsResult) -> dict[str, Any]:
+    """A bootstrap of optical gains in plain values; ``optical_gain`` is what to scale a matrix by."""
+    gains = result.gains
+    return {
+        "method": result.method,
+        "optical_gain": None if gains is None else gains.best,
+        "sigma": None if gains is None else gains.best_sigma,
+        "common_sigma": None if gains is None else gains.common_sigma,
+        "as_measured": None if gains is None else {"value": gains.value, "sigma": gains.sigma},
+        "trend": None if gains is None else {"value": gains.trend, "sigma": gains.trend_sigma},
+        "rounds": [_round_document(one) for one in result.rounds],
+        "closure": [asdict(step) for step in result.closure],
+        "converged": result.converged,
+        "loop_gain": result.loop_gain,
+        "frames": result.frames,
+        "lost_frames": result.lost_frames,
+        "beside": {
+            name: {"optical_gain": one.best, "sigma": one.best_sigma, "common_sigma": one.common_sigma}
+            for name, one in result.beside.items()
+        },
+        "partial": result.partial,
+        "notes": list(result.notes),
+    }
+
+
+def _round_document(one: GainRound) -> dict[str, Any]:
+    return {
+        "poke": one.poke,
+        "frames": one.frames,
+        "optical_gain": one.gains.best,
+        "sigma": one.gains.best_sigma,
+        "common_sigma": one.gains.common_sigma,
+        "change": one.change,
+        "expected_change": one.expected_change,
+        "reached": one.reached,
+        "residual_nm": one.residual_nm,
+        "strehl_loss": one.strehl_loss,
+        "strehl": strehl_document(one.strehl),
     }

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, nogil=True)
-def _step(matrix, slopes, law, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _step(matrix, slopes, keep, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
     """One step, compiled as a whole: in small systems calls cost more than arithmetic."""
     np.dot(matrix, slopes, residual)
     for k in range(state.size):
-        state[k] = law[0] * state[k] - law[1] * residual[k]
+        state[k] = keep * state[k] - gains[k] * residual[k]
 
 
 def gain_limit(delay_frames: float) -> float:
@@ -38,28 +38,73 @@ class LeakyIntegrator:
     reconstructor
         ``(n_modes, n_slopes)``.
     gain
-        Loop gain.
+        Loop gain, or one for each mode ``(n_modes,)``.
     leak
         Share of the state lost per frame.
+
+    Raises
+    ------
+    ValueError
+        A gain is not positive, or the leak not in [0, 1].
     """
 
-    def __init__(self, reconstructor: NDArray[np.float32], gain: float, leak: float) -> None:
-        if not gain > 0:
-            raise ValueError(f"gain is {gain}; it must be positive")
+    def __init__(
+        self, reconstructor: NDArray[np.float32], gain: float | NDArray[np.floating], leak: float
+    ) -> None:
         if not 0 <= leak <= 1:
             raise ValueError(f"leak is {leak}; it must lie in [0, 1]")
         self._matrix = np.ascontiguousarray(reconstructor, np.float32)
-        self.gain = gain
-        self._law = np.array([1 - leak, gain], np.float32)
-        self.state = np.zeros(self._matrix.shape[0], np.float32)
-        self.residual = np.zeros(self._matrix.shape[0], np.float32)
+        self._keep = np.float32(1 - leak)
+        n_modes = self._matrix.shape[0]
+        self._gains = np.zeros(n_modes, np.float32)
+        self.set_gain(gain)
+        self.state = np.zeros(n_modes, np.float32)
+        self.residual = np.zeros(n_modes, np.float32)
+
+    @property
+    def gains(self) -> NDArray[np.float32]:
+        """Gain of each mode ``(n_modes,)``; a copy."""
+        return self._gains.copy()
+
+    def set_gain(self, gain: float | NDArray[np.floating]) -> None:
+        """Go on with another gain, or other gains ``(n_modes,)``; the state stays.
+
+        Raises
+        ------
+        ValueError
+            A gain is not positive, or there are not as many as modes.
+        """
+        gains = np.asarray(gain, float)
+        if gains.shape not in ((), self._gains.shape):
+            raise ValueError(f"gain has shape {gains.shape}; one number or {self._gains.shape} is needed")
+        if not ((gains > 0) & np.isfinite(gains)).all():
+            raise ValueError(f"gain is {gain}; it must be positive")
+        self._gains[:] = gains
+
+    def set_reconstructor(self, reconstructor: NDArray[np.float32]) -> None:
+        """Go on with another reconstructor ``(n_modes, n_slopes)`` without a bump.
+
+        The state, a command in the same modes, stays: the mirror's next shape differs from the present
+        one only by what the next slopes add.
+
+        Raises
+        ------
+        ValueError
+            It has another shape.
+        """
+        if reconstructor.shape != self._matrix.shape:
+            raise ValueError(
+                f"the new reconstructor has shape {reconstructor.shape}, the one in use "
+                f"{self._matrix.shape}; another basis or grid needs a new integrator"
+            )
+        self._matrix = np.array(reconstructor, np.float32, order="C")
 
     def __call__(self, slopes: NDArray[np.float32]) -> NDArray[np.float32]:
         """Next modal command ``(n_modes,)`` from slopes ``(n_slopes,)``; also sets ``residual``.
 
         The command and ``residual`` are the same arrays at every call; copy what is to be kept.
         """
-        _step(self._matrix, slopes, self._law, self.residual, self.state)
+        _step(self._matrix, slopes, self._keep, self._gains, self.residual, self.state)
         return self.state
 
     def applied(self, modes: NDArray[np.floating]) -> None:

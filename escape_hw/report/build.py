@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from escape_hw.io.storage import write_atomic
-from escape_hw.report import figures_bench, figures_matrix, figures_registration, html, tables
+from escape_hw.report import figures_bench, figures_gains, figures_matrix, figures_registration, html, tables
 from escape_hw.report.content import RunContent, read_run
 
 REPORT = "report.html"
@@ -66,6 +66,7 @@ def render(run: RunContent) -> str:
     parts += [
         _verdict(document),
         _registration(run),
+        _gains(run),
         _loops(run),
         _matrices(run),
         _sky_time(run),
@@ -93,15 +94,7 @@ def _facts(run: RunContent) -> dict[str, str]:
 
 
 def _verdict(document: dict[str, Any]) -> str:
-    checks = document.get("criteria") or []
-    if not checks:
-        return ""
-    items = "".join(
-        f'<li class="{"good" if check["met"] else "bad"}">{"✓" if check["met"] else "✗"} '
-        f"{html.escape(check['text'])}</li>"
-        for check in checks
-    )
-    return html.section("Criteria", f'<ul class="checks">{items}</ul>')
+    return html.section("Criteria", html.checks(document.get("criteria") or []))
 
 
 def _registration(run: RunContent) -> str:
@@ -126,6 +119,24 @@ def _registration(run: RunContent) -> str:
             )
         parts.append(html.notes(list(estimate.warnings), "bad"))
     return html.section("Registration", *parts)
+
+
+def _gains(run: RunContent) -> str:
+    parts = []
+    for number, (label, result) in enumerate(run.gains.items()):
+        if result.rounds:
+            caption = (
+                f"Optical gain of every mode relative to the {label} matrix, with standard errors, and its "
+                "smooth course with its own."
+            )
+            parts.append(html.figure(f"og{number}", figures_gains.optical_gains(result), caption))
+        caption = (
+            "First closure: effective gain and residual at each gain tried. Rounds: change of the gains."
+        )
+        parts.append(html.figure(f"bootstrap{number}", figures_gains.bootstrap(result), caption))
+        parts.append(html.table(tables.rounds_table(result), "Rounds of the bootstrap."))
+        parts.append(html.notes(list(result.notes)))
+    return html.section("Optical gains", *parts) if parts else ""
 
 
 def _loops(run: RunContent) -> str:

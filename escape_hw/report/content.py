@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.gains import GainsResult
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.errors import ProductError
 from escape_hw.io import fits_file
 from escape_hw.io.fits import KIND_MATRIX, load_matrix
+from escape_hw.io.gains import KIND_GAINS, load_gains
 from escape_hw.io.psf import KIND_PSF, load_loop
 from escape_hw.io.run_folder import read_result
 
@@ -25,7 +27,11 @@ METHOD_LABELS = {
     "modulated": "modulation",
     "docrime": "DO-CRIME",
     "docrime-whitened": "DO-CRIME",
+    "docrime-closed": "DO-CRIME, closed loop",
+    "push-pull-fast": "fast push-pull",
+    "push-pull-fast-closed": "fast push-pull, closed loop",
     "escape": "ESCAPE",
+    "simulated": "simulation",
 }
 
 
@@ -39,6 +45,7 @@ class RunContent:
     measured_labels: dict[str, str] = field(default_factory=dict)
     columns: dict[str, str] = field(default_factory=dict)
     loops: dict[str, LoopResult] = field(default_factory=dict)
+    gains: dict[str, GainsResult] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     config_text: str = ""
     log_text: str = ""
@@ -91,6 +98,7 @@ class RunContent:
         return (
             any(result.partial for result in self.calibrations.values())
             or any(loop.partial for loop in self.loops.values())
+            or any(gains.partial for gains in self.gains.values())
             or bool(self.document.get("partial"))
         )
 
@@ -128,8 +136,11 @@ def _add(run: RunContent, name: str, path: Path, label: Mapping[str, str]) -> No
     elif kind == KIND_PSF:
         loop = load_loop(path).result
         run.loops[_free(run.loops, label.get("label") or METHOD_LABELS.get(loop.method, name), name)] = loop
+    elif kind == KIND_GAINS:
+        found = load_gains(path).result
+        run.gains[label.get("label") or METHOD_LABELS.get(found.method, name)] = found
     else:
-        raise ProductError(f"{path}: its kind is {kind!r}; this version knows IM and PSF")
+        raise ProductError(f"{path}: its kind is {kind!r}; this version knows IM, PSF and OG")
 
 
 def _free(taken: Mapping[str, object], label: str, name: str) -> str:

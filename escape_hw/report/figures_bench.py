@@ -42,8 +42,9 @@ def draw_psfs(
 ) -> None:
     """Draw the PSFs into a figure or a part of one.
 
-    Logarithmic stretch relative to the model's maximum, backgrounds taken out; the three Strehl
-    ratios stand below each in the paper's order: peak, optical transfer function, encircled energy.
+    All images have the model's flux, for a computed one knows nothing of the star's. Logarithmic
+    stretch relative to the model's maximum, backgrounds taken out; the three Strehl ratios stand
+    below each in the paper's order: peak, optical transfer function, encircled energy.
 
     Parameters
     ----------
@@ -67,7 +68,8 @@ def draw_psfs(
     if perfect is not None:
         _psf_panel(next(places), perfect, reference, psf_px, "model", None)
     for label, image in images.items():
-        _psf_panel(next(places), image, reference, psf_px, label, shown[label].strehl)
+        scaled = image if perfect is None else _with_flux(image, float(perfect.sum()))
+        _psf_panel(next(places), scaled, reference, psf_px, label, shown[label].strehl)
     for place in places:
         place.set_visible(False)
     unit = "pixel" if psf_px is None else "λ/D"
@@ -125,6 +127,12 @@ def _without_background(image: NDArray[np.float32]) -> NDArray[np.float64]:
     border = np.ones(image.shape, bool)
     border[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
     return np.asarray(image - np.median(image[border]), float)
+
+
+def _with_flux(image: NDArray[np.float64], flux: float) -> NDArray[np.float64]:
+    """The image scaled to a flux; one without light stays as it is."""
+    own = float(image.sum())
+    return image * (flux / own) if own > 0 else image
 
 
 def _cut(image: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -27,8 +27,10 @@ def convergence(estimate: RegistrationEstimate, planted: Registration | None = N
     figure = style.new_figure(7.8, 8.2)
     panels = figure.subplots(6, 1, sharex=True, height_ratios=[1.6, 1, 1, 1, 1, 1])
     norm = np.array([step.step_norm for step in steps], float)
-    panels[0].plot(number, np.where(norm > 0, norm, np.nan), "o-", color=style.SERIES[0], ms=3, lw=1.3)
-    if np.any(norm > 0):
+    moved = norm > 0
+    # A step of zero (the start, or a change of the model) has no place on a logarithmic scale.
+    panels[0].plot(number[moved], norm[moved], "o-", color=style.SERIES[0], ms=3, lw=1.3)
+    if moved.any():
         panels[0].set_yscale("log")
     style.tidy(panels[0]).set_ylabel("relative\nstep norm")
     state = "converged" if estimate.converged else "NOT converged"

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from html import escape as escape
 from importlib import resources
+from typing import Any
+from urllib.parse import quote
 
 from matplotlib.figure import Figure
 
@@ -55,6 +57,21 @@ def figure(key: str, content: Figure, caption: str) -> str:
     drawing = style.svg(content, key)
     drawing = drawing.replace("<svg", f'<svg role="img" aria-labelledby="{key}-caption" {width}', 1)
     return f'<figure>{drawing}<figcaption id="{key}-caption">{escape(caption)}</figcaption></figure>'
+
+
+def checks(criteria: Sequence[Mapping[str, Any]]) -> str:
+    """Criteria with a tick or a cross; nothing without any."""
+    items = "".join(
+        f'<li class="{"good" if check["met"] else "bad"}">{"✓" if check["met"] else "✗"} '
+        f"{escape(check['text'])}</li>"
+        for check in criteria
+    )
+    return f'<ul class="checks">{items}</ul>' if items else ""
+
+
+def link(target: str, text: str) -> str:
+    """A link to a file beside the page."""
+    return f'<a href="{escape(quote(target))}">{escape(text)}</a>'
 
 
 def side_by_side(*parts: str) -> str:

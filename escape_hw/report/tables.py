@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
+from escape_hw.api.gains import GainsResult
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import LoopResult, Measured, RegistrationEstimate
 
@@ -112,4 +115,34 @@ def strehl_table(loops: Mapping[str, LoopResult]) -> Table:
         if loop.partial:
             state += ", aborted"
         rows.append((label, *ratios, f"{loop.gain:.3f}", f"{loop.residual_rms_nm:.0f}", state))
+    return Table(headings, tuple(rows))
+
+
+def rounds_table(result: GainsResult) -> Table:
+    """Rounds of a bootstrap of optical gains: poke, frames, mean gain, its change, cost."""
+    headings = (
+        "Round",
+        "poke [% of stroke]",
+        "frames",
+        "mean gain",
+        "change [%]",
+        "Strehl lost [%]",
+        "Strehl [%]",
+    )
+    rows = []
+    for number, one in enumerate(result.rounds, 1):
+        gains = one.gains
+        own = float(np.sqrt(np.mean(np.square(gains.best_sigma)) / gains.n_modes))
+        mean = float(np.mean(gains.best))
+        rows.append(
+            (
+                str(number),
+                f"{100 * one.poke:.3g}",
+                str(one.frames),
+                with_error(Measured(mean, math.hypot(own, mean * gains.common_sigma))),
+                f"{100 * one.change:.1f}",
+                f"{100 * one.strehl_loss:.2g}",
+                "–" if one.strehl is None else percent(one.strehl.peak).strip(" %"),
+            )
+        )
     return Table(headings, tuple(rows))

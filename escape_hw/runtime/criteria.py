@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from escape_hw.api.gains import GainsResult
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import LoopResult, RegistrationEstimate
 
@@ -35,6 +36,18 @@ def _words(name: str) -> str:
 def converged(label: str, estimate: RegistrationEstimate | None) -> dict[str, Any]:
     """SPRINT converged."""
     return check(f"{label}: SPRINT converged", estimate is not None and estimate.converged)
+
+
+def gains_converged(result: GainsResult) -> dict[str, Any]:
+    """The bootstrap of the optical gains converged."""
+    if not result.rounds:
+        return check("optical gains: measured at least once", False)
+    last = result.rounds[-1]
+    return check(
+        f"optical gains: converged in {len(result.rounds)} rounds (last change {100 * last.change:.1f} %, "
+        f"{100 * last.expected_change:.1f} % expected of the errors, poke {100 * last.poke:.2g} % of stroke)",
+        result.converged,
+    )
 
 
 def recovered(label: str, estimate: RegistrationEstimate, planted: Registration) -> dict[str, Any]:
@@ -65,21 +78,29 @@ def agree(short: RegistrationEstimate, long: RegistrationEstimate) -> list[dict[
 
 
 def loops(results: Mapping[str, LoopResult]) -> list[dict[str, Any]]:
-    """Every loop is stable; ESCAPE is not below push-pull beyond the error bar."""
+    """Every loop is stable; ESCAPE is not below the measured baseline beyond the error bar.
+
+    The baseline is push-pull or, where there is no source for it, DO-CRIME.
+    """
     checks = [check(f"{label}: loop stable", loop.stable) for label, loop in results.items()]
-    escape, baseline = results.get("ESCAPE"), results.get("push-pull")
+    ours_name = "ESCAPE + OG" if "ESCAPE + OG" in results else "ESCAPE"
+    escape, name = results.get(ours_name), "push-pull" if "push-pull" in results else "DO-CRIME"
+    baseline = results.get(name)
     if escape is None or baseline is None or escape.model_psf is None or baseline.model_psf is None:
         return checks
     if escape.strehl is None or baseline.strehl is None or not math.isfinite(escape.strehl.peak.sigma):
-        return [*checks, check("Strehl of ESCAPE and push-pull compared: their loops were too short", False)]
-    for way, name in (("peak", "peak"), ("otf", "OTF"), ("encircled", "encircled")):
+        return [
+            *checks,
+            check(f"Strehl of {ours_name} and {name} compared: their loops were too short", False),
+        ]
+    for way, what in (("peak", "peak"), ("otf", "OTF"), ("encircled", "encircled")):
         ours, theirs = getattr(escape.strehl, way), getattr(baseline.strehl, way)
         error = math.hypot(ours.sigma, theirs.sigma)
         difference = ours.value - theirs.value
         checks.append(
             check(
-                f"Strehl ({name}) of ESCAPE minus push-pull: {100 * difference:+.1f} ± {100 * error:.1f} %, "
-                "not below zero by more than two standard errors",
+                f"Strehl ({what}) of {ours_name} minus {name}: {100 * difference:+.1f} ± "
+                f"{100 * error:.1f} %, not below zero by more than two standard errors",
                 difference >= -2 * error,
             )
         )

@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from escape_hw.api.gains import GainsResult
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.io.fits import save_matrix
+from escape_hw.io.gains import save_gains
 from escape_hw.io.provenance import sha256_of
 from escape_hw.io.psf import save_loop
 from escape_hw.io.run_folder import RunFolder
@@ -53,6 +55,21 @@ def keep_loop(
     path = folder.file(f"{name}.fits")
     saved = save_loop(path, result, record.system, record.simulated, record.origin(parents))
     return folder.add(name, saved)
+
+
+def keep_gains(
+    folder: RunFolder, record: BenchRecord, name: str, result: GainsResult, parents: Mapping[str, Path]
+) -> Path:
+    """Save a bootstrap of optical gains as ``NAME.fits``, with the matrices it was made from as parents.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    known = {path.name: sha256_of(path) for path in parents.values()}
+    path = folder.file(f"{name}.fits")
+    return folder.add(name, save_gains(path, result, record.system, record.simulated, record.origin(known)))
 
 
 def finish(folder: RunFolder, document: Mapping[str, Any]) -> dict[str, Any]:

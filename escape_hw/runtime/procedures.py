@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,8 +14,14 @@ from escape_hw.bench import Bench
 from escape_hw.errors import ConfigError
 from escape_hw.runtime.records import without_turbulence
 
+if TYPE_CHECKING:
+    from escape_hw.calibration.checkpoint import Checkpoint
+    from escape_hw.calibration.stopping import Target
+
 #: The calibration methods, by the names that the command line knows as well.
-METHODS = ("push-pull", "modulated", "docrime", "escape")
+METHODS = ("push-pull", "push-pull-fast", "modulated", "docrime", "escape")
+#: Those that work in closed loop as well.
+CLOSED_LOOP = ("push-pull-fast", "docrime", "escape")
 
 
 def calibrate_by(
@@ -25,10 +33,13 @@ def calibrate_by(
     grid: SensorGeometry | None = None,
     whiten: bool = True,
     estimator: str | None = None,
+    closing: CalibrationResult | None = None,
+    until: Target | None = None,
+    keep: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
     """A calibration by the name of its method.
 
-    Push-pull needs a source: the phase screen, where the bench moves one, is out of the beam
+    Slow push-pull needs a source: the phase screen, where the bench moves one, is out of the beam
     meanwhile. The others take the light as it is.
 
     Parameters
@@ -47,36 +58,56 @@ def calibrate_by(
         False: the paper's plain estimator of ``docrime`` and ``escape``.
     estimator
         What ``escape`` fits: ``"matrix"``, ``"telemetry"`` or ``"auto"``; as configured by default.
+    closing
+        Measure in closed loop, with this calibration's matrix; the methods of :data:`CLOSED_LOOP`.
+    until
+        Stop when this is reached.
+    keep
+        Where the state is kept meanwhile, and what to go on with.
 
     Raises
     ------
     ConfigError
-        No such method; nothing moved.
+        No such method, or options that do not go together; nothing moved.
     TooFewFrames, CalibrationError, Aborted
         See :func:`~escape_hw.calibration.push_pull.push_pull`,
         :func:`~escape_hw.calibration.docrime.docrime`, :func:`~escape_hw.calibration.escape.escape`.
     """
     # Imported when used: these bring compilers along, and a bench opens without them.
+    if method not in METHODS:
+        raise ConfigError(f"calibration method '{method}' is unknown; it is one of {', '.join(METHODS)}")
+    if closing is not None and method not in CLOSED_LOOP:
+        raise ConfigError(f"'{method}' is for open loop; in closed loop: {', '.join(CLOSED_LOOP)}")
+    if closing is not None and not whiten:
+        raise ConfigError("the plain estimator is for open loop; in closed loop turbulence is whitened")
+    common: dict[str, Any] = {"frames": frames, "poke": poke, "until": until, "keep": keep}
     if method == "push-pull":
         from escape_hw.calibration.push_pull import push_pull
 
         with without_turbulence(bench):
-            return (yield from push_pull(bench, frames=frames, poke=poke, grid=grid))
+            return (yield from push_pull(bench, grid=grid, **common))
     if method == "modulated":
         from escape_hw.calibration.modulated import modulated
 
-        return (yield from modulated(bench, frames=frames, poke=poke, grid=grid))
-    if method == "docrime":
-        from escape_hw.calibration.docrime import docrime
-
-        return (yield from docrime(bench, frames=frames, poke=poke, grid=grid, whiten=whiten))
+        return (yield from modulated(bench, grid=grid, **common))
     if method == "escape":
         from escape_hw.calibration.escape import escape
 
         return (
-            yield from escape(bench, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator)
+            yield from escape(bench, grid=grid, whiten=whiten, estimator=estimator, closing=closing, **common)
         )
-    raise ConfigError(f"calibration method '{method}' is unknown; it is one of {', '.join(METHODS)}")
+    if method == "push-pull-fast":
+        from escape_hw.calibration.poke_patterns import PushPullPokes
+
+        common["pattern"] = PushPullPokes
+        common["poke"] = bench.config.calibration.push_pull_poke if poke is None else poke
+    if closing is not None:
+        from escape_hw.calibration.docrime_closed import docrime_closed_loop
+
+        return (yield from docrime_closed_loop(bench, closing, **common))
+    from escape_hw.calibration.docrime import docrime
+
+    return (yield from docrime(bench, grid=grid, whiten=whiten, **common))
 
 
 def model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32]]:
@@ -94,7 +125,7 @@ def model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32
     CalibrationError
         The system has no science camera.
     """
-    from escape_hw.calibration.closed_loop import measure_model_psf
+    from escape_hw.calibration.model_psf import measure_model_psf
 
     with without_turbulence(bench):
         return (yield from measure_model_psf(bench, frames=frames))

@@ -6,6 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.gains import GainsResult
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.bench import Bench
@@ -25,8 +29,8 @@ PAPER_CASE = (
 
 
 @dataclass(slots=True)
-class ShwfsResult:
-    """Push-pull, DO-CRIME and ESCAPE on one Shack-Hartmann bench, each with its loop.
+class Comparison:
+    """Several calibrations of one system, each with its loop.
 
     ``loops`` are the runs at each matrix's own best gain, ``scans`` the runs that found it, both by
     label; ``sky_time`` holds error curves over a few random plants; ``notes`` say what went wrong on
@@ -37,6 +41,7 @@ class ShwfsResult:
     loops: dict[str, LoopResult] = field(default_factory=dict)
     scans: dict[str, list[LoopResult]] = field(default_factory=dict)
     sky_time: dict[str, Any] | None = None
+    gains: GainsResult | None = None
     notes: list[str] = field(default_factory=list)
     partial: bool = False
 
@@ -51,7 +56,7 @@ class Table1Result:
 
 def reproduce_shwfs(
     bench: Bench, *, frames: int = SHORT_FRAMES, loop_frames: int = 5000, plants: int = 0
-) -> Procedure[ShwfsResult]:
+) -> Procedure[Comparison]:
     """Calibrate with and without a source and close the loop with every matrix.
 
     The push-pull baseline and the model PSF are taken with the phase screen out; the DO-CRIME and
@@ -79,7 +84,7 @@ def reproduce_shwfs(
 
     # Now, and not after the baseline was measured.
     require_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
-    result = ShwfsResult()
+    result = Comparison()
     try:
         yield from _calibrate(bench, frames, result)
         if not result.partial:
@@ -98,7 +103,7 @@ def reproduce_shwfs(
     return result
 
 
-def _calibrate(bench: Bench, frames: int, result: ShwfsResult) -> Procedure[None]:
+def _calibrate(bench: Bench, frames: int, result: Comparison) -> Procedure[None]:
     baseline = yield from calibrate_by(bench, "push-pull")
     result.calibrations["push-pull"] = baseline
     result.partial = baseline.partial
@@ -116,22 +121,54 @@ def _calibrate(bench: Bench, frames: int, result: ShwfsResult) -> Procedure[None
     result.calibrations["ESCAPE"] = found
 
 
-def _close_loops(bench: Bench, loop_frames: int, result: ShwfsResult) -> Procedure[None]:
-    from escape_hw.calibration.closed_loop import best_gain, closed_loop
-
+def _close_loops(bench: Bench, loop_frames: int, result: Comparison) -> Procedure[None]:
     model = yield from model_psf(bench)
     for label, calibration in result.calibrations.items():
-        matrix, grid = calibration.matrix, calibration.grid
-        gain, scan = yield from best_gain(bench, matrix, grid, model_psf=model)
-        result.scans[label] = list(scan)
-        if any(run.partial for run in scan):
-            result.partial = True
+        yield from close_at_best(bench, label, calibration, loop_frames, model, result)
+        if result.partial:
             return
+
+
+def close_at_best(
+    bench: Bench,
+    label: str,
+    calibration: CalibrationResult,
+    loop_frames: int,
+    model: NDArray[np.float32],
+    result: Comparison,
+) -> Procedure[None]:
+    """Find a matrix's own best gain, close the loop with it, and add both to the result.
+
+    Parameters
+    ----------
+    bench
+        An open bench with a science camera.
+    label
+        What the matrix is called in the result.
+    calibration
+        The matrix, and the geometry that it belongs to.
+    loop_frames
+        Frames of the loop at the best gain.
+    model
+        PSF to measure Strehl ratios against.
+    result
+        Takes the runs; ``partial`` is set when one of them was stopped.
+
+    Raises
+    ------
+    CalibrationError
+        No gain gives a stable loop.
+    """
+    from escape_hw.calibration.closed_loop import closed_loop
+    from escape_hw.calibration.gain_search import best_gain
+
+    matrix, grid = calibration.matrix, calibration.grid
+    gain, scan = yield from best_gain(bench, matrix, grid, model_psf=model)
+    result.scans[label] = list(scan)
+    result.partial = any(run.partial for run in scan)
+    if not result.partial:
         loop = yield from closed_loop(bench, matrix, grid, gain=gain, frames=loop_frames, model_psf=model)
-        result.loops[label] = loop
-        if loop.partial:
-            result.partial = True
-            return
+        result.loops[label], result.partial = loop, loop.partial
 
 
 def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -> Procedure[Table1Result]:

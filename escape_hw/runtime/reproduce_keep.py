@@ -8,15 +8,45 @@ from typing import Any
 from escape_hw.io import documents
 from escape_hw.io.run_folder import RunFolder
 from escape_hw.runtime import criteria
-from escape_hw.runtime.keep import finish, keep_calibration, keep_loop, key_of
+from escape_hw.runtime.keep import finish, keep_calibration, keep_gains, keep_loop, key_of
 from escape_hw.runtime.records import BenchRecord
-from escape_hw.runtime.reproduce import ShwfsResult, Table1Result, measured_part
+from escape_hw.runtime.reproduce import Comparison, Table1Result, measured_part
+from escape_hw.runtime.reproduce_pywfs import WITH_GAINS
 
 
 def keep_shwfs(
-    folder: RunFolder, record: BenchRecord, result: ShwfsResult, wall_seconds: float
+    folder: RunFolder, record: BenchRecord, result: Comparison, wall_seconds: float
 ) -> dict[str, Any]:
-    """Products, ``result.json`` and report of :func:`~escape_hw.runtime.reproduce.reproduce_shwfs`.
+    """As :func:`keep_comparison`, of :func:`~escape_hw.runtime.reproduce.reproduce_shwfs`."""
+    title = f"Calibration without a source: {record.system}"
+    return keep_comparison(folder, record, result, wall_seconds, "reproduce shwfs", title)
+
+
+def keep_pywfs(
+    folder: RunFolder, record: BenchRecord, result: Comparison, wall_seconds: float
+) -> dict[str, Any]:
+    """As :func:`keep_comparison`, of :func:`~escape_hw.runtime.reproduce_pywfs.reproduce_pywfs`."""
+    title = f"Calibration and optical gains without a source: {record.system}"
+    return keep_comparison(folder, record, result, wall_seconds, "reproduce pywfs", title)
+
+
+def keep_maps(
+    folder: RunFolder, record: BenchRecord, result: Comparison, wall_seconds: float
+) -> dict[str, Any]:
+    """As :func:`keep_comparison`, of :func:`~escape_hw.runtime.reproduce_maps.reproduce_maps`."""
+    title = f"Calibration on the sky, with a dirty mirror: {record.system}"
+    return keep_comparison(folder, record, result, wall_seconds, "reproduce maps", title)
+
+
+def keep_comparison(
+    folder: RunFolder,
+    record: BenchRecord,
+    result: Comparison,
+    wall_seconds: float,
+    command: str,
+    title: str,
+) -> dict[str, Any]:
+    """Products, ``result.json`` and report of several calibrations of one system.
 
     Returns
     -------
@@ -33,18 +63,24 @@ def keep_shwfs(
         parents = {"docrime": saved["DO-CRIME"]} if label == "ESCAPE" and "DO-CRIME" in saved else {}
         saved[label] = keep_calibration(folder, record, key_of(label), calibration, parents)
     for label, loop in result.loops.items():
-        keep_loop(folder, record, f"loop_{key_of(label)}", loop, saved[label])
+        # A matrix scaled by its optical gains comes from the one saved.
+        keep_loop(folder, record, f"loop_{key_of(label)}", loop, saved[label.removesuffix(WITH_GAINS)])
+    if result.gains is not None:
+        beside = {key_of(label): saved[label] for label in result.gains.beside}
+        keep_gains(folder, record, "gains", result.gains, {"im": saved["ESCAPE"], **beside})
     escape = result.calibrations.get("ESCAPE")
     estimate = None if escape is None else escape.registration
     checks = [] if result.partial else [criteria.converged("ESCAPE", estimate), *criteria.loops(result.loops)]
     if not result.partial and estimate is not None and record.planted is not None:
         checks.insert(1, criteria.recovered("ESCAPE", estimate, record.planted))
+    if not result.partial and result.gains is not None:
+        checks.append(criteria.gains_converged(result.gains))
     labels: dict[str, Any] = {key_of(label): {"label": label} for label in result.calibrations}
     labels |= {f"loop_{key_of(label)}": {"label": label} for label in result.loops}
     labels.setdefault("escape", {}).update(measured="DO-CRIME", column="")
     document = {
-        **record.head("reproduce shwfs"),
-        "title": f"Calibration without a source: {record.system}",
+        **record.head(command),
+        "title": title,
         "calibrations": {k: documents.calibration_document(v) for k, v in result.calibrations.items()},
         **documents.registration_document(estimate),
         "loops": {label: documents.loop_document(loop) for label, loop in result.loops.items()},

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeVar
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.procedure import Observer, Procedure
+from escape_hw.api.procedure import Observer, Procedure, Stop
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
@@ -19,7 +18,9 @@ from escape_hw.bench import Bench
 from escape_hw.config.load import load_system
 
 if TYPE_CHECKING:
+    from escape_hw.calibration.checkpoint import Checkpoint
     from escape_hw.calibration.sensor_setup import SensorSetup
+    from escape_hw.calibration.stopping import Target
 
 T = TypeVar("T")
 
@@ -39,7 +40,7 @@ class System(Bench):
         procedure: Procedure[T],
         *,
         observers: tuple[Observer, ...] = (),
-        abort: threading.Event | None = None,
+        abort: Stop | None = None,
         progress: bool = False,
     ) -> T:
         """Drive a procedure to its end and return its result.
@@ -109,6 +110,9 @@ class System(Bench):
         grid: SensorGeometry | None = None,
         whiten: bool = True,
         estimator: str | None = None,
+        closing: CalibrationResult | None = None,
+        until: Target | None = None,
+        keep: Checkpoint | None = None,
         progress: bool = False,
     ) -> CalibrationResult:
         """Measure an interaction matrix and, with ``"escape"``, the registration behind it.
@@ -117,8 +121,8 @@ class System(Bench):
         ----------
         method
             ``"push-pull"`` (needs a source: the phase screen, where the bench moves one, is out of
-            the beam meanwhile), ``"modulated"`` (with or without one), ``"docrime"`` or ``"escape"``
-            (both under turbulence).
+            the beam meanwhile), ``"modulated"`` (with or without one), ``"push-pull-fast"``,
+            ``"docrime"`` or ``"escape"`` (all three under turbulence, in open or closed loop).
         frames
             Frames to measure with (push-pull: per push and per pull; modulated: per batch of modes);
             as configured by default.
@@ -131,6 +135,12 @@ class System(Bench):
         estimator
             What ``"escape"`` fits: ``"matrix"``, ``"telemetry"`` (fewer frames than modes are enough)
             or ``"auto"``; as configured by default.
+        closing
+            An earlier calibration: its matrix closes the loop, and the pokes stand beside the integrator.
+        until
+            Stop when this signal-to-noise ratio or accuracy is reached.
+        keep
+            Where the state is kept meanwhile, and what to go on with.
         progress
             Show a bar with the time left.
 
@@ -151,8 +161,9 @@ class System(Bench):
         from escape_hw.runtime.procedures import calibrate_by
 
         procedure = calibrate_by(
-            self, method, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator
-        )
+            self, method, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator,
+            closing=closing, until=until, keep=keep,
+        )  # fmt: skip
         return self.run(procedure, progress=progress)
 
     def find_registration(self, matrix: InteractionMatrix, grid: SensorGeometry) -> RegistrationEstimate:
@@ -290,7 +301,7 @@ class System(Bench):
         Aborted
             Stopped by Ctrl-C.
         """
-        from escape_hw.calibration.closed_loop import best_gain
+        from escape_hw.calibration.gain_search import best_gain
 
         procedure = best_gain(self, matrix, grid, gains=gains, frames=frames, model_psf=model_psf)
         return self.run(procedure, progress=progress)

@@ -69,6 +69,11 @@ class SimMirror(DeformableMirror):
         """Identity and geometry."""
         return self._info
 
+    @property
+    def twin(self) -> SimBench:
+        """The simulated bench, hidden truth and all; for tests and benchmarks alone."""
+        return self._bench
+
     def now_ns(self) -> int:
         """Simulated time in nanoseconds."""
         return self._bench.now_ns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -80,6 +81,8 @@ class SimBench:
         if twin.atmosphere is not None:
             self.air = Atmosphere(twin.atmosphere, self.pupil.pixel_m, self.pupil.lit, sky)
         self.beam_blocked = False
+        #: Told the optical path ``(n, n)`` in metres, and the time, of every frame of the sensor.
+        self.onlookers: list[Callable[[NDArray[np.float32], float], None]] = []
 
     # ------------------------------------------------------------------ clock
     @property
@@ -107,8 +110,7 @@ class SimBench:
     def optical_path(self, start_s: float, end_s: float) -> NDArray[np.float32]:
         """Mean optical path ``(n, n)`` in metres over an exposure, common to both cameras."""
         middle = 0.5 * (start_s + end_s)
-        opd = self._surface(self.dynamics.mean(start_s, end_s))
-        opd *= self._metres
+        opd = self.mirror_path(self.dynamics.mean(start_s, end_s))
         self.plates.add(middle, opd)
         if self.air is not None:
             self.air.add(middle, opd)
@@ -117,6 +119,19 @@ class SimBench:
             x = self.pupil.coordinates_m.astype(np.float32)
             opd += (np.float32(tip) * x)[None, :] + (np.float32(tilt) * x)[:, None]
         return opd
+
+    def mirror_path(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Optical path ``(n, n)`` in metres that the settled mirror makes of a command ``(n_act,)``."""
+        opd = self._surface(command)
+        opd *= self._metres
+        return opd
+
+    def sensor_path(self, opd: NDArray[np.float32], time_s: float) -> NDArray[np.float32]:
+        """Optical path ``(n, n)`` in metres in front of the sensor, what only it sees included."""
+        seen = opd + self._ncpa
+        if self._drifts:
+            seen += self._drift(time_s)
+        return seen
 
     def wfs_image(self, start_s: float, end_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Intensity on the wavefront sensor over an exposure, and the last optical path."""
@@ -128,10 +143,7 @@ class SimBench:
         for k in range(steps):
             at = start_s + k * step
             opd = self.optical_path(at, at + step)
-            seen = opd + self._ncpa
-            if self._drifts:
-                seen += self._drift(at)
-            sensor.frame(seen, image)
+            sensor.frame(self.sensor_path(opd, at), image)
         return (image / np.float32(steps) if steps > 1 else image), opd
 
     def wfs_light(self, exposure_s: float) -> tuple[float, float]:
@@ -194,7 +206,9 @@ class SimBench:
         self._exposures = None
 
     def observe(self, opd: NDArray[np.float32], time_s: float) -> None:
-        """Offer the science camera the optical path of a moment."""
+        """Offer the science camera, and whoever else looks on, the optical path of a moment."""
+        for look in self.onlookers:
+            look(opd, time_s)
         if self._exposures is not None:
             self._exposures.offer(opd, time_s)
 

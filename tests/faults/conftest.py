@@ -12,8 +12,8 @@ from small_bench import small
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.calibration.closed_loop import measure_model_psf
 from escape_hw.calibration.docrime import DocrimeRun, docrime_run
+from escape_hw.calibration.model_psf import measure_model_psf
 from escape_hw.runtime.records import without_turbulence
 from escape_hw.runtime.system import System
 from escape_sim.screen import von_karman_screen

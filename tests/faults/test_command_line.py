@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_bench import SMALL, configuration
+from small_system import SMALL, configuration
 
 from escape_hw import register_device
 from escape_hw.cli import main

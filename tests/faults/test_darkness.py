@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from small_bench import assert_flat, small
 
-from escape_hw.calibration.closed_loop import best_gain, closed_loop, measure_model_psf
+from escape_hw.calibration.closed_loop import closed_loop
 from escape_hw.calibration.docrime import docrime
 from escape_hw.calibration.escape import escape
+from escape_hw.calibration.gain_search import best_gain
+from escape_hw.calibration.model_psf import measure_model_psf
 from escape_hw.calibration.push_pull import push_pull
 from escape_hw.calibration.sensor_setup import find_sensor
 from escape_hw.errors import CalibrationError

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from small_bench import small
 
-from escape_hw.calibration.closed_loop import closed_loop, measure_model_psf
+from escape_hw.calibration.closed_loop import closed_loop
 from escape_hw.calibration.escape import escape
+from escape_hw.calibration.model_psf import measure_model_psf
 from escape_hw.calibration.push_pull import push_pull
 
 

@@ -6,24 +6,12 @@ import math
 
 import numpy as np
 import pytest
+from small_system import SMALL
 
 import escape_hw
 from escape_hw.calibration import closed_loop
 from escape_hw.pipeline.strehl import strehl
 
-#: 12 x 12 lenslets and 37 actuators: ten times as fast as the bundled bench, as correlated in time.
-SMALL = (
-    "sensor.n_sub=12",
-    "sensor.beam_radius_m=inf",
-    "devices.wfs.region=[220,156,200,200]",
-    'devices.dm.layout="circle-7"',
-    "devices.dm.pitches_across_pupil=5.0",
-    "devices.dm.pitch_m=2.7e-3",
-    "devices.screen.screen=2",
-    "basis.n_modes=30",
-    "loop.dropped_modes=4",
-    "twin.wfs.photons_per_frame=2.5e6",
-)
 #: Science frames of a loop of 1,000 frames.
 LENGTH = 85
 

@@ -11,30 +11,14 @@ from typing import Any
 
 import pytest
 from running import ESCAPE, Running
-
-from escape_hw.config.load import load_system
-
-#: 12 x 12 lenslets, 37 actuators, 30 modes: thousands of frames per second.
-SMALL = (
-    "sensor.n_sub=12",
-    "sensor.beam_radius_m=inf",
-    "devices.wfs.region=[220,156,200,200]",
-    'devices.dm.layout="circle-7"',
-    "devices.dm.pitches_across_pupil=5.0",
-    "devices.dm.pitch_m=2.7e-3",
-    "devices.screen.screen=2",
-    "basis.n_modes=30",
-    "calibration.sprint_modes=20",
-    "loop.dropped_modes=4",
-    "twin.wfs.photons_per_frame=2.5e6",
-)
+from small_system import configuration
 
 
 @pytest.fixture(scope="session")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small bench as a system file."""
     path = tmp_path_factory.mktemp("system") / "small.toml"
-    path.write_text(load_system("razor-shwfs", overrides=SMALL).to_toml())
+    path.write_text(configuration().to_toml())
     return path
 
 

@@ -60,7 +60,9 @@ class FakeProcedures:
         self.benches: list[FakeBench] = []
 
     def _calibrate(self, bench: FakeBench, name: str, **options: Any):
-        self.calls.append((name, {key: value for key, value in options.items() if value is not None}))
+        # Where the state of a run goes is no option of the calibration.
+        shown = {key: value for key, value in options.items() if value is not None and key != "keep"}
+        self.calls.append((name, shown))
         bench.screen_seen[name] = bench.screen.state.inserted
         try:
             yield from steps(name)
@@ -99,6 +101,10 @@ class FakeProcedures:
         yield from steps("gain")
         return 0.35, [replace(fake.loop(matrix.method), gain=g) for g in (0.25, 0.35, 0.45)]
 
+    def simulated(self, bench: FakeBench, grid: Any, m2c: Any):
+        self.calls.append(("simulated", {}))
+        return fake.calibration("simulated")
+
     def measure_model_psf(self, bench: FakeBench, **options: Any):
         bench.screen_seen["model_psf"] = bench.screen.state.inserted
         yield from steps("model PSF")
@@ -115,7 +121,10 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         "docrime": ("docrime",),
         "escape": ("escape",),
         "sprint": ("sprint",),
-        "closed_loop": ("closed_loop", "best_gain", "measure_model_psf"),
+        "closed_loop": ("closed_loop",),
+        "gain_search": ("best_gain",),
+        "model_psf": ("measure_model_psf",),
+        "pseudo_synthetic": ("simulated",),
     }
     for module, names in homes.items():
         stand_in = types.ModuleType(f"escape_hw.calibration.{module}")

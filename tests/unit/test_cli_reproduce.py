@@ -53,3 +53,37 @@ def test_reproduce_table1(escape, document, bench, tmp_path):
     assert set(found["products"]) == {
         "docrime_short", "escape_short", "docrime_long", "escape_long", "report",
     }  # fmt: skip
+
+
+@pytest.mark.usefixtures("reports")
+def test_reproduce_maps_shows_the_matrix_beside_its_simulation(escape, bench, tmp_path):
+    run = tmp_path / "run"
+    code, out, err = escape("reproduce", "maps", "--out", run, "--frames", 4000, "--loop-frames", 321)
+    # The stand-in's registration is not the one planted in this system.
+    assert code == 1, err
+    assert bench.benches[0].config.system.name == "maps-nir"
+    names = [name for name, _ in bench.calls]
+    assert names == ["escape", "best_gain", "closed_loop", "best_gain", "closed_loop", "simulated"]
+    assert "DO-CRIME" in out
+    assert "ESCAPE minus DO-CRIME" in out
+    page = (run / "report.html").read_text()
+    for word in ("simulation", "dirty mirror", "Stacked closed-loop PSFs"):
+        assert word in page
+    assert load_loop(run / "loop_docrime.fits").header["PARENT1"] == "docrime.fits"
+
+
+@pytest.mark.usefixtures("reports")
+def test_reproduce_all_leads_to_every_report(escape, document, bench, tmp_path):
+    words = ("reproduce", "all", "--out", tmp_path / "all", "--only", "maps", "--only", "table1")
+    code, out, _ = escape(*words, "--share", 0.1)
+    assert code == 1
+    assert [options["frames"] for name, options in bench.calls if name == "escape"] == [1000, 10_000, 6000]
+    page = (tmp_path / "all" / "index.html").read_text()
+    for part in ("table1", "maps"):
+        assert f'href="{part}/report.html"' in page
+        assert (tmp_path / "all" / part / "report.html").is_file()
+    assert "index.html" in out.splitlines()[-1]
+    code, found, _ = document(*words)
+    assert list(found["parts"]) == ["table1", "maps"]
+    assert document("reproduce", "all", "--out", tmp_path / "x", "--only", "mops")[0] == 2
+    assert not (tmp_path / "x").exists()

@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from config_text import complaint, line_with
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -17,16 +18,6 @@ from escape_hw.config.starter import starter_text
 from escape_hw.errors import ConfigError
 
 RAZOR = bundled_text("razor-shwfs")
-
-
-def complaint(text: str, **options: object) -> list[str]:
-    with pytest.raises(ConfigError) as caught:
-        load_text(text, "bench.toml", **options)  # type: ignore[arg-type]
-    return str(caught.value).splitlines()
-
-
-def line_with(text: str, fragment: str) -> int:
-    return next(n for n, line in enumerate(text.splitlines(), start=1) if fragment in line)
 
 
 def test_razor_holds_the_facts() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from config_text import complaint, line_with
 
 from escape_hw.api.registration import Registration
 from escape_hw.config.bundled import bundled_text
@@ -13,16 +14,6 @@ from escape_hw.errors import ConfigError
 
 PYWFS = bundled_text("razor-pywfs")
 SHWFS = bundled_text("razor-shwfs")
-
-
-def complaint(text: str, **options: object) -> list[str]:
-    with pytest.raises(ConfigError) as caught:
-        load_text(text, "bench.toml", **options)  # type: ignore[arg-type]
-    return str(caught.value).splitlines()
-
-
-def line_with(text: str, fragment: str) -> int:
-    return next(n for n, line in enumerate(text.splitlines(), start=1) if fragment in line)
 
 
 def test_razor_pywfs_holds_the_facts() -> None:

@@ -123,6 +123,32 @@ def test_applied_does_not_hold_on_to_the_callers_array():
     assert control(np.zeros(1, np.float32))[0] == 1
 
 
+def test_modes_have_gains_of_their_own():
+    gains = np.array([0.1, 0.4, 0.9])
+    control = LeakyIntegrator(np.eye(3, dtype=np.float32), gains, 0.0)
+    assert control(np.ones(3, np.float32)) == pytest.approx(-gains)
+    control.set_gain(0.5)
+    assert control(np.ones(3, np.float32)) == pytest.approx(-gains - 0.5)
+    with pytest.raises(ValueError, match="shape"):
+        control.set_gain(np.ones(2))
+    with pytest.raises(ValueError, match="positive"):
+        control.set_gain(np.array([0.1, 0.0, 0.2]))
+
+
+def test_another_reconstructor_comes_without_a_bump():
+    rng = np.random.default_rng(3)
+    old, new = rng.standard_normal((2, 5, 12)).astype(np.float32)
+    control, slopes = LeakyIntegrator(old, 0.4, 0.1), rng.standard_normal(12).astype(np.float32)
+    before = control(slopes).copy()
+    control.set_reconstructor(new)
+    new_at_exchange = new.copy()
+    new[:] = 0
+    assert control.state == pytest.approx(before)
+    assert control(slopes) == pytest.approx(0.9 * before - 0.4 * (new_at_exchange @ slopes), abs=1e-5)
+    with pytest.raises(ValueError, match="another basis or grid"):
+        control.set_reconstructor(new[:4])
+
+
 @pytest.mark.parametrize(("gain", "leak"), [(0.0, 0.0), (-1.0, 0.0), (0.4, -0.1), (0.4, 1.1), (np.nan, 0.0)])
 def test_senseless_parameters_are_refused(gain, leak):
     with pytest.raises(ValueError, match=r"gain|leak"):

@@ -1,0 +1,92 @@
+"""The paper's results as cases: on which system, how, and what is kept of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from escape_hw.api.procedure import Procedure
+from escape_hw.bench import Bench
+from escape_hw.errors import ConfigError
+from escape_hw.runtime.reproduce import PAPER_CASE, reproduce_shwfs, reproduce_table1
+from escape_hw.runtime.reproduce_keep import keep_maps, keep_pywfs, keep_shwfs, keep_table1
+from escape_hw.runtime.reproduce_maps import reproduce_maps
+from escape_hw.runtime.reproduce_pywfs import reproduce_pywfs
+
+
+@dataclass(frozen=True, slots=True)
+class PaperCase:
+    """One of the paper's results.
+
+    Parameters
+    ----------
+    kind
+        Name, as the command line knows it.
+    title
+        What it shows.
+    system
+        System it runs on.
+    frames
+        Numbers of frames by the procedure's keyword.
+    procedure
+        Takes an open bench and the frames.
+    keep
+        Saves, judges and reports the result.
+    overrides
+        Of the system's configuration.
+    """
+
+    kind: str
+    title: str
+    system: str
+    frames: dict[str, int]
+    procedure: Callable[..., Procedure[Any]]
+    keep: Callable[..., dict[str, Any]]
+    overrides: tuple[str, ...] = ()
+
+    def shortened(self, share: float) -> dict[str, int]:
+        """A share of the frames, by the procedure's keyword."""
+        return {name: max(1, round(share * count)) for name, count in self.frames.items()}
+
+
+def _table1(bench: Bench, *, short: int, long: int) -> Procedure[Any]:
+    return reproduce_table1(bench, frames={"SHORT": short, "LONG": long})
+
+
+CASES = {
+    case.kind: case
+    for case in (
+        PaperCase(
+            "table1", "registration from 20 seconds and from 3 minutes of data", "razor-shwfs",
+            {"short": 10_000, "long": 100_000}, _table1, keep_table1, PAPER_CASE,
+        ),
+        PaperCase(
+            "shwfs", "Shack-Hartmann bench: matrices and loops", "razor-shwfs",
+            {"frames": 10_000, "loop_frames": 30_000}, reproduce_shwfs, keep_shwfs, PAPER_CASE,
+        ),
+        PaperCase(
+            "pywfs", "pyramid bench: matrices, optical gains, loops with and without them", "razor-pywfs",
+            {"frames": 100_000, "closed_frames": 20_000, "loop_frames": 20_000},
+            reproduce_pywfs, keep_pywfs,
+        ),
+        PaperCase(
+            "maps", "telescope with a dirty mirror: matrix, simulation and loops", "maps-nir",
+            {"frames": 60_000, "loop_frames": 10_000}, reproduce_maps, keep_maps,
+        ),
+    )
+}  # fmt: skip
+
+
+def chosen(kinds: Sequence[str] | None) -> list[PaperCase]:
+    """The cases of these kinds, or all, in their own order.
+
+    Raises
+    ------
+    ConfigError
+        One is unknown.
+    """
+    for kind in kinds or ():
+        if kind not in CASES:
+            raise ConfigError(f"the paper's result '{kind}' is unknown; it is one of {', '.join(CASES)}")
+    return [case for kind, case in CASES.items() if not kinds or kind in kinds]

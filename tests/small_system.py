@@ -1,0 +1,26 @@
+"""The bundled Shack-Hartmann bench made small, so that tests run at thousands of frames per second."""
+
+from __future__ import annotations
+
+from escape_hw.config.load import load_system
+from escape_hw.config.models import SystemConfig
+
+#: 12 x 12 lenslets, 37 actuators, 30 modes, moderate turbulence; everything else as on the real bench.
+SMALL = (
+    "sensor.n_sub=12",
+    "sensor.beam_radius_m=inf",
+    "devices.wfs.region=[220,156,200,200]",
+    'devices.dm.layout="circle-7"',
+    "devices.dm.pitches_across_pupil=5.0",
+    "devices.dm.pitch_m=2.7e-3",
+    "devices.screen.screen=2",
+    "basis.n_modes=30",
+    "calibration.sprint_modes=20",
+    "loop.dropped_modes=4",
+    "twin.wfs.photons_per_frame=2.5e6",
+)
+
+
+def configuration(*more: str, seed: int | None = None) -> SystemConfig:
+    """The configuration of the small bench, with further overrides."""
+    return load_system("razor-shwfs", overrides=(*SMALL, *more), seed=seed)
