@@ -81,6 +81,7 @@ class Motion:
         self._sum = np.zeros(n_slopes)
         self._squares = np.zeros(n_slopes)
         self._pokes = self._later = 0.0
+        self._pairs = 0
         self._past: deque[NDArray[np.float32]] = deque(maxlen=_LATER)
         self._blocks, self._length = [np.zeros(n_slopes)], 1
 
@@ -94,6 +95,7 @@ class Motion:
         self._blocks[-1] += slopes
         if len(self._past) == _LATER:
             self._later += float(self._past[0] @ slopes)
+            self._pairs += 1
         self._past.append(slopes.copy())
         self._n += 1
         self._sum += slopes
@@ -102,12 +104,18 @@ class Motion:
             self._pokes += float(poke @ poke)
 
     def state(self) -> NDArray[np.float64]:
-        """Sums and sums of squares with the number of frames behind them ``(3, n_slopes)``."""
-        return np.stack([self._sum, self._squares, np.full(self.n_slopes, float(self._n))])
+        """All sums with the number of frames behind them ``(7 + blocks, n_slopes)``."""
+        numbers = (float(self._n), self._pokes, self._later, float(self._pairs), float(self._length))
+        rows = (np.full(self.n_slopes, number) for number in numbers)
+        return np.stack([self._sum, self._squares, *rows, *self._blocks])
 
     def restore(self, state: NDArray[np.float64]) -> None:
         """Go on from what :meth:`state` gave."""
         self._sum, self._squares, self._n = state[0].copy(), state[1].copy(), int(state[2, 0])
+        self._pokes, self._later = float(state[3, 0]), float(state[4, 0])
+        self._pairs, self._length = int(state[5, 0]), int(state[6, 0])
+        self._blocks = [row.copy() for row in state[7:]]
+        self._past.clear()
 
     def of(self, grid: SensorGeometry) -> SensorGeometry:
         """The geometry with the motion filled in."""
@@ -123,11 +131,10 @@ class Motion:
 
     def _steady(self, variance: float) -> float:
         """Correlation of the slopes with those :data:`_LATER` frames later, between 0 and 1."""
-        pairs = self._n - _LATER
-        if pairs < 1 or not variance > 0:
+        if not self._pairs or not variance > 0:
             return 0.0
         mean = float(np.square(self._sum / self._n).sum())
-        return float(np.clip((self._later / pairs - mean) / (variance * self.n_slopes), 0.0, 1.0))
+        return float(np.clip((self._later / self._pairs - mean) / (variance * self.n_slopes), 0.0, 1.0))
 
     def _looks(self, variance: float) -> float:
         """Independent states of the slopes seen so far: by how much means over blocks vary less.

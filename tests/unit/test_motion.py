@@ -45,3 +45,20 @@ def test_motion_pokes_and_what_lasts(memory: float, white: float) -> None:
 def test_too_few_frames_tell_no_looks() -> None:
     assert run(3, 5.0, 0.0, 1).looks == 0
     assert run(2, 5.0, 0.0, 1).steady == 0
+
+
+def test_a_run_that_goes_on_later_tells_the_same() -> None:
+    rng = np.random.default_rng(7)
+    slopes, pokes = rng.standard_normal((300, 16)).cumsum(axis=0), rng.standard_normal((300, 4))
+    whole, first, second = Motion(16), Motion(16), Motion(16)
+    for k in range(300):
+        whole.add(slopes[k].astype(np.float32), pokes[k])
+        if k == 170:
+            second.restore(first.state())
+        (first if k < 170 else second).add(slopes[k].astype(np.float32), pokes[k])
+    one, other = whole.of(pupils()), second.of(pupils())
+    assert isinstance(one, PyramidPupils)
+    assert isinstance(other, PyramidPupils)
+    assert (other.motion, other.pokes, other.looks) == pytest.approx((one.motion, one.pokes, one.looks))
+    # Two pairs across the interruption are lost.
+    assert other.steady == pytest.approx(one.steady, abs=0.02)
