@@ -11,9 +11,7 @@ from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.pipeline.pyramid_slopes import slopes_of_image
 from escape_sim.pyramid import PyramidOptics
 
-#: Random shapes of the mirror whose response is looked at under each state.
-_SHAPES = 8
-#: Their rms path in waves: small enough for differences to be derivatives.
+#: Rms path of a shape in waves: small enough for differences to be derivatives.
 _STEP = 0.01
 
 Jacobian = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -23,6 +21,7 @@ def air_scatter(
     optics: PyramidOptics,
     pupils: PyramidPupils,
     phases: NDArray[np.float64],
+    shapes: NDArray[np.float64],
     influence_m: NDArray[np.float64],
     jacobian: Jacobian,
 ) -> NDArray[np.float64]:
@@ -41,23 +40,24 @@ def air_scatter(
         Its geometry.
     phases
         Random states ``(count, n, n)`` in radians: turbulence and pokes.
+    shapes
+        Commands ``(count, n_act, k)`` whose response is looked at under each state, of all modes of a
+        calibration: fine shapes tell the registration better than coarse ones.
     influence_m
         Optical path per unit command of each actuator ``(n_act, n, n)`` in metres.
     jacobian
         The model's matrix for shapes ``(n_act, k)``, and its derivatives by registration and width.
     """
-    rng = np.random.default_rng(2)
     found = []
-    for phase in phases * (optics.wavelength_m / (2 * np.pi)):
-        shapes = rng.standard_normal((len(influence_m), _SHAPES))
-        paths = np.tensordot(shapes.T, influence_m, 1)
+    for phase, commands in zip(phases * (optics.wavelength_m / (2 * np.pi)), shapes, strict=True):
+        paths = np.tensordot(commands.T, influence_m, 1)
         step = _STEP * optics.wavelength_m / float(paths.std())
         slopes = [
             slopes_of_image(optics.frame((phase + step * path).astype(np.float32)), pupils)
             - slopes_of_image(optics.frame((phase - step * path).astype(np.float32)), pupils)
             for path in paths
         ]
-        unit, derivatives = jacobian(shapes)
+        unit, derivatives = jacobian(commands)
         terms = np.concatenate([unit[None], derivatives[:5]]).reshape(6, -1)
         gain, *moved = np.linalg.lstsq(terms @ terms.T, terms @ np.stack(slopes, axis=1).ravel())[0]
         found.append(np.array(moved) / gain)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.pyramid import PyramidPupils, boxes
 from escape_hw.api.registration import Registration
+from escape_hw.calibration.modes import karhunen_loeve
 from escape_hw.config.sensor_models import PyramidSection
 from escape_hw.errors import CalibrationError
 from escape_sim.air_scatter import air_scatter
@@ -41,6 +42,8 @@ _CALM = 0.5
 #: What scalings err by in common on a pyramid under turbulence and pokes, in % of the diameter: the mean
 #: over sixteen twins with the images at their true centres (docs/decisions/0018-pyramids-in-truth.md).
 _SCALING = 0.12
+#: Shapes of the mirror that are looked at under each state of the air.
+_SHAPES = 10
 #: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
 _STRENGTH_DOUBT, _ELLIPSE = 0.4, 0.05
 
@@ -203,9 +206,17 @@ class PyramidModel:
             paths = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
             paths *= 2 * self._config.devices.dm.stroke_m
             self._scatter = air_scatter(
-                optics, self._pupils, phases, paths, lambda m2c: self.modal_jacobian(Registration(), m2c)
-            )
+                optics, self._pupils, phases, self._random_commands(len(phases)), paths,
+                lambda m2c: self.modal_jacobian(Registration(), m2c),
+            )  # fmt: skip
         return np.asarray(self._scatter / np.sqrt(self._pupils.looks))
+
+    def _random_commands(self, count: int) -> NDArray[np.float64]:
+        """Commands ``(count, n_act, k)`` of all modes of a basis at once, as a calibration's pokes are."""
+        surfaces, lit, pixel_m = self.influence_functions()
+        n_modes = min(self._config.basis.n_modes, self.n_act - 1)
+        m2c = karhunen_loeve(surfaces, lit, pixel_m, n_modes, _OUTER_SCALE * self._config.system.pupil_m)
+        return m2c @ np.random.default_rng(2).standard_normal((count, n_modes, _SHAPES))
 
     def _by_phase(self) -> NDArray[np.float32]:
         """The slopes' derivatives by the phase at the nodes ``(n_slopes, m * m)``."""
