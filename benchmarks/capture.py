@@ -48,7 +48,7 @@ def run_plant(system: str, number: int) -> dict[str, Any]:
     changes = ["calibration.push_pull_frames=2", *plant_overrides(plant)]
     with System.from_config(twins_of(system, changes, seed=number + 1)) as bench:
         measured = bench.calibrate("push-pull")
-        found = sprint(measured.matrix, bench.model(measured.grid), misfit=False, max_iterations=40)
+        found = sprint(measured.matrix, bench.model(measured.grid), solver="light", max_iterations=40)
     error = found.registration.to_array() - plant.to_array()
     limits = np.concatenate([[TOLERANCE_PITCH * pitch] * 2, TOLERANCE_REST])
     right = bool((np.abs(error) <= limits).all())

@@ -23,21 +23,24 @@ if TYPE_CHECKING:
     from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
     from escape_hw.api.matrix import InteractionMatrix
     from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
-    from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
+    from escape_hw.api.modulator import Modulation, ModulatorInfo, ModulatorStatus, TipTiltModulator
     from escape_hw.api.procedure import Procedure, Progress, Reporter, run
     from escape_hw.api.pyramid import PyramidPupils
     from escape_hw.api.registration import Registration
     from escape_hw.api.results import CalibrationResult, LoopResult, Measured, RegistrationEstimate
     from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
     from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
+    from escape_hw.calibration.checkpoint import Checkpoint
     from escape_hw.calibration.closed_loop import closed_loop
     from escape_hw.calibration.docrime import docrime
+    from escape_hw.calibration.docrime_closed import docrime_closed_loop
     from escape_hw.calibration.escape import escape
     from escape_hw.calibration.gain_search import best_gain
     from escape_hw.calibration.model_psf import measure_model_psf
     from escape_hw.calibration.push_pull import push_pull
     from escape_hw.calibration.sensor_setup import find_sensor, measure_dark
     from escape_hw.calibration.sprint import sprint
+    from escape_hw.calibration.stopping import Target
     from escape_hw.config.bundled import bundled_systems
     from escape_hw.config.load import load_system
     from escape_hw.config.registry import register_device
@@ -55,6 +58,7 @@ _HOME = {
     "CameraInfo": "escape_hw.api.frames",
     "CameraSettings": "escape_hw.api.frames",
     "CalibrationResult": "escape_hw.api.results",
+    "Checkpoint": "escape_hw.calibration.checkpoint",
     "DMInfo": "escape_hw.api.mirror",
     "DeformableMirror": "escape_hw.api.mirror",
     "Frame": "escape_hw.api.frames",
@@ -64,6 +68,7 @@ _HOME = {
     "MirrorLimits": "escape_hw.safety.limits",
     "Modulation": "escape_hw.api.modulator",
     "ModulatorInfo": "escape_hw.api.modulator",
+    "ModulatorStatus": "escape_hw.api.modulator",
     "PhaseScreen": "escape_hw.api.screen",
     "Procedure": "escape_hw.api.procedure",
     "Progress": "escape_hw.api.procedure",
@@ -80,11 +85,13 @@ _HOME = {
     "ShellState": "escape_hw.api.adaptive_secondary",
     "SubApertureGrid": "escape_hw.api.sensor",
     "System": "escape_hw.runtime.system",
+    "Target": "escape_hw.calibration.stopping",
     "TipTiltModulator": "escape_hw.api.modulator",
     "best_gain": "escape_hw.calibration.gain_search",
     "bundled_systems": "escape_hw.config.bundled",
     "closed_loop": "escape_hw.calibration.closed_loop",
     "docrime": "escape_hw.calibration.docrime",
+    "docrime_closed_loop": "escape_hw.calibration.docrime_closed",
     "errors": "escape_hw.errors",
     "escape": "escape_hw.calibration.escape",
     "find_sensor": "escape_hw.calibration.sensor_setup",
@@ -107,6 +114,7 @@ __all__ = [
     "Camera",
     "CameraInfo",
     "CameraSettings",
+    "Checkpoint",
     "DMInfo",
     "DeformableMirror",
     "Frame",
@@ -116,6 +124,7 @@ __all__ = [
     "MirrorLimits",
     "Modulation",
     "ModulatorInfo",
+    "ModulatorStatus",
     "PhaseScreen",
     "Procedure",
     "Progress",
@@ -132,12 +141,14 @@ __all__ = [
     "ShellState",
     "SubApertureGrid",
     "System",
+    "Target",
     "TipTiltModulator",
     "__version__",
     "best_gain",
     "bundled_systems",
     "closed_loop",
     "docrime",
+    "docrime_closed_loop",
     "errors",
     "escape",
     "find_sensor",

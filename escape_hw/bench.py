@@ -211,6 +211,29 @@ def build_bench(config: SystemConfig) -> Bench:
     return Bench.from_config(config)
 
 
+def build_device(name: str, config: SystemConfig, kind: type[D]) -> D:
+    """Build one device of a system alone; opens nothing.
+
+    Parameters
+    ----------
+    name
+        Its key in ``[devices]``.
+    config
+        The whole configuration.
+    kind
+        What it has to be.
+
+    Raises
+    ------
+    ConfigError
+        The system has none in this mode, or its driver is unknown, not installed or of another kind.
+    """
+    device = _build(name, getattr(config.devices, name, None), config, {}, kind)
+    if device is None:
+        raise ConfigError(f"system '{config.system.name}' has no driver for devices.{name} in this mode")
+    return device
+
+
 def mode_of(section: DeviceConfig, config: SystemConfig) -> str:
     """The mode of one device: its own, or else the system's."""
     return section.mode or config.system.mode

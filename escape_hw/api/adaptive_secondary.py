@@ -54,6 +54,10 @@ class ShellHealth:
         Commands that the mirror itself did not execute since it was opened.
     fault
         Why it is in ``FAULT``, empty otherwise.
+    contaminated
+        Actuators that the mirror itself took out of service.
+    owner
+        Who controls it, where it can tell.
     """
 
     time_ns: int
@@ -63,6 +67,8 @@ class ShellHealth:
     temperature_c: float
     skipped: int
     fault: str = ""
+    contaminated: tuple[int, ...] = ()
+    owner: str = ""
 
 
 class AdaptiveSecondary(DeformableMirror):
@@ -71,7 +77,8 @@ class AdaptiveSecondary(DeformableMirror):
     Commands are followed in the state ``RUNNING`` only. ``open`` leads there unless ``lift`` is
     false; ``close`` flattens and rests the shell. A fault is latched: nothing but :meth:`recover`
     ends it, and no command, no closing and no opening does. Drivers fill in ``_state``, ``_step``,
-    ``_recover``, ``_measure`` and ``_health`` beside those of a mirror.
+    ``_recover``, ``_measure``, ``_health`` and, where it can be watched without control, ``_glance``
+    beside those of a mirror.
 
     Parameters
     ----------
@@ -79,11 +86,19 @@ class AdaptiveSecondary(DeformableMirror):
         As for every mirror.
     lift
         Lead the mirror to ``RUNNING`` when it is opened.
+
+    Attributes
+    ----------
+    lift
+        As above; may be changed while it is closed.
+    leave_set
+        ``close`` leaves a floating shell afloat and flat instead of resting it.
     """
 
     def __init__(self, name: str, limits: MirrorLimits, *, lift: bool = True) -> None:
         super().__init__(name, limits)
-        self._lift = lift
+        self.lift = lift
+        self.leave_set = False
 
     @property
     def state(self) -> ShellState:
@@ -108,6 +123,17 @@ class AdaptiveSecondary(DeformableMirror):
         """
         self.require_open()
         return self._health()
+
+    @final
+    def glance(self) -> ShellHealth:
+        """What the mirror says of itself, without taking control of it; works open or not.
+
+        Raises
+        ------
+        DeviceError
+            It does not answer, or can only be watched by who controls it.
+        """
+        return self._health() if self.is_open else self._glance()
 
     @final
     def measured_positions(self) -> NDArray[np.float64]:
@@ -178,34 +204,68 @@ class AdaptiveSecondary(DeformableMirror):
     def _healthy_state(self) -> ShellState:
         state = self._state()
         if state is ShellState.FAULT:
-            raise DeviceError(
-                self.name, f"fault latched: {self._health().fault}; see to the cause, then call recover()"
-            )
+            raise self._latched(self._health().fault)
         return state
+
+    def _latched(self, fault: str) -> DeviceError:
+        """The error of a mirror that stopped itself."""
+        return DeviceError(self.name, f"fault latched: {fault}; see to the cause, then call recover()")
+
+    def _asleep(self, state: ShellState, why: str = "") -> DeviceError:
+        """The error of a mirror that is not running."""
+        return DeviceError(self.name, f"is {state} and follows no commands{why}; call go(ShellState.RUNNING)")
 
     def _movable(self) -> bool:
         return self._state() is ShellState.RUNNING
 
     def _after_open(self) -> None:
         super()._after_open()
-        if self._lift:
+        if self.lift:
             self.go(ShellState.RUNNING)
 
     def _before_close(self) -> None:
-        super()._before_close()
+        end = ShellState.SET if self.leave_set else ShellState.RESTED
+        try:
+            super()._before_close()
+        except DeviceError as error:
+            # A shell that cannot be flattened is better at rest than afloat with nobody there.
+            self._tidy(lambda: self._lower(end), error)
+            raise
         if self._state() in (ShellState.SET, ShellState.RUNNING):
-            self.go(ShellState.RESTED)
+            self.go(end)
+
+    def _lower(self, end: ShellState) -> None:
+        """Step down to a state without asking for a shape."""
+        for state in reversed(LADDER[LADDER.index(end) : -1]):
+            if self._state() in LADDER[LADDER.index(state) + 1 :]:
+                self._step(state)
 
     @final
-    def _send(self, command: NDArray[np.float64]) -> None:
-        state = self._healthy_state()
+    def _send(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        state = self._known_state()
+        if state is ShellState.FAULT:
+            self._healthy_state()
         if state is not ShellState.RUNNING:
-            raise DeviceError(self.name, f"is {state} and follows no commands; call go(ShellState.RUNNING)")
-        self._drive(command)
+            raise self._asleep(state)
+        return self._drive(command)
+
+    def _known_state(self) -> ShellState:
+        """Where the mirror stood when it last spoke: asked before every command, so it must be cheap."""
+        return self._state()
+
+    def _glance(self) -> ShellHealth:
+        """Ask for the health over a way that needs no control; the mirror is not open."""
+        raise DeviceError(self.name, "tells its health only to who controls it; open it first")
 
     @abc.abstractmethod
-    def _drive(self, command: NDArray[np.float64]) -> None:
-        """Transfer a guarded command ``(n_act,)`` to the running mirror."""
+    def _drive(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Transfer a guarded command ``(n_act,)`` to the running mirror.
+
+        Returns
+        -------
+        ndarray or None
+            The shape it has now where it refused this one and kept another; ``None``: as commanded.
+        """
 
     @abc.abstractmethod
     def _state(self) -> ShellState:

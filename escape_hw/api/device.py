@@ -109,6 +109,10 @@ class Device(abc.ABC):
         try:
             step()
         except Exception as second:
+            if type(second) is type(cause) and str(second) == str(cause):
+                # A device that is gone says the same of every further step.
+                log.debug("again while clearing up: %s", second)
+                return
             log.warning("further failure while clearing up: %s: %s", type(second).__name__, second)
             cause.add_note(f"and then, while clearing up: {type(second).__name__}: {second}")
 

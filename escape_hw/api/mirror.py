@@ -43,11 +43,24 @@ class DMInfo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SendReport:
-    """What became of one command: the shape sent (read-only), when, and what the guard did to it."""
+    """What became of one command.
+
+    Parameters
+    ----------
+    sent
+        The shape that the mirror has now ``(n_act,)``, read-only.
+    sent_ns
+        When, on the mirror's clock.
+    guard
+        What the guard did to the command.
+    skipped
+        The mirror itself did not execute it and kept ``sent``, its last shape.
+    """
 
     sent: NDArray[np.float64]
     sent_ns: int
     guard: GuardReport
+    skipped: bool = False
 
 
 class DeformableMirror(Device):
@@ -132,12 +145,41 @@ class DeformableMirror(Device):
             except CommandRejected:
                 self.rejected_count += 1
                 raise
-            self._send(safe)
-            guard.accept(safe)
+            kept = self._send(safe)
+            shape = safe if kept is None else kept
+            guard.accept(shape)
             self._shape_known = True
             self.sent_count += 1
             self.clipped_count += report.clipped
-            return SendReport(safe, self.now_ns(), report)
+            return SendReport(shape, self.now_ns(), report, kept is not None)
+
+    @final
+    def check(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
+        """What :meth:`send` would make of a shape now; sends nothing.
+
+        Parameters
+        ----------
+        command
+            ``(n_act,)`` real numbers, fractions of full stroke.
+
+        Returns
+        -------
+        shape : ndarray of float64, ``(n_act,)``
+            Read-only: what would reach the mirror.
+        report : GuardReport
+            What the guard would change.
+
+        Raises
+        ------
+        CommandRejected
+            Malformed or not finite.
+        """
+        return self._checked().limit(command)
+
+    @final
+    def obeys(self, command: NDArray[np.float64]) -> bool:
+        """Whether a shape ``(n_act,)`` would pass :meth:`send` as it is; sends nothing."""
+        return self._checked().obeys(command)
 
     @final
     def allowed_share(self, command: ArrayLike) -> float:
@@ -225,8 +267,15 @@ class DeformableMirror(Device):
         return True
 
     @abc.abstractmethod
-    def _send(self, command: NDArray[np.float64]) -> None:
-        """Transfer a guarded, C-contiguous, read-only float64 command ``(n_act,)``."""
+    def _send(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Transfer a guarded, C-contiguous, read-only float64 command ``(n_act,)``.
+
+        Returns
+        -------
+        ndarray or None
+            ``None``: the mirror takes the command. A mirror that may skip a command without harm
+            returns the shape that it keeps, read-only.
+        """
 
 
 def _neighbours(info: DMInfo) -> NDArray[np.intp]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import abc
 import math
-from dataclasses import dataclass
-from typing import final
+from dataclasses import dataclass, field
+from typing import Any, final
 
 from escape_hw.api.device import Device
 from escape_hw.errors import DeviceError, SettingRejected
@@ -30,11 +30,34 @@ class ModulatorInfo:
     simulated: bool
 
 
+@dataclass(frozen=True, slots=True)
+class ModulatorStatus:
+    """What a modulator does at a moment.
+
+    Parameters
+    ----------
+    info
+        Which modulator.
+    modulation
+        The modulation in force; ``None``: it does not turn.
+    position_rad
+        Where it points (x, y) from its centre, where it can tell.
+    details
+        What else this stage tells of itself (servos, connection, corrections), plain values.
+    """
+
+    info: ModulatorInfo
+    modulation: Modulation | None
+    position_rad: tuple[float, float] | None = None
+    details: dict[str, Any] = field(default_factory=dict)
+
+
 class TipTiltModulator(Device):
     """A tip-tilt stage that turns the beam in a circle; parks at its centre when stopped.
 
     Drivers fill in ``_open``, ``_close``, ``_check``, ``_modulate``, ``_park``,
-    ``info`` and ``modulation``. Closing parks first.
+    ``info`` and ``modulation``; where they can, ``_status``, ``_look`` and ``_release`` too. Closing
+    parks first.
     """
 
     @property
@@ -99,8 +122,52 @@ class TipTiltModulator(Device):
         self.require_open()
         self._park()
 
+    @final
+    def status(self) -> ModulatorStatus:
+        """What the stage does now. Moves nothing; one that is not open is connected for the question.
+
+        Raises
+        ------
+        DeviceError
+            It cannot be asked.
+        """
+        with self._lock:
+            return self._status() if self.is_open else self._look()
+
+    @final
+    def release(self) -> bool:
+        """Disconnect without parking: a stage with a clock of its own goes on turning.
+
+        Everything else parks on closing; this is for a person who adjusts the beam.
+
+        Returns
+        -------
+        bool
+            True when the stage goes on; false when it cannot, and was closed as usual.
+        """
+        with self._lock:
+            self.require_open()
+            if not self._release():
+                self.close()
+                return False
+            self._is_open = False
+            return True
+
     def _before_close(self) -> None:
         self._park()
+
+    def _status(self) -> ModulatorStatus:
+        """Status of an open stage."""
+        return ModulatorStatus(self.info, self.modulation)
+
+    def _look(self) -> ModulatorStatus:
+        """Status of a stage that is not open."""
+        with self:
+            return self._status()
+
+    def _release(self) -> bool:
+        """Disconnect and leave the stage turning; false where that is impossible."""
+        return False
 
     @abc.abstractmethod
     def _check(self, want: Modulation) -> Modulation:

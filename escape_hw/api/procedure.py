@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.flag import Flag
 from escape_hw.errors import Aborted
 
 log = logging.getLogger(__name__)
@@ -69,27 +70,6 @@ class Stop(Protocol):
 
     def is_set(self) -> bool:
         """Whether to stop."""
-
-
-class Flag:
-    """A flag that a signal handler may set.
-
-    It takes no lock, unlike :class:`threading.Event`: a handler that interrupts itself in the midst
-    of setting an event waits for itself for ever.
-    """
-
-    __slots__ = ("_set",)
-
-    def __init__(self) -> None:
-        self._set = False
-
-    def set(self) -> None:
-        """Raise the flag."""
-        self._set = True
-
-    def is_set(self) -> bool:
-        """Whether it was raised."""
-        return self._set
 
 
 Procedure = Generator[Progress, None, T]

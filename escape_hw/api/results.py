@@ -63,6 +63,8 @@ class RegistrationEstimate:
         ``(5, 5)`` in the order and units of ``PARAMETERS``, errors of the model included.
     width
         Scale of the influence functions' width relative to nominal.
+    notes
+        What to know of it that is no reason to distrust it, such as parameters that go together.
     """
 
     registration: Registration
@@ -73,6 +75,7 @@ class RegistrationEstimate:
     iterations: tuple[SprintIteration, ...]
     chi2: float
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def sigma(self) -> NDArray[np.float64]:

@@ -103,6 +103,12 @@ class Motion:
         if poke is not None:
             self._pokes += float(poke @ poke)
 
+    def extend(self, slopes: NDArray[np.float32]) -> None:
+        """Take the slopes of many frames ``(n, n_slopes)``."""
+        self._n += len(slopes)
+        self._sum += slopes.sum(axis=0, dtype=np.float64)
+        self._squares += np.einsum("ts,ts->s", slopes, slopes, dtype=np.float64)
+
     def state(self) -> NDArray[np.float64]:
         """All sums with the number of frames behind them ``(7 + blocks, n_slopes)``."""
         numbers = (float(self._n), self._pokes, self._later, float(self._pairs), float(self._length))

@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.calibration.acquire import Motion
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
 
 #: Frames handed over at once.
@@ -40,6 +41,8 @@ class BackgroundEstimator:
 
     Attributes
     ----------
+    motion
+        Of the slopes in the estimate.
     skipped
         Frames lost because the sums were behind.
     """
@@ -53,6 +56,7 @@ class BackgroundEstimator:
     ) -> None:
         self.estimator, self.skipped, self._patient, self._look = estimator, 0, patient, look
         self._n_slopes, self._n_modes = estimator.n_slopes, estimator.n_modes
+        self.motion = Motion(estimator.n_slopes)
         columns = self._n_slopes + 2 * self._n_modes
         self._free: queue.SimpleQueue[tuple[NDArray[np.int64], NDArray[np.float32]]] = queue.SimpleQueue()
         for _ in range(_WAITING + 1):
@@ -141,6 +145,7 @@ class BackgroundEstimator:
                     part = rows[:filled]
                     n = self._n_slopes
                     self.estimator.extend(index[:filled], part[:, :n], part[:, n:])
+                    self.motion.extend(part[:, :n])
                     if self._look is not None:
                         self._look(self.estimator)
             except BaseException as error:

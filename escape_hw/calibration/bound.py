@@ -1,6 +1,13 @@
-"""The Cramer-Rao bound of a registration from a whitened DO-CRIME run."""
+"""The least error of a registration that frames of a DO-CRIME run allow: the Cramer-Rao bound.
+
+``docs/theory/sky-time.md`` derives it. Gain and registration are fixed unknowns; what a real mirror and
+sensor have besides are random effects with a known scatter, and the bound that counts both kinds is the
+*hybrid* one (Rockah & Schultheiss 1987).
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,42 +15,152 @@ from numpy.typing import NDArray
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.derivatives import modal_jacobian
+from escape_hw.calibration.covariance import FLOOR
+from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.linearisation import Problem
+from escape_hw.calibration.misfit import NormalEquations, Priors
+from escape_hw.calibration.telemetry_sprint import independent_columns
+from escape_hw.calibration.weighted import WeightedMatrix
 
-#: Share of the diagonal mixed into the noise covariance, so that few frames leave it invertible.
-_SHRINKAGE = 0.05
+#: Passes that find the level of the uncorrelated part of the noise.
+_PASSES = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bound:
+    """Least standard errors of the registration ``(5,)``.
+
+    Parameters
+    ----------
+    exact
+        For a model that is exact: gain and registration are the only unknowns.
+    hybrid
+        With the random effects, and with what the model still misses.
+    """
+
+    exact: NDArray[np.float64]
+    hybrid: NDArray[np.float64]
 
 
 def registration_bound(
     matrix: InteractionMatrix,
+    gram: NDArray[np.float64],
     covariance: NDArray[np.float64],
+    rows: int,
     model: SyntheticModel,
     registration: Registration,
-) -> NDArray[np.float64]:
-    """Least standard errors ``(5,)`` that any unbiased estimator can reach on these frames.
-
-    Gain and registration are the only unknowns: the model is taken as exact and the whitened noise
-    as Gaussian with the covariance found. The Fisher information of frames with pokes ``c`` and
-    noise ``N(0, C)`` is ``F_pq = sum_t (J_p c_t)^T C^-1 (J_q c_t)``, with ``J_p`` the derivative of
-    the matrix by parameter ``p``; pokes are white, so their second moments are diagonal.
+    priors: Priors,
+) -> Bound:
+    """The bound for pokes that were really sent.
 
     Parameters
     ----------
     matrix
-        The measured matrix; its standard errors tell how strongly each mode was excited.
+        A matrix of this sensor and basis; its data tell the gain.
+    gram
+        Sum over the frames of whitened pokes times whitened pokes ``(n_modes, n_modes)``: of any rank.
     covariance
-        Covariance of one frame's whitened residual slopes ``(n_slopes, n_slopes)``.
+        Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``, or its diagonal ``(n_slopes,)``
+        where more is not known.
+    rows
+        Degrees of freedom that the covariance rests on.
     model
         The synthetic model on the same grid.
     registration
         Where to take the bound.
+    priors
+        Scatter of the random effects.
     """
-    variance = np.diag(covariance)
-    excitation = np.mean(variance[:, None] / np.square(matrix.sigma, dtype=float), axis=0)
-    mixed = (1 - _SHRINKAGE) * covariance + _SHRINKAGE * np.diag(variance)
-    unit, derivatives = modal_jacobian(model, registration, matrix.m2c)
+    variance = np.diag(covariance) if covariance.ndim == 2 else covariance
+    unit = modal_matrix(model, registration, matrix.m2c)
     gain = float(np.vdot(unit, matrix.data) / np.vdot(unit, unit))
-    jacobian = np.concatenate([unit[None], gain * derivatives[:5]]) * np.sqrt(excitation)
-    whitened = np.linalg.solve(np.linalg.cholesky(mixed), jacobian.transpose(1, 0, 2).reshape(len(mixed), -1))
-    columns = whitened.reshape(len(mixed), 6, -1).transpose(1, 0, 2).reshape(6, -1)
-    return np.asarray(np.sqrt(np.diag(np.linalg.inv(columns @ columns.T)))[1:6])
+    truth = replace(matrix, data=(gain * unit).astype(np.float32))
+    columns = independent_columns(truth, gram, variance)
+    problem = Problem(WeightedMatrix.of(columns, np.arange(columns.n_modes)), model, priors)
+    system = problem.linearise(problem.start(registration))
+    if covariance.ndim == 2:
+        inverse = inverse_correlation(covariance / np.sqrt(np.outer(variance, variance)), rows)
+        whole = correlated_information(system, problem.precision, inverse)
+        hybrid = np.linalg.inv(whole)
+    else:
+        whole, hybrid = system.inner, np.linalg.inv(system.information())
+    exact = np.linalg.inv(whole[:6, :6])
+    return Bound(np.sqrt(np.diag(exact)[1:6]), np.sqrt(np.diag(hybrid)[1:6] + np.square(FLOOR)))
+
+
+def inverse_correlation(correlation: NDArray[np.float64], rows: int) -> NDArray[np.float64]:
+    """Inverse of a correlation matrix that was measured on few rows.
+
+    The inverse of a sample covariance of ``p`` slopes from ``n`` rows is too large by ``n / (n - p)``, and no
+    shrinkage that leaves it invertible cures that. So the noise is taken for a few patterns that move many
+    slopes together, on top of uncorrelated noise (Johnstone 2001): eigenvalues within the Marchenko-Pastur
+    bulk, ``(1 + sqrt(p / n))^2`` and below, are scatter about one level, and those beyond it are put back by
+    what the sample raises them by, ``l -> l (1 + (p / n) / (l - 1))``.
+
+    Parameters
+    ----------
+    correlation
+        ``(p, p)`` with unit diagonal.
+    rows
+        Degrees of freedom ``n`` behind it.
+    """
+    values, patterns = np.linalg.eigh(correlation)
+    p, ratio, level = len(values), len(values) / rows, 1.0
+    for _ in range(_PASSES):
+        relative = values / level
+        beyond = relative > (1 + np.sqrt(ratio)) ** 2
+        half = (relative[beyond] + 1 - ratio) / 2
+        true = level * (half + np.sqrt(np.maximum(np.square(half) - relative[beyond], 0.0)))
+        level = max(float((p - true.sum()) / max(p - true.size, 1)), float(values.mean()) / p)
+    spikes = patterns[:, beyond]
+    return np.asarray(np.eye(p) / level + (spikes * (1 / true - 1 / level)) @ spikes.T)
+
+
+def correlated_information(
+    system: NormalEquations, precision: NDArray[np.float64], inverse: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Information on all unknowns where neighbouring slopes err together.
+
+    As :func:`~.misfit.normal_equations` with ``J^T R^-1 J`` in place of ``J^T J``; the derivatives by
+    actuators and slopes are outer products here as well, and are never written out.
+
+    Parameters
+    ----------
+    system
+        The linearised problem, weighted by the slopes' standard errors.
+    precision
+        Prior precision of every unknown.
+    inverse
+        Inverse of the correlation matrix of the slopes' noise ``(n_slopes, n_slopes)``.
+
+    Returns
+    -------
+    ndarray, ``(n, n)``
+        In the order of the unknowns.
+    """
+    common, sampled, model, modes = system.common, system.sampled, system.model, system.modes
+    metric, k = inverse, len(common)
+    member = (system.lines[:, None] == np.arange(system.lines.max() + 1)).astype(float)
+    zonal = np.concatenate([system.slopes_gain, system.slopes_width], axis=1)
+    twice = np.concatenate([modes, modes])
+    seen_common = np.einsum("st,ptm->psm", metric, common, optimize=True)
+    seen_zonal = metric @ zonal
+    flat = common.reshape(k, -1)
+    common_acting = (np.concatenate([seen_common @ modes.T] * 2, axis=2) * zonal).sum(axis=1)
+    by_line, by_slope = (
+        np.einsum("psm,sm->ps", seen_common, part, optimize=True) for part in (sampled, model)
+    )
+    line_acting, slope_acting = ((part @ twice.T) * seen_zonal for part in (sampled, model))
+    line_line = member.T @ (metric * (sampled @ sampled.T)) @ member
+    slope_line = (metric * (model @ sampled.T)) @ member
+    acting = (zonal.T @ seen_zonal) * (twice @ twice.T)
+    whole = np.block(
+        [
+            [seen_common.reshape(k, -1) @ flat.T, by_line @ member, common_acting, by_slope],
+            [(by_line @ member).T, line_line, member.T @ line_acting, slope_line.T],
+            [common_acting.T, (member.T @ line_acting).T, acting, slope_acting.T],
+            [by_slope.T, slope_line, slope_acting, metric * (model @ model.T)],
+        ]
+    )
+    whole[np.diag_indices(len(whole))] += precision
+    return np.asarray(whole)

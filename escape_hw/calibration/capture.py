@@ -38,6 +38,7 @@ def capture(
     start: NDArray[np.float64],
     iterations: int,
     learning_rate: float = 1.0,
+    frozen: bool = False,
 ) -> Generator[LightFit, None, LightFit]:
     """Descend to the registration of a matrix, from wherever it may be.
 
@@ -58,16 +59,16 @@ def capture(
         Iterations of each descent before giving up.
     learning_rate
         Share of each step that is taken.
+    frozen
+        Whether the descent on all columns keeps the derivatives of its start.
 
     Returns
     -------
     LightFit
         The best that was found, on all columns. Every step on the way is yielded.
     """
-    fine = LightProblem(WeightedMatrix.of(matrix, columns), model, learning_rate)
-    coarse = fine
-    if columns.size > 2 * COARSE:
-        coarse = LightProblem(WeightedMatrix.of(matrix, np.sort(columns)[:COARSE]), model, learning_rate)
+    fine = LightProblem(WeightedMatrix.of(matrix, columns), model, learning_rate, frozen)
+    coarse = low_modes(matrix, model, columns, learning_rate) or fine
     best = yield from _coarse_to_fine(coarse, fine, start, iterations)
     if believable(fine, best) or not isinstance(model, DifferentiableModel):
         return best
@@ -78,6 +79,15 @@ def capture(
         if believable(fine, best):
             break
     return best
+
+
+def low_modes(
+    matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], learning_rate: float = 1.0
+) -> LightProblem | None:
+    """The problem of the lowest of the columns; ``None`` where there are too few to leave some out."""
+    if columns.size <= 2 * COARSE:
+        return None
+    return LightProblem(WeightedMatrix.of(matrix, np.sort(columns)[:COARSE]), model, learning_rate)
 
 
 def _coarse_to_fine(

@@ -11,7 +11,7 @@ from escape_hw.calibration.weighted import WeightedMatrix
 
 #: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
 #: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
-_FLOOR = np.array([0.03, 0.03, 0.0, 0.035, 0.018])
+FLOOR = np.array([0.03, 0.03, 0.0, 0.045, 0.024])
 
 
 class Linearised(Protocol):
@@ -65,7 +65,7 @@ def sandwich(
     the distance to zero at half the pupil (Bartlett's window, as in Newey & West 1987 over time).
     Beyond that the noise's correlation fills in where it is known, and else the scatter of the
     scores from mode to mode, which shows what moved all slopes together while one mode was
-    measured. What is common to the whole pupil no scatter can show; :data:`_FLOOR` stands for it.
+    measured. What is common to the whole pupil no scatter can show; :data:`FLOOR` stands for it.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def sandwich(
     # Never better than the noise alone allows.
     scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))
     covariance = found * np.outer(scale, scale)
-    covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(_FLOOR)
+    covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(FLOOR)
     if not weighted.measured:
         covariance = covariance * np.mean(np.square(system.residual))
     return np.asarray(covariance)

@@ -19,12 +19,12 @@ from escape_hw.calibration.acquire import (
 from escape_hw.calibration.checkpoint import Checkpoint
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
 from escape_hw.calibration.docrime_solution import DocrimeSolution
-from escape_hw.calibration.poke_patterns import Pattern, RandomPokes
+from escape_hw.calibration.poke_patterns import Pattern, RandomPokes, random_pattern
 from escape_hw.calibration.poke_session import PokeSession, Record
 from escape_hw.calibration.sensor_setup import (
     SETUP_FRAMES,
     modal_basis,
-    poke_amplitudes,
+    random_amplitudes,
 )
 from escape_hw.calibration.stopping import Judge, Looks, Target, no_accuracy
 from escape_hw.config.models import CalibrationSection
@@ -71,8 +71,9 @@ def docrime_run(
     c = bench.config.calibration
     n_frames = c.frames if frames is None else some_frames(frames)
     poke = c.poke if poke is None else poke
+    pattern = random_pattern(c.pokes) if pattern is RandomPokes else pattern
     m2c = modal_basis(bench)
-    amplitude = poke_amplitudes(bench, m2c, poke)
+    amplitude = random_amplitudes(bench, m2c, poke)
     require_frames(c, n_frames, m2c.shape[1], whiten)
     order, lags = c.whiten_order if whiten else 0, c.lags
 
@@ -98,7 +99,7 @@ def docrime_run(
         if partial:
             raise Aborted(f"aborted after {session.taken} frames, too few for a matrix") from None
         raise
-    method = pattern.method + ("-whitened" if whiten and pattern is RandomPokes else "")
+    method = pattern.method + ("-whitened" if whiten and issubclass(pattern, RandomPokes) else "")
     matrix = matrix_of(
         bench, session.grid, m2c, solution, method, poke=float(poke), shortened=session.shortened
     )

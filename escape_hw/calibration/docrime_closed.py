@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +26,11 @@ from escape_hw.calibration.docrime import (
 )
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
 from escape_hw.calibration.loop_run import CLOSING_S, LoopRecord, RunningLoop
-from escape_hw.calibration.poke_patterns import Pattern, RandomPokes
-from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepare_sensor
+from escape_hw.calibration.poke_patterns import Pattern, RandomPokes, random_pattern
+from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, random_amplitudes
 from escape_hw.calibration.stopping import Judge, Looks, Target
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
-
-T = TypeVar("T")
+from escape_hw.io.state_file import RunState
 
 #: Frames after which a running loop asks whether the estimate will do.
 _STRETCH = 500
@@ -65,14 +62,28 @@ class ClosedLoopPokes:
         self._bench, self._grid, self._looks, self._estimator = bench, grid, looks, estimator
         control = integrator_for(bench, matrix, grid)
         self._loop = RunningLoop(bench, matrix.m2c, extractor(bench, grid), control)
-        self._enough = False
-        #: Frames that the estimate lost because its sums were behind.
-        self.skipped = 0
+        self._enough = self._stopped = False
+        self._beside = BackgroundEstimator(estimator, patient=bench.simulated, look=self._look)
 
     @property
     def record(self) -> LoopRecord:
         """What the loop gathered."""
         return self._loop.record
+
+    @property
+    def skipped(self) -> int:
+        """Frames that the estimate lost because its sums were behind."""
+        return self._beside.skipped
+
+    @property
+    def grid(self) -> SensorGeometry:
+        """The geometry with the motion of the closed loop, which a model of the sensor has to match."""
+        return self._beside.motion.of(self._grid)
+
+    def restore(self, state: RunState) -> None:
+        """Go on from what a run that was broken off has kept."""
+        self._estimator.restore(state.values, state.arrays)
+        self._beside.motion.restore(state.arrays["motion"])
 
     def poke(self, frames: int, pokes: Pattern, stage: str) -> Procedure[bool]:
         """Close the loop, poke until the estimator has so many frames, open it; the mirror ends flat.
@@ -93,7 +104,7 @@ class ClosedLoopPokes:
         # One frame first: what the camera lost while nobody read it is not a loss of the loop.
         next_frame(bench)
         try:
-            with BackgroundEstimator(self._estimator, patient=bench.simulated, look=self._look) as beside:
+            with self._beside as beside:
                 try:
                     yield from loop.run(closing, report=Reporter("closing the loop", closing))
                     done, report = self._estimator.taken, Reporter(stage, frames)
@@ -103,20 +114,35 @@ class ClosedLoopPokes:
                         done += stretch
                         beside.catch_up()
                 except Aborted:
-                    partial = True
+                    # At once: the sums may have a while to go.
+                    bench.dm.flatten()
+                    partial = self._stopped = True
                 beside.finish()
-                self.skipped = beside.skipped
         finally:
             bench.dm.flatten()
         self._require_closed()
         if partial:
-            _drained(self._looks.look(self._estimator, self._grid, 0, {}, {}, always=True))
+            self._kept_and_judged(always=True)
         return partial
 
     def _look(self, estimator: DocrimeEstimator) -> None:
         """Keep the state and judge the estimate, as far as either is due; in the estimator's thread."""
-        if not self._enough and self._looks.due(estimator.taken):
-            self._enough = _drained(self._looks.look(estimator, self._grid, estimator.taken, {}, {}))
+        if not self._enough and not self._stopped and self._looks.due(estimator.taken):
+            self._enough = self._kept_and_judged()
+
+    def _kept_and_judged(self, *, always: bool = False) -> bool:
+        """Whether the estimate will do; its progress is nobody's. False if the run is stopped meanwhile."""
+        arrays = {"motion": self._beside.motion.state()}
+        taken = self._estimator.taken
+        procedure = self._looks.look(self._estimator, self.grid, taken, {}, arrays, always=always)
+        while True:
+            try:
+                next(procedure)
+            except StopIteration as done:
+                return bool(done.value)
+            if self._stopped:
+                procedure.close()
+                return False
 
     def _require_closed(self) -> None:
         record = self._loop.record
@@ -126,16 +152,6 @@ class ClosedLoopPokes:
                 "their limits. Lower loop.gain or raise loop.dropped_modes; if that does not help, the "
                 "matrix does not belong to this state of the bench, or the delay is longer than thought"
             )
-
-
-def _drained(procedure: Generator[Any, None, T]) -> T:
-    """What a procedure returns; its progress is nobody's."""
-    while True:
-        try:
-            next(procedure)
-        except StopIteration as done:
-            value: T = done.value
-            return value
 
 
 def docrime_closed_run(
@@ -153,21 +169,22 @@ def docrime_closed_run(
     c, m2c, grid = bench.config.calibration, closing.matrix.m2c, closing.grid
     n_frames = c.frames if frames is None else some_frames(frames)
     poke = c.poke if poke is None else poke
+    pattern = random_pattern(c.pokes) if pattern is RandomPokes else pattern
     if c.whiten_order == 0:
         raise ConfigError("calibration.whiten_order is 0; in closed loop the turbulence must be whitened")
-    amplitude = poke_amplitudes(bench, m2c, poke)
+    amplitude = random_amplitudes(bench, m2c, poke)
     require_frames(c, n_frames, m2c.shape[1])
     estimator = DocrimeEstimator(
         grid.n_slopes, m2c.shape[1], order=c.whiten_order, lags=c.lags, closed=True,
         correlations=correlations and grid.n_slopes <= MOST_CORRELATED,
     )  # fmt: skip
-    prepare_sensor(bench)
-    loop = ClosedLoopPokes(bench, closing.matrix, grid, estimator, Looks(keep, judge))
     method = _method(pattern)
     settings = {"poke": poke, "correlations": correlations, "closed with": fingerprint(closing.matrix.data)}
     state = None if keep is None else keep.begin(bench, method, m2c, settings)
+    prepare_sensor(bench)
+    loop = ClosedLoopPokes(bench, closing.matrix, grid, estimator, Looks(keep, judge))
     if state is not None:
-        estimator.restore(state.values, state.arrays)
+        loop.restore(state)
     stage = f"{pattern.title} in closed loop"
     partial = yield from loop.poke(n_frames, pattern(amplitude, bench.rng), stage)
     try:
@@ -184,7 +201,7 @@ def docrime_closed_run(
     )  # fmt: skip
     seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
     result = CalibrationResult(
-        matrix, grid, solution.frames, solution.lost_frames, seconds, solution.response,
+        matrix, loop.grid, solution.frames, solution.lost_frames, seconds, solution.response,
         partial=partial, notes=(*notes_on(solution, matrix), *_loop_notes(loop, residual)),
     )  # fmt: skip
     return DocrimeRun(result, solution)
@@ -218,7 +235,7 @@ def docrime_closed_loop(
     Returns
     -------
     CalibrationResult
-        On the grid of ``closing``. Stopped early, ``partial`` is true.
+        On the grid of ``closing``, with the motion that the loop left. Stopped early, ``partial`` is true.
 
     Raises
     ------

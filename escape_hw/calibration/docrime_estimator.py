@@ -63,6 +63,7 @@ class DocrimeEstimator:
         self._recorder = Recorder(n_slopes, n_modes, BURN_IN, closed=closed)
         self._shapes = (n_slopes,), (n_modes,)
         self._driven = np.zeros(2 * n_modes)
+        self._blind = 0
         self._next: int | None = None
         self._whitener: NDArray[np.float64] | None = None
         self._response: TemporalResponse | None = None
@@ -108,7 +109,7 @@ class DocrimeEstimator:
                 raise ValueError(f"in closed loop a poke ({self.n_modes},) stands beside the command")
             driven = self._driven
             driven[: self.n_modes], driven[self.n_modes :] = command, poke
-        if index != self._next:
+        if index != self._next or self._blind:
             return self.extend(np.array([index]), slopes[None], driven[None])
         room = self._recorder.take_one(slopes, driven)
         if room < 0:
@@ -153,16 +154,23 @@ class DocrimeEstimator:
             self._lose(int(steps[start]) - 1)
             done = start
             while done < end:
-                done += self._recorder.take(slopes[done:end], driven[done:end])
+                took = self._recorder.take(slopes[done:end], driven[done:end])
+                self._blind -= self._recorder.blind(took, self._blind)
+                done += took
                 if self._recorder.full:
                     self._absorb()
         self._next = int(index[-1]) + 1
         return self
 
     def break_off(self) -> None:
-        """The run pauses, the mirror goes flat, and the next frame may have any index."""
+        """The run pauses, the mirror goes flat, and the next frame may have any index.
+
+        A loop is closed again before the first of its frames comes here, and what the mirror did until
+        then is not known: in closed loop the first frames only tell their commands.
+        """
         if self._next is None:
             return
+        self._blind = self.lags if self.closed else 0
         for _ in range(self._memory() + self.order + self.lags):
             self._recorder.lose_one(flat=True)
             if self._recorder.full:
@@ -220,7 +228,10 @@ class DocrimeEstimator:
         if self.frames or self._recorder.filled:
             raise ValueError("an estimator that has taken frames cannot be restored")
         if "rows" in arrays:
-            self._replay(arrays["rows"], arrays["present"])
+            # Frames from before there was a filter, by their places on the time line.
+            at = np.flatnonzero(arrays["present"])
+            self.extend(at, arrays["rows"][at, : self.n_slopes], arrays["rows"][at, self.n_slopes :])
+            self.break_off()
             return
         self.frames, self.lost_frames = int(values["frames"]), int(values["lost_frames"])
         self._whitener, self._spread = arrays["whitener"], float(values["spread"])
@@ -244,17 +255,10 @@ class DocrimeEstimator:
         self._next = 0
         self.break_off()
 
-    def _replay(self, rows: NDArray[np.float32], present: NDArray[np.bool_]) -> None:
-        """Take kept frames again, by their places on the time line."""
-        at = np.flatnonzero(present)
-        if at.size:
-            self.extend(at, rows[at, : self.n_slopes], rows[at, self.n_slopes :])
-        self.break_off()
-
     @property
     def taken(self) -> int:
-        """Frames taken, those that are not in the sums yet included."""
-        return self.frames + self._recorder.fresh
+        """Frames taken, also those not in the sums yet; less those whose slopes will not be taken."""
+        return self.frames + self._recorder.fresh - self._blind
 
     @property
     def settled(self) -> bool:

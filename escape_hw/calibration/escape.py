@@ -18,6 +18,7 @@ from escape_hw.calibration.docrime_solution import DocrimeSolution
 from escape_hw.calibration.escape_few import escape_from_few
 from escape_hw.calibration.pseudo_synthetic import synthesise
 from escape_hw.calibration.sensor_setup import modal_basis
+from escape_hw.calibration.solvers import BY_MODES
 from escape_hw.calibration.sprint import sprint_steps
 from escape_hw.calibration.stopping import Target
 from escape_hw.calibration.telemetry_sprint import independent_columns
@@ -75,7 +76,13 @@ def escape(
     estimator = c.estimator if estimator is None else estimator
     if estimator not in ESTIMATORS:
         raise ConfigError(f"estimator '{estimator}' is unknown; it is one of {', '.join(ESTIMATORS)}")
-    from_matrix = estimator == "matrix" or not whiten
+    by_modes = c.solver in BY_MODES
+    if by_modes and estimator == "telemetry":
+        raise ConfigError(
+            f"calibration.solver = '{c.solver}' fits modes, and telemetry has none; "
+            "choose estimator = 'matrix' or another solver"
+        )
+    from_matrix = estimator == "matrix" or not whiten or by_modes
     n_frames = c.frames if frames is None else frames
     if closing is None and not from_matrix and n_frames < least_frames(c, bench.config.basis.n_modes):
         return (yield from escape_from_few(bench, frames=n_frames, poke=poke, grid=grid))
@@ -113,7 +120,7 @@ def escape(
         matrix=replace(made.matrix, metrics=metrics),
         registration=_with_gain_error(estimate, solution.gain_sigma),
         measured=measured.matrix,
-        notes=(*measured.notes, *estimate.warnings),
+        notes=(*measured.notes, *estimate.warnings, *estimate.notes),
     )
 
 
@@ -136,8 +143,12 @@ def _fit(
             matrix,
             bench.model(grid),
             modes=modes,
+            choice=c.modes_choice,
+            solver=c.solver,
+            loss=c.loss,
             learning_rate=c.learning_rate,
             covariance=solution.covariance,
+            learn=True,
         )
     )
 

@@ -11,15 +11,15 @@ from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix, some_frames
-from escape_hw.calibration.poke_patterns import RandomPokes
+from escape_hw.calibration.poke_patterns import random_pattern
 from escape_hw.calibration.poke_session import PokeSession
 from escape_hw.calibration.pseudo_synthetic import synthesise
-from escape_hw.calibration.sensor_setup import SETUP_FRAMES, modal_basis, poke_amplitudes
+from escape_hw.calibration.sensor_setup import SETUP_FRAMES, modal_basis, random_amplitudes
 from escape_hw.calibration.telemetry_sprint import MIN_ROWS, telemetry_sprint, time_line
 from escape_hw.errors import Aborted, TooFewFrames
 
-#: Frames per past frame of the whitening filter: with few frames, each past one costs a good share of them.
-_FRAMES_PER_ORDER = 16
+#: Frames per past frame of the whitening filter, so that there are enough to find it on.
+_FRAMES_PER_ORDER = 3
 
 
 def escape_from_few(
@@ -54,15 +54,14 @@ def escape_from_few(
     """
     c = bench.config.calibration
     order = min(c.whiten_order, max(1, some_frames(frames) // _FRAMES_PER_ORDER))
-    if frames < MIN_ROWS + order:
-        raise TooFewFrames(
-            f"{frames} frames are too few for a registration; ask for at least {MIN_ROWS + order} frames"
-        )
+    least = MIN_ROWS + min(order, 1)
+    if frames < least:
+        raise TooFewFrames(f"{frames} frames are too few for a registration; ask for at least {least} frames")
     poke = c.poke if poke is None else poke
     m2c = modal_basis(bench)
-    amplitude = poke_amplitudes(bench, m2c, poke)
+    amplitude = random_amplitudes(bench, m2c, poke)
     session = PokeSession(bench, m2c, grid, min(SETUP_FRAMES, frames), None, keep=True)
-    if (yield from session.poke(frames, RandomPokes(amplitude, bench.rng))):
+    if (yield from session.poke(frames, random_pattern(c.pokes)(amplitude, bench.rng))):
         raise Aborted(f"aborted after {session.taken} of {frames} frames, too few for a registration")
     session.ready()
     record = session.record()
@@ -75,7 +74,7 @@ def escape_from_few(
     frame = measured_matrix(bench, found, m2c, np.zeros(shape), np.zeros(shape), "telemetry")
     fit = yield from telemetry_sprint(
         time_line(*record, before=2 * c.whiten_order + c.lags), frame, bench.model(found),
-        order=order, lags=c.lags, learning_rate=c.learning_rate,
+        order=order, lags=c.lags, learning_rate=c.learning_rate, solver=c.solver, loss=c.loss,
     )  # fmt: skip
     lost = int(record[0][-1] - record[0][0]) + 1 - record[0].size
     made = synthesise(bench, found, fit.estimate, m2c)
@@ -94,6 +93,7 @@ def escape_from_few(
         mean_frame=session.mean_frame,
         notes=(
             *fit.estimate.warnings,
+            *fit.estimate.notes,
             "too few frames for a measured matrix: the registration comes straight from the telemetry",
             *session.notes(),
         ),

@@ -31,6 +31,8 @@ _CLOSED = 0.9
 _MOST = 14
 #: Standard errors by which the optical gain must differ from none.
 _CLEARLY = 5.0
+#: Share of the modes that may answer with the opposite sign, by so many standard errors.
+_WRONG, _SURELY = 0.15, 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,8 +92,9 @@ def close_first(
             f"the loop cannot be closed: the sensor answers the pokes with {answer[0]:.2g} of what the "
             "matrix says; a sign is wrong (of the matrix, or of the mirror), or the pupil is flipped"
         )
-    beyond = opened.residual_nm / answer[0]
-    search = _Search(wanted, beyond)
+    if opened.gains is not None:
+        _require_agreement(opened.gains)
+    search = _Search(wanted, opened.residual_nm / answer[0])
     gain = _CAREFUL * wanted / answer[0]
     for _ in range(_MOST):
         loop.control.set_gain(gain)
@@ -105,6 +108,23 @@ def close_first(
             loop.open_again()
         gain = search.following(gain)
     return search.found(loop, steps)
+
+
+def _require_agreement(gains: MeasuredGains) -> None:
+    """Raise :class:`CalibrationError` unless most modes answer alike.
+
+    Optical gains differ by some ten percent between modes. A matrix that belongs to another state of the
+    bench has no such answer: its modes' gains are what chance makes of them, of either sign.
+    """
+    value, sigma = gains.value[0], gains.sigma[0]
+    wrong = int(np.count_nonzero(value < -_SURELY * sigma))
+    scatter = math.sqrt(max(float(np.var(value) - np.mean(sigma**2)), 0.0))
+    if wrong > _WRONG * value.size or scatter > float(np.mean(value)):
+        raise CalibrationError(
+            f"the loop cannot be closed: {wrong} of {value.size} modes answer with the opposite sign, and "
+            f"the modes' gains scatter by {scatter:.2g} about {np.mean(value):.2g}. The matrix belongs to "
+            "another state of the bench (registration, flip or rotation of the pupil); measure it again"
+        )
 
 
 def _look(

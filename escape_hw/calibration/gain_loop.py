@@ -21,7 +21,7 @@ from escape_hw.calibration.optical_gain import scaled_matrix, slope_weights
 from escape_hw.calibration.poke_patterns import RandomPokes
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor
 from escape_hw.calibration.stopping import GROWTH
-from escape_hw.errors import CalibrationError, TooFewFrames
+from escape_hw.errors import CalibrationError, IncompatibleProduct, TooFewFrames
 from escape_hw.pipeline.integrator import LeakyIntegrator
 from escape_hw.pipeline.reconstructor import reconstructor
 
@@ -74,6 +74,8 @@ class GainLoop:
         science: bool = False,
     ) -> None:
         self.bench, self.reference = bench, calibration.matrix
+        for name, matrix in beside.items():
+            _require_like(self.reference, name, matrix)
         self._references = [self.reference, *beside.values()]
         self._weights = slope_weights(calibration.measured or self.reference)
         self.control: LeakyIntegrator = integrator_for(bench, self.reference, calibration.grid)
@@ -168,6 +170,17 @@ class GainLoop:
     def _new_meter(self) -> GainMeter:
         c = self.bench.config.calibration
         return GainMeter(self._references, self._weights, order=c.whiten_order, lags=c.lags)
+
+
+def _require_like(reference: InteractionMatrix, name: str, matrix: InteractionMatrix) -> None:
+    """Raise :class:`IncompatibleProduct` unless a matrix has the reference's slopes and modes."""
+    if not np.array_equal(matrix.valid, reference.valid):
+        raise IncompatibleProduct(
+            f"{name} was measured on other sub-apertures than the matrix that closes the loop, so its gains "
+            "cannot be told; measure it on the same geometry (grid= of the calibration)"
+        )
+    if matrix.m2c.shape != reference.m2c.shape or not np.allclose(matrix.m2c, reference.m2c):
+        raise IncompatibleProduct(f"{name} is of other modes than the matrix that closes the loop")
 
 
 def _solved(meter: GainMeter) -> tuple[MeasuredGains | None, str]:

@@ -85,10 +85,20 @@ class LightProblem:
         The synthetic model.
     learning_rate
         Share of each step that is taken, in (0, 1] (paper: gamma).
+    frozen
+        Whether the derivatives stay those of the start, as in the first publications: an iteration then
+        costs a matrix instead of a matrix and its derivatives, and there are more of them.
     """
 
-    def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, learning_rate: float = 1.0) -> None:
+    def __init__(
+        self,
+        weighted: WeightedMatrix,
+        model: SyntheticModel,
+        learning_rate: float = 1.0,
+        frozen: bool = False,
+    ) -> None:
         self.weighted, self._model, self._rate = weighted, model, learning_rate
+        self._renewed = np.inf if frozen else _FROZEN
         self._modes = weighted.modes
 
     def matrix(self, alpha: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -112,7 +122,7 @@ class LightProblem:
         fit, damping = self.linearise(start, np.zeros(5)), 0.0
         yield fit
         for _ in range(iterations):
-            step = self._step(fit, damping)
+            step = self.step(fit, damping)
             if step is None or (fit.settled and damping == 0):
                 break
             longest = float(np.max(np.abs(step) / LARGEST))
@@ -120,7 +130,7 @@ class LightProblem:
             trial = self._fit(fit.alpha + step, self.matrix(fit.alpha + step), fit.derivatives, step)
             if trial.cost < fit.cost:
                 damping = damping / 10 if damping > 1e-6 else 0.0
-                fit = trial if longest < _FROZEN else self.linearise(trial.alpha, step)
+                fit = trial if longest < self._renewed else self.linearise(trial.alpha, step)
                 yield fit
                 continue
             damping = max(10 * damping, _DAMPED)
@@ -128,7 +138,7 @@ class LightProblem:
                 break
         return fit
 
-    def _step(self, fit: LightFit, damping: float) -> NDArray[np.float64] | None:
+    def step(self, fit: LightFit, damping: float) -> NDArray[np.float64] | None:
         """Damped Gauss-Newton step of the registration; also tells the fit whether it has settled."""
         information = fit.information()
         right = fit.efficient().reshape(6, -1) @ fit.residual.ravel()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,20 @@ _PEDESTAL = 1.7
 GAIN, WIDTH, SHAPE = 0, 6, 7
 
 
+#: Random effects of which there are many of a kind, in the order of the unknowns ...
+_EFFECTS = ("sampling", "actuator_gain", "actuator_width", "slope_gain")
+#: ... and the share of its usual scatter below which none is taken to fall.
+_LEAST_SCATTER = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """Scatter of the random effects as the data have it, and how many unknowns the data decided."""
+
+    priors: Priors
+    decided: float
+
+
 @dataclass(slots=True, eq=False)
 class State:
     """Present values: common parameters and random effects."""
@@ -33,19 +48,50 @@ class State:
     actuator_width: NDArray[np.float64]
     slope_gain: NDArray[np.float64]
 
-    def offset(self) -> NDArray[np.float64]:
+    def offset(self, mean_width: float = 0.0) -> NDArray[np.float64]:
         """Distance from the priors' means, in the order of the unknowns."""
-        head = np.concatenate([[0.0], np.zeros(5), [self.width, self.shape]])
+        head = np.concatenate([[0.0], np.zeros(5), [self.width - mean_width, self.shape]])
         return np.concatenate(
             [head, self.variant, self.sampling, self.actuator_gain, self.actuator_width, self.slope_gain]
         )
 
 
-class Problem:
-    """One matrix, one model, and the weights between them."""
+@dataclass(slots=True, eq=False)
+class _Shapes:
+    """Zonal matrices at a state, in standard errors: derivatives, variants, and the whole."""
 
-    def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, priors: Priors) -> None:
-        self.weighted = weighted
+    moved: NDArray[np.float64]
+    by_width: NDArray[np.float64]
+    by_shape: NDArray[np.float64]
+    variants: list[NDArray[np.float64]]
+    shaped: NDArray[np.float64]
+
+
+class Problem:
+    """One matrix, one model, and the weights between them.
+
+    Parameters
+    ----------
+    weighted
+        The measured matrix.
+    model
+        The synthetic model.
+    priors
+        Scatter of what it does not know.
+    bends
+        What commands may be multiplied with by one standard deviation ``(n_act, n_act)`` each, such as
+        optical gains that differ between modes; fitted beside the model's own variants.
+    """
+
+    def __init__(
+        self,
+        weighted: WeightedMatrix,
+        model: SyntheticModel,
+        priors: Priors,
+        bends: Sequence[NDArray[np.float64]] = (),
+    ) -> None:
+        self.weighted, self.bends, self.priors = weighted, tuple(bends), priors
+        self.mean_width = priors.mean_width
         self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
         rows, cols = np.nonzero(weighted.valid)
@@ -56,7 +102,7 @@ class Problem:
             [
                 np.zeros(6),
                 [priors.width**-2, priors.shape**-2],
-                np.ones(len(self.variants)),
+                np.ones(self.n_variants),
                 np.full(self.n_lines, priors.sampling**-2),
                 np.full(model.n_act, priors.actuator_gain**-2),
                 np.full(model.n_act, priors.actuator_width**-2),
@@ -73,26 +119,56 @@ class Problem:
         return State(
             gain,
             registration.to_array(),
+            self.mean_width,
             0.0,
-            0.0,
-            np.zeros(len(self.variants)),
+            np.zeros(self.n_variants),
             np.zeros(self.n_lines),
             zeros,
             zeros.copy(),
             np.zeros(n_slopes),
         )
 
-    def linearise(self, state: State) -> NormalEquations:
-        """Model and derivatives about a state."""
+    @property
+    def n_variants(self) -> int:
+        """Shares of variants and bends among the unknowns."""
+        return len(self.variants) + len(self.bends)
+
+    def _shapes(self, state: State) -> _Shapes:
+        """The zonal matrix of a state and what it is made of, weighted."""
         here, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
         zonal, moved = (weigh(part) for part in zonal_jacobian(self.model, here, w))
         by_width = moved[5] * w
         by_shape = weigh(self.model.zonal_matrix(here, w * _PEDESTAL)) - zonal
         variants = [weigh(v.zonal_matrix(here, w)) - zonal for v in self.variants]
-        rows, acting = (1 + state.slope_gain)[:, None], 1 + state.actuator_gain
+        variants += [zonal @ bend for bend in self.bends]
         shaped = zonal + state.shape * by_shape + state.actuator_width * by_width
         for share, difference in zip(state.variant, variants, strict=True):
             shaped = shaped + share * difference
+        return _Shapes(moved, by_width, by_shape, variants, shaped)
+
+    def matrix(self, state: State, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Slopes per unit of any modes ``(n_slopes, n)`` at a state, random effects included.
+
+        Parameters
+        ----------
+        state
+            Where.
+        m2c
+            Modes ``(n_act, n)``.
+        """
+        zonal = self._shapes(state)
+        acted = (1 + state.actuator_gain)[:, None] * m2c
+        half = len(zonal.shaped) // 2
+        sampled = np.concatenate([zonal.moved[0, :half], zonal.moved[1, half:]])
+        whole = zonal.shaped + state.sampling[self.lines, None] * sampled
+        scale = state.gain * (1 + state.slope_gain) * self.weighted.by_slope
+        return np.asarray(scale[:, None] * (whole @ acted))
+
+    def linearise(self, state: State) -> NormalEquations:
+        """Model and derivatives about a state."""
+        z = self._shapes(state)
+        moved, by_width, by_shape, variants, shaped = z.moved, z.by_width, z.by_shape, z.variants, z.shaped
+        rows, acting = (1 + state.slope_gain)[:, None], 1 + state.actuator_gain
         acted = acting[:, None] * self.modes
 
         def modal(z: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -112,15 +188,51 @@ class Problem:
             state.gain * (shaped @ acted),
             self.weighted.data - model,
             self.precision,
-            state.offset(),
+            state.offset(self.mean_width),
             sampled,
             self.lines,
         )
 
+    def zonal(self, state: State) -> NDArray[np.float64]:
+        """Slopes per unit command ``(n_slopes, n_act)`` at a state, random effects included."""
+        here, w = Registration.from_array(state.alpha), 1.0 + state.width
+        zonal, moved = zonal_jacobian(self.model, here, w)
+        shaped = zonal + state.actuator_width * moved[5] * w
+        shaped += state.shape * (self.model.zonal_matrix(here, w * _PEDESTAL) - zonal)
+        for share, variant in zip(state.variant, self.variants, strict=True):
+            shaped += share * (variant.zonal_matrix(here, w) - zonal)
+        half = len(zonal) // 2
+        shaped += state.sampling[self.lines, None] * np.concatenate([moved[0, :half], moved[1, half:]])
+        return np.asarray(state.gain * (1 + state.slope_gain)[:, None] * shaped * (1 + state.actuator_gain))
+
+    def learned(self, state: State, system: NormalEquations) -> Learned:
+        """What a solution says about the scatter of the random effects.
+
+        One step of expectation and maximisation (Dempster, Laird & Rubin 1977): the scatter that makes an
+        effect's values most likely is that of their estimates and of what is left uncertain of them. Where
+        the data say nothing, that is the prior; an effect that is not there fades from step to step.
+
+        Parameters
+        ----------
+        state, system
+            Solution, and the problem about it.
+        """
+        variance = system.posterior_variance()
+        head = SHAPE + 1 + self.n_variants
+        counts = (self.n_lines, self.model.n_act, self.model.n_act, self.weighted.data.shape[0])
+        parts = np.split(variance[head:], np.cumsum(counts)[:-1])
+        scatter, usual = {}, Priors()
+        for name, part in zip(_EFFECTS, parts, strict=True):
+            least = _LEAST_SCATTER * getattr(usual, name)
+            found = float(np.mean(np.square(getattr(state, name)) + part))
+            scatter[name] = max(float(np.sqrt(found)), least)
+        decided = float(np.sum(1 - variance * self.precision))
+        return Learned(replace(self.priors, **scatter), decided)
+
     def move(self, state: State, step: NDArray[np.floating]) -> State:
         """The state after a step, in the order of the unknowns."""
         n_act = self.model.n_act
-        v, n = len(self.variants), len(self.variants) + self.n_lines
+        v, n = self.n_variants, self.n_variants + self.n_lines
         variant, sampling, gains, widths, slopes = np.split(step[8:], [v, n, n + n_act, n + 2 * n_act])
         return State(
             state.gain + step[GAIN],

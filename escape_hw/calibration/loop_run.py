@@ -190,8 +190,7 @@ class RunningLoop:
         if not whole:
             sent = dm.send(shape)
             return sent, None if sent.guard.untouched else sent.guard.clipped
-        allowed = reachable(dm, shape)
-        sent = dm.send(allowed)
-        if sent.guard.untouched and np.array_equal(allowed, shape):
-            return sent, None
+        if dm.obeys(shape):
+            return dm.send(shape), None
+        sent = dm.send(reachable(dm, shape))
         return sent, int(np.count_nonzero(np.abs(shape) > dm.limits.max_stroke))

@@ -29,6 +29,8 @@ class Priors:
         x slopes of a column and to the y slopes of a row, which fall on the pixels alike.
     width, shape
         Common width of the influence functions, and the share of a broad pedestal in them.
+    mean_width
+        Width to expect beyond nominal: zero, unless an earlier fit has told it.
     """
 
     actuator_gain: float = 0.1
@@ -37,6 +39,7 @@ class Priors:
     width: float = 0.2
     shape: float = 0.2
     sampling: float = 0.5
+    mean_width: float = 0.0
 
 
 @dataclass(slots=True, eq=False)
@@ -98,6 +101,30 @@ class NormalEquations:
         """Information on the common parameters ``(n_common, n_common)``, random effects integrated out."""
         k, whole = self.n_common, self.whole
         return np.asarray(whole[:k, :k] - whole[:k, k:] @ np.linalg.solve(whole[k:, k:], whole[k:, :k]))
+
+    def noise(self, precision: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Covariance that the data's noise alone gives the common parameters ``(n_common, n_common)``.
+
+        The inverse of :meth:`information` holds besides what the priors leave open, which is the same
+        in every repetition.
+
+        Parameters
+        ----------
+        precision
+            Prior precision of every unknown, as handed to :func:`normal_equations`.
+        """
+        k, n = self.n_common, len(self.inner)
+        answers = np.linalg.inv(self.whole)[:, :k]
+        by_slope = self.across @ answers / self.diagonal[:, None]
+        believed = answers.T @ (precision[:n, None] * answers) + by_slope.T @ (precision[n:, None] * by_slope)
+        return np.asarray(answers[:k] - believed)
+
+    def posterior_variance(self) -> NDArray[np.float64]:
+        """Variance of every unknown given the data and the priors ``(n,)``, in the order of the unknowns."""
+        inverse = np.linalg.inv(self.whole)
+        coupled = self.across / self.diagonal[:, None]
+        of_slopes = 1 / self.diagonal + np.einsum("sp,sp->s", coupled @ inverse, coupled)
+        return np.concatenate([np.diag(inverse), of_slopes])
 
     def efficient(self) -> NDArray[np.float64]:
         """Derivatives by the common parameters, less what the random effects can imitate.

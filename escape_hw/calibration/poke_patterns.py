@@ -7,6 +7,12 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.config.models import Pokes
+
+#: How strongly shaped pokes alternate in sign. More gains little (:func:`~.pokes.information_gain`) and asks
+#: the mirror for ever larger steps.
+ALTERNATING = 0.6
+
 
 class Pattern(Protocol):
     """Makes pokes from the amplitude of each mode ``(n_modes,)`` and a random generator.
@@ -47,6 +53,31 @@ class RandomPokes:
     def __call__(self) -> NDArray[np.float64]:
         """Poke of the next frame ``(n_modes,)``."""
         return self._amplitude * self._rng.uniform(-1.0, 1.0, self._amplitude.size)
+
+
+class AlternatingPokes(RandomPokes):
+    """As :class:`RandomPokes`, with signs that change more often than not: where turbulence is weak.
+
+    Each poke is correlated with the one before by minus :data:`ALTERNATING`, a first-order
+    autoregression of the same rms; the modes stay independent of each other and of the turbulence.
+    """
+
+    def __init__(self, amplitude: NDArray[np.float64], rng: np.random.Generator) -> None:
+        super().__init__(amplitude, rng)
+        self._last: NDArray[np.float64] | None = None
+
+    def __call__(self) -> NDArray[np.float64]:
+        """Poke of the next frame ``(n_modes,)``."""
+        fresh = super().__call__()
+        if self._last is not None:
+            fresh = np.sqrt(1 - ALTERNATING**2) * fresh - ALTERNATING * self._last
+        self._last = fresh
+        return fresh
+
+
+def random_pattern(kind: Pokes) -> type[Pattern]:
+    """The random pokes that the configuration asks for (``calibration.pokes``)."""
+    return AlternatingPokes if kind == "shaped" else RandomPokes
 
 
 class PushPullPokes:

@@ -122,6 +122,8 @@ class PokeSession:
         """Keep the state and judge the estimate, as far as either is due."""
         if self.looks is None or self.estimator is None or self.grid is None or self.motion is None:
             return False
+        # A model of the sensor has to match how far its spots moved.
+        grid = self.motion.of(self.grid)
         parts = {str(part): count for part, (_, count) in self.looked.items()}
         values = {"taken": self.taken, "fed": self.fed, "shortened": self.shortened, "looked": parts}
         arrays: dict[str, NDArray[Any]] = {"motion": self.motion.state()}
@@ -130,7 +132,7 @@ class PokeSession:
         if self.focus is not None:
             arrays["focus"] = self.focus.state()
         arrays |= {f"looked.{part}": total for part, (total, _) in self.looked.items()}
-        return (yield from self.looks.look(self.estimator, self.grid, self.fed, values, arrays, always=last))
+        return (yield from self.looks.look(self.estimator, grid, self.fed, values, arrays, always=last))
 
     def restore(self, state: RunState) -> None:
         """Go on from what a run that was broken off has kept."""

@@ -228,7 +228,8 @@ def _regress(
     z = x if instrument is predicted else np.stack([shifted(instrument, at, lag) for lag in range(lags)])
     flat = z.reshape(lags, -1)
     normal = (flat @ x.reshape(lags, -1).T).astype(np.float64)
-    weights = np.asarray(np.linalg.solve(normal, (flat @ y.ravel()).astype(np.float64)), np.float64)
+    right = (flat @ y.ravel()).astype(np.float64)
+    weights = np.asarray(np.linalg.solve(normal, right), np.float64)
     error = y - np.tensordot(weights.astype(np.float32), x, axes=1)
     # One score per frame: neighbouring slopes err together, frames (whitened) do not.
     scores = np.einsum("lts,ts->lt", z, error).astype(np.float64)

@@ -9,10 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import some_frames
+from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.mode_shapes import fourier, zernike
 from escape_hw.calibration.modes import karhunen_loeve, unit_rms, zonal
+from escape_hw.calibration.pokes import equal_snr
 from escape_hw.calibration.sensor_kinds import kind_of
 from escape_hw.errors import CalibrationError, ConfigError
 
@@ -20,6 +24,8 @@ from escape_hw.errors import CalibrationError, ConfigError
 SETUP_FRAMES = 200
 #: Outer scale of the turbulence assumed for the modal basis, in pupil diameters.
 _OUTER_SCALE = 4.0
+#: Bases that need nothing but the influence functions.
+_OF_SURFACES = {"zonal": zonal, "zernike": zernike, "fourier": fourier}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,8 +211,8 @@ def modal_basis(bench: Bench) -> NDArray[np.float64]:
         raise ConfigError(f"the model has {surfaces.shape[0]} actuators, the mirror {bench.dm.info.n_act}")
     works = np.ones(surfaces.shape[0], dtype=bool)
     works[list(bench.dm.limits.disabled)] = False
-    if basis.kind == "zonal":
-        return _spread_over(works, zonal(surfaces[works], pupil, basis.n_modes))
+    if basis.kind in _OF_SURFACES:
+        return _spread_over(works, _OF_SURFACES[basis.kind](surfaces[works], pupil, basis.n_modes))
     if basis.kind == "file":
         # Imported here: astropy takes a second to load, and only this needs it.
         from escape_hw.io.fits import load_matrix
@@ -246,4 +252,21 @@ def poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDAr
     """
     if not 0 < poke <= 1:
         raise ConfigError(f"poke is {poke}; it must lie in (0, 1], rms surface as fraction of full stroke")
-    return np.asarray(np.minimum(poke, bench.config.calibration.poke_command / np.abs(m2c).max(axis=0)))
+    return np.asarray(np.minimum(poke, _most(bench, m2c)))
+
+
+def random_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDArray[np.float64]:
+    """As :func:`poke_amplitudes`, for random pokes on all modes at once.
+
+    With ``calibration.pokes = "equal-snr"`` the modes share the same Strehl budget by what is seen of
+    them (:func:`~.pokes.equal_snr`).
+    """
+    usual = poke_amplitudes(bench, m2c, poke)
+    if bench.config.calibration.pokes != "equal-snr":
+        return usual
+    return equal_snr(modal_matrix(bench.model(), Registration(), m2c), _most(bench, m2c), poke)
+
+
+def _most(bench: Bench, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Amplitude of each mode at which an actuator takes ``calibration.poke_command``."""
+    return np.asarray(bench.config.calibration.poke_command / np.abs(m2c).max(axis=0))

@@ -133,6 +133,19 @@ class Recorder:
         self.filled = k = k + 1
         return len(self._slots) - k
 
+    def blind(self, took: int, frames: int) -> int:
+        """Count the slopes of the first of the ``took`` frames put in last as lost, up to ``frames`` of them.
+
+        Returns
+        -------
+        int
+            How many were.
+        """
+        n, first = min(took, frames), self.filled - took
+        self._rows[first : first + n, : self.n_slopes] = 0
+        self._present[first : first + n] = False
+        return n
+
     def lose_one(self, *, flat: bool = False) -> None:
         """Put in a lost frame, for which there must be room.
 

@@ -20,18 +20,23 @@ from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
-from escape_hw.calibration.derivatives import modal_matrix
 from escape_hw.calibration.docrime import MOST_CORRELATED
-from escape_hw.calibration.response import Filtered, filtered
-from escape_hw.calibration.sprint import sprint_steps
+from escape_hw.calibration.fading_sums import LEAST, turned
+from escape_hw.calibration.misfit import Priors
+from escape_hw.calibration.sprint import fit_steps
 from escape_hw.calibration.telemetry import Telemetry
-from escape_hw.calibration.whitening import apply_filter, prediction_error_filter
+from escape_hw.calibration.whitening import (
+    apply_filter,
+    filter_by_past,
+    filters_by_past,
+    known_past,
+    prediction_error_filter,
+)
+from escape_hw.config.models import Loss, Solver
 from escape_hw.errors import TooFewFrames
 
-#: Rounds of response, whitener and registration; the third changes nothing that matters.
-_ROUNDS = 3
-#: Directions that the pokes took less than this share of the strongest tell nothing.
-_LEAST = 1e-9
+#: Rounds of registration, response, whitener and scatter; a fifth changes nothing that matters.
+_ROUNDS = 4
 #: Whitened frames without which no noise level is worth stating.
 MIN_ROWS = 12
 #: Whitened frames at which the measured correlation of the slopes' noise counts half.
@@ -49,7 +54,7 @@ class TelemetryFit:
     response
         The temporal response, its weights scaled to sum 1.
     whitener
-        The filter over time.
+        The filter over time, for frames with a full past.
     covariance
         Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``, shrunk towards its diagonal;
         ``None`` with more than :data:`~escape_hw.calibration.docrime.MOST_CORRELATED` slopes.
@@ -83,16 +88,7 @@ def independent_columns(
     InteractionMatrix
         ``(n_slopes, rank)``, with the modes turned alike; its modes have no unit rms any more.
     """
-    power, directions = np.linalg.eigh(gram)
-    taken = power > _LEAST * power.max()
-    turn = directions[:, taken] * np.sqrt(power[taken])
-    sigma = np.repeat(np.sqrt(variance)[:, None], turn.shape[1], axis=1)
-    return replace(
-        matrix,
-        data=(matrix.data @ turn).astype(np.float32),
-        sigma=sigma.astype(np.float32),
-        m2c=matrix.m2c @ turn,
-    )
+    return turned(matrix, matrix.data @ gram, gram, gram, variance)
 
 
 def time_line(
@@ -129,6 +125,8 @@ def telemetry_sprint(
     lags: int,
     start: Registration | None = None,
     learning_rate: float = 1.0,
+    solver: Solver = "effects",
+    loss: Loss = "squares",
 ) -> Procedure[TelemetryFit]:
     """Registration, gain and temporal response from a stretch of telemetry.
 
@@ -141,13 +139,14 @@ def telemetry_sprint(
     model
         The synthetic model on the same sub-apertures.
     order
-        Past frames that predict the turbulence; 0: nothing is predicted.
+        Past frames that predict the turbulence, for frames that have so many before them; 0: nothing is
+        predicted.
     lags
         Frames over which the temporal response is estimated.
     start
         Where to start; from afar by default.
-    learning_rate
-        As for :func:`~escape_hw.calibration.sprint.sprint`.
+    learning_rate, solver, loss
+        As for :func:`~escape_hw.calibration.sprint.sprint`; a solver that needs modes will not do.
 
     Raises
     ------
@@ -156,59 +155,99 @@ def telemetry_sprint(
     CalibrationError
         The slopes do not follow the pokes.
     """
-    whitener = np.array([1.0, -1.0]) if order else np.ones(1)
+    filters = [np.ones(1), np.array([1.0, -1.0])][: 2 if order else 1]
     matrix: NDArray[np.float64] | None = None
+    priors, decided = Priors(), 0.0
     for _ in range(_ROUNDS):
-        block = filtered(data, whitener, lags)
-        if len(block.now) < MIN_ROWS:
+        frames = _Whitened.of(data, filters, lags)
+        n = len(frames.slopes)
+        if n < MIN_ROWS:
             raise TooFewFrames(
-                f"{len(block.now)} whitened frames are too few for a registration; "
-                f"at least {MIN_ROWS + order} frames in a row are needed"
+                f"{n} whitened frames are too few for a registration; "
+                f"at least {MIN_ROWS + min(order, 1)} frames are needed, most of them in a row"
             )
-        response = _first_response(block, lags) if matrix is None else _response(block, matrix, lags)
-        slopes = block.slopes.astype(float)
-        seen = block.driven(response.weights).astype(float)
-        slopes, seen = slopes - slopes.mean(axis=0), seen - seen.mean(axis=0)
+        response = _first_response(frames) if matrix is None else _response(frames, matrix)
+        slopes, seen = frames.slopes, frames.through(response.weights)
         left = slopes if matrix is None else slopes - seen @ matrix.T
-        variance = np.square(left).mean(axis=0)
+        freedom = max(n - 1 - decided / slopes.shape[1], 1.0)
+        variance = np.square(left).sum(axis=0) / freedom
         covariance = _shrunk(left) if left.shape[1] <= MOST_CORRELATED else None
         gram = seen.T @ seen
         measured = replace(
             frame,
-            data=(slopes.T @ seen @ np.linalg.pinv(gram, rcond=_LEAST, hermitian=True)).astype(np.float32),
+            data=(slopes.T @ seen @ np.linalg.pinv(gram, rcond=LEAST, hermitian=True)).astype(np.float32),
             sigma=np.zeros(frame.data.shape, np.float32),
         )
         columns = independent_columns(measured, gram, variance)
-        estimate = yield from sprint_steps(
-            columns, model, start=start, learning_rate=learning_rate, covariance=covariance,
-            reach=start is None,
+        fit = yield from fit_steps(
+            columns, model, solver=solver, loss=loss, start=start, learning_rate=learning_rate,
+            covariance=covariance, priors=priors, reach=start is None,
         )  # fmt: skip
-        start = estimate.registration
-        unit = modal_matrix(model, start, frame.m2c, estimate.width.value)
-        matrix = estimate.gain.value * unit
+        start = fit.estimate.registration
+        matrix = fit.zonal() @ frame.m2c
+        if fit.learned is not None:
+            learned = fit.learned()
+            priors, decided = learned.priors, learned.decided
         if order:
-            whitener = _whitener(data, matrix, response, order, lags)
-    return TelemetryFit(estimate, response, whitener, covariance, len(block.now))
+            filters = filters_by_past(*_unexplained(data, matrix, response), order)
+    return TelemetryFit(fit.estimate, response, filters[-1], covariance, n)
 
 
-def _first_response(block: Filtered, lags: int) -> TemporalResponse:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Whitened:
+    """Whitened slopes ``(n, n_slopes)`` and pokes by lag ``(lags, n, n_modes)``, constants taken out."""
+
+    slopes: NDArray[np.float64]
+    pokes: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, data: Telemetry, filters: list[NDArray[np.float64]], lags: int) -> _Whitened:
+        past = known_past(data.present, len(filters) - 1)
+        # Wherever the spots rest, nobody poked them there: a constant is free, filtered as the slopes are.
+        constant = filter_by_past(np.ones((past.size, 1)), filters, past)
+        constant /= max(float(np.linalg.norm(constant)), 1e-12)
+
+        def white(values: NDArray[np.floating]) -> NDArray[np.float64]:
+            rows = filter_by_past(values, filters, past)
+            return np.asarray(rows - constant @ (constant.T @ rows))
+
+        return cls(white(data.slopes), np.stack([white(delayed(data.pokes, lag)) for lag in range(lags)]))
+
+    def through(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pokes as the slopes saw them ``(n, n_modes)``."""
+        return np.asarray(np.tensordot(response, self.pokes, axes=1))
+
+
+def delayed(pokes: NDArray[np.floating], lag: int) -> NDArray[np.floating]:
+    """Pokes ``lag`` rows later; before the first the mirror was flat."""
+    return np.concatenate([np.zeros_like(pokes[:lag]), pokes[: len(pokes) - lag]])
+
+
+def _unexplained(
+    data: Telemetry, matrix: NDArray[np.float64], response: TemporalResponse
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """What a matrix leaves of the slopes ``(n_times, n_slopes)``, and which rows are there."""
+    seen = sum(weight * delayed(data.pokes, lag) for lag, weight in enumerate(response.weights))
+    left = data.slopes - np.asarray(seen) @ matrix.T
+    return (left - left[data.present].mean(axis=0)).astype(np.float32), data.present
+
+
+def _first_response(frames: _Whitened) -> TemporalResponse:
     """All weight on the lag at which slopes and pokes go together most."""
-    slopes, n = block.slopes, block.n_slopes
-    power = [float(np.square(slopes.T @ block.before(lag)[:, n:]).sum()) for lag in range(lags)]
-    weights = np.zeros(lags)
+    power = [float(np.square(frames.slopes.T @ pokes).sum()) for pokes in frames.pokes]
+    weights = np.zeros(len(power))
     weights[int(np.argmax(power))] = 1.0
-    return TemporalResponse(weights, np.ones(lags))
+    return TemporalResponse(weights, np.ones(len(power)))
 
 
-def _response(block: Filtered, matrix: NDArray[np.float64], lags: int) -> TemporalResponse:
+def _response(frames: _Whitened, matrix: NDArray[np.float64]) -> TemporalResponse:
     """Weights of the lags from what a matrix predicts, scaled to sum 1, with errors by frames."""
-    n = block.n_slopes
-    predicted = np.stack([block.before(lag)[:, n:] @ matrix.T for lag in range(lags)])
-    slopes = block.slopes.astype(float)
+    predicted = frames.pokes @ matrix.T
+    lags = len(predicted)
     flat = predicted.reshape(lags, -1)
     bread = np.linalg.inv(flat @ flat.T)
-    weights = bread @ (flat @ slopes.ravel())
-    left = slopes - np.tensordot(weights, predicted, axes=1)
+    weights = bread @ (flat @ frames.slopes.ravel())
+    left = frames.slopes - np.tensordot(weights, predicted, axes=1)
     # Neighbouring slopes err together, whitened frames do not.
     scores = np.einsum("lts,ts->lt", predicted, left)
     total = float(weights.sum())
@@ -226,10 +265,22 @@ def _shrunk(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(share * covariance + (1 - share) * np.diag(np.diag(covariance)))
 
 
-def _whitener(
+def fitted_whitener(
     data: Telemetry, matrix: NDArray[np.float64], response: TemporalResponse, order: int, lags: int
 ) -> NDArray[np.float64]:
-    """Prediction-error filter of what the pokes do not explain."""
+    """Prediction-error filter of what the pokes do not explain.
+
+    Parameters
+    ----------
+    data
+        Slopes and pokes (or, in closed loop, total commands).
+    matrix
+        ``(n_slopes, n_modes)``.
+    response
+        Temporal response.
+    order, lags
+        Past frames that the filter uses, and frames of the response.
+    """
     at = np.arange(lags - 1, data.present.size)
     explained = apply_filter(data.rows, response.weights, at, data.n_slopes) @ matrix.T.astype(np.float32)
     return prediction_error_filter(data.slopes[at] - explained, data.present[at], order)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,15 @@ class WeightedMatrix:
             by_mode = np.full(data.shape[1], max(float(data.std()), 1e-30))
         m2c = matrix.m2c[:, columns]
         return cls(data / by_slope[:, None] / by_mode, by_slope, by_mode, m2c, measured, matrix.valid)
+
+    def columns(self, which: slice) -> WeightedMatrix:
+        """Some of the columns."""
+        return replace(self, data=self.data[:, which], by_mode=self.by_mode[which], m2c=self.m2c[:, which])
+
+    def trusting(self, share: NDArray[np.float64]) -> WeightedMatrix:
+        """The same with the squares of every slope weighted by a share ``(n_slopes,)``."""
+        root = np.sqrt(share)
+        return replace(self, data=self.data * root[:, None], by_slope=self.by_slope / root)
 
     @property
     def modes(self) -> NDArray[np.float64]:

@@ -90,6 +90,71 @@ def apply_filter(
     return out if n == at.size else out[at - first]
 
 
+def filters_by_past(
+    residuals: NDArray[np.float32], present: NDArray[np.bool_], order: int
+) -> list[NDArray[np.float64]]:
+    """Prediction-error filters for every number of known past frames, ``order + 1`` of them.
+
+    Each is scaled so that what it leaves has the variance of what the longest leaves: rows with a short
+    past then stand beside the others with their due weight. Together they whiten a stretch of any
+    length without giving up its first frames, as the Cholesky factor of its covariance over time would.
+
+    Parameters
+    ----------
+    residuals, present, order
+        As for :func:`prediction_error_filter`.
+    """
+    filters, left = [], []
+    past = known_past(present, order)
+    for k in range(order + 1):
+        weights = prediction_error_filter(residuals, present, k)
+        at = np.flatnonzero(past >= k)
+        errors = _gathered(residuals, weights, at)
+        filters.append(weights)
+        left.append(float(np.sqrt(np.square(errors - errors.mean(axis=0)).mean())) if at.size > 1 else 0.0)
+    return [w * (left[-1] / rms if rms > 0 else 1.0) for w, rms in zip(filters, left, strict=True)]
+
+
+def known_past(present: NDArray[np.bool_], order: int) -> NDArray[np.intp]:
+    """How many frames in a row are known before each one, at most ``order``; -1 where the frame is lost."""
+    past, running = np.full(present.size, -1, np.intp), 0
+    for t in np.flatnonzero(present):
+        running = running + 1 if t and present[t - 1] else 0
+        past[t] = min(running, order)
+    return past
+
+
+def filter_by_past(
+    values: NDArray[np.floating], filters: list[NDArray[np.float64]], past: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """Rows filtered by as much past as they have, in time order ``(n_usable, n)``.
+
+    Parameters
+    ----------
+    values
+        ``(n_times, n)``.
+    filters
+        From :func:`filters_by_past`; with more than one, rows without a past are left out.
+    past
+        From :func:`known_past`, no more than there are filters for.
+    """
+    usable = past >= min(1, len(filters) - 1)
+    out = np.empty((past.size, values.shape[1]))
+    for k, weights in enumerate(filters):
+        at = np.flatnonzero(usable & (past == k))
+        out[at] = _gathered(values, weights, at)
+    return out[usable]
+
+
+def _gathered(
+    values: NDArray[np.floating], weights: NDArray[np.float64], at: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    total = np.zeros((at.size, values.shape[1]))
+    for lag, weight in enumerate(weights):
+        total += weight * values[at - lag]
+    return total
+
+
 @njit(cache=True, fastmath=True, nogil=True)
 def _filter(values, taps, first, column, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     for t in range(out.shape[0]):

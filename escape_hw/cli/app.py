@@ -8,7 +8,25 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli import calibrate, gains, loop, perf, products, reproduce, systems
+from escape_hw.cli import (
+    asm,
+    calibrate,
+    camera,
+    discover,
+    dm,
+    doctor,
+    emulate,
+    gains,
+    loop,
+    modulator,
+    perf,
+    products,
+    rehearse,
+    reproduce,
+    systems,
+    track,
+    udev,
+)
 
 app = typer.Typer(
     name="escape",
@@ -26,11 +44,21 @@ app.command("calibrate")(calibrate.calibrate)
 app.command("sprint")(calibrate.sprint)
 app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
+app.command("track")(track.track)
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)
 app.command("perf")(perf.perf)
+app.add_typer(dm.app, name="dm")
+app.add_typer(camera.app, name="camera")
+app.add_typer(modulator.app, name="modulator")
+app.add_typer(asm.app, name="asm")
+app.command("doctor")(doctor.doctor)
+app.command("discover")(discover.discover)
+app.add_typer(udev.app, name="udev")
+app.command("emulate")(emulate.emulate)
+app.command("rehearse")(rehearse.rehearse)
 
 
 def _version(wanted: bool) -> None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult
     from escape_hw.bench import Bench
     from escape_hw.calibration.checkpoint import Checkpoint
+    from escape_hw.io.fits import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
 
@@ -114,6 +115,10 @@ def calibrate(
         str | None,
         typer.Option("--estimator", help="What ESCAPE fits: auto, matrix or telemetry (few frames)."),
     ] = None,
+    pokes: options.Pokes = None,
+    solver: options.Solver = None,
+    modes_choice: options.ModesChoice = None,
+    loss: options.Loss = None,
     resume: Annotated[
         Path | None,
         typer.Option("--resume", metavar="RUN", help="Go on with a run that was broken off (its folder)."),
@@ -134,7 +139,9 @@ def calibrate(
             "closed_loop": None if closed_loop is None else str(closed_loop.absolute()),
         }  # fmt: skip
         request = _request(asked, resume).checked()
-        choice = options.Choice.of(_system(system, resume), set, seed, mode)
+        choice = options.Choice.of(_system(system, resume), set, seed, mode).calibrating(
+            pokes=pokes, solver=solver, modes_choice=modes_choice, loss=loss
+        )
         if modes is not None:
             choice = _with_modes(one, choice, modes)
         config = one.configured(choice)
@@ -152,7 +159,7 @@ def calibrate(
                 used = None if closing is None else closing.result
                 result, stop = one.attempt(request.procedure(bench, used, keep))
             with one.saving(stop):
-                _finish(one, folder, record, result, request)
+                _finish(one, folder, record, result, request, closing)
             if stop is not None:
                 raise stop
             keep.done()
@@ -210,7 +217,12 @@ def _with_modes(one: Session, choice: options.Choice, modes: int) -> options.Cho
 
 
 def _finish(
-    one: Session, folder: RunFolder, record: BenchRecord, result: CalibrationResult, request: _Request
+    one: Session,
+    folder: RunFolder,
+    record: BenchRecord,
+    result: CalibrationResult,
+    request: _Request,
+    closing: MatrixProduct | None,
 ) -> None:
     """Save, judge, report and show a calibration."""
     from escape_hw.io.documents import calibration_document
@@ -220,9 +232,9 @@ def _finish(
 
     measured = measured_part(result)
     labels: dict[str, Any] = {"im": {"measured": "DO-CRIME", "column": ""}}
-    parents = {}
+    parents = {} if closing is None else {"closing": closing.path}
     if measured is not None:
-        parents = {"docrime": keep_calibration(folder, record, "docrime", measured)}
+        parents = {"docrime": keep_calibration(folder, record, "docrime", measured, parents)}
         labels["docrime"] = {"label": "DO-CRIME"}
     keep_calibration(folder, record, "im", result, parents)
     checks = []
@@ -268,20 +280,23 @@ def sprint(
     set: options.Set = None,
     seed: options.Seed = None,
     mode: options.Mode = None,
-    light: Annotated[
-        bool, typer.Option("--light", help="Gain and registration only; quick, for a mirror like its model.")
-    ] = False,
+    solver: options.Solver = None,
+    modes_choice: options.ModesChoice = None,
+    loss: options.Loss = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Find the registration behind a measured interaction matrix; opens no device."""
     with session("sprint", json=json, quiet=quiet) as one:
-        config = one.configured(options.Choice.of(system, set, seed, mode))
+        choice = options.Choice.of(system, set, seed, mode).calibrating(
+            solver=solver, modes_choice=modes_choice, loss=loss
+        )
+        config = one.configured(choice)
         with one.run_folder(config, "sprint", out) as folder:
-            _sprint(one, folder, config, im, light)
+            _sprint(one, folder, config, im)
 
 
-def _sprint(one: Session, folder: RunFolder, config: Any, im: Path, light: bool) -> None:
+def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
     from dataclasses import replace
 
     from escape_hw.calibration.sprint import sprint
@@ -308,8 +323,10 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path, light: bool)
         measured,
         model,
         modes=min(settings.sprint_modes, measured.n_modes),
+        choice=settings.modes_choice,
+        solver=settings.solver,
+        loss=settings.loss,
         learning_rate=settings.learning_rate,
-        misfit=not light,
     )
     result = replace(product.result, matrix=measured, measured=None, registration=estimate)
     origin = replace(config_record(config), parents={im.name: product.sha256})

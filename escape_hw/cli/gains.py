@@ -12,6 +12,7 @@ from escape_hw.cli.loop import fitting_matrix, refuse_simulated
 from escape_hw.cli.session import Session, session
 
 if TYPE_CHECKING:
+    from escape_hw.api.matrix import InteractionMatrix
     from escape_hw.api.procedure import Procedure
     from escape_hw.bench import Bench
     from escape_hw.calibration.gain_bootstrap import GainsRun
@@ -100,10 +101,17 @@ def _procedure(
             budget=budget,
             frames=frames,
             gain=gain,
-            beside={name: each.matrix for name, each in others.items()},
+            beside=_beside(product, others),
             model_psf=model,
         )
     )
+
+
+def _beside(product: MatrixProduct, others: dict[str, MatrixProduct]) -> dict[str, InteractionMatrix]:
+    """The other matrices, and the measured one that a pseudo-synthetic one was computed from."""
+    measured = product.result.measured
+    known = {} if measured is None else {"DO-CRIME": measured}
+    return {**known, **{name: each.matrix for name, each in others.items()}}
 
 
 def _finish(

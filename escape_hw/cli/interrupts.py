@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-from escape_hw.api.procedure import Flag
+from escape_hw.api.flag import Flag
 
 
 class Interrupts:

@@ -22,6 +22,22 @@ Set = Annotated[
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")]
 Mode = Annotated[str | None, typer.Option("--mode", metavar="sim|hardware", help="Twins or real devices.")]
 Matrix = Annotated[Path, typer.Option("--im", metavar="FILE", help="Interaction matrix (FITS).")]
+Pokes = Annotated[
+    str | None, typer.Option("--pokes", help="DO-CRIME: white, shaped or equal-snr (default: configured).")
+]
+Solver = Annotated[
+    str | None,
+    typer.Option(
+        "--solver", help="SPRINT: effects, light, frozen, batches or diagonal (default: configured)."
+    ),
+]
+ModesChoice = Annotated[
+    str | None,
+    typer.Option("--modes-choice", help="SPRINT's modes: snr, first, d-optimal or a-optimal."),
+]
+Loss = Annotated[
+    str | None, typer.Option("--loss", help="SPRINT: squares, or huber against bad sub-apertures.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Allow a simulated matrix on hardware.")]
 
 
@@ -37,6 +53,10 @@ class Choice:
     def plus(self, *overrides: str) -> Choice:
         """The same with further overrides, which go last."""
         return replace(self, set=(*self.set, *overrides))
+
+    def calibrating(self, **asked: str | None) -> Choice:
+        """The same with what was asked of the calibration: values by key, ``None`` for as configured."""
+        return self.plus(*(f"calibration.{key}={value}" for key, value in asked.items() if value is not None))
 
     @classmethod
     def of(cls, system: str, overrides: list[str] | None, seed: int | None, mode: str | None) -> Choice:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from escape_hw.cli import options
 from escape_hw.cli.session import Session, session
+
+if TYPE_CHECKING:
+    from escape_hw.api.matrix import InteractionMatrix
 
 
 def show(
@@ -93,12 +96,32 @@ def compare(
         result = comparison.compare(a.result, b.result)
         one.show(f"A: {first} ({a.matrix.method})", f"B: {second} ({b.matrix.method})")
         one.show(*comparison.lines(result))
+        gains = _optical_gains(one, a.matrix, b.matrix)
         one.show(rich_table(comparison.mode_table(result)))
         if result.registration:
             one.show(rich_table(comparison.registration_table(result)))
         simulated = a.matrix.simulated or b.matrix.simulated
         document: dict[str, Any] = head("compare", a.matrix.system, simulated, None)
-        one.result({**document, "a": first.absolute(), "b": second.absolute(), **result.document()})
+        document |= {"a": first.absolute(), "b": second.absolute(), "optical_gain": gains}
+        one.result({**document, **result.document()})
+
+
+def _optical_gains(one: Session, a: InteractionMatrix, b: InteractionMatrix) -> dict[str, Any] | None:
+    """Gains of B relative to A, by the paper's ratio of deviations and by the unbiased projection."""
+    from escape_hw.calibration.optical_gain import deviation_ratio, projection
+    from escape_hw.errors import CalibrationError
+
+    try:
+        found = {"deviation_ratio": deviation_ratio(b, a), "projection": projection(b, a)}
+    except CalibrationError as error:
+        one.show(f"no optical gains: {error}")
+        return None
+    for name, (value, sigma) in found.items():
+        middle, error_of_one = sorted(value)[len(value) // 2], sorted(sigma)[len(sigma) // 2]
+        one.show(
+            f"optical gain of B over A, {name.replace('_', ' ')}: median {middle:.4f} ± {error_of_one:.2g}"
+        )
+    return {name: {"value": value, "sigma": sigma} for name, (value, sigma) in found.items()}
 
 
 def report(

@@ -208,12 +208,13 @@ class Session:
         return (FAULT if self.was_opened else FAILED), type(error).__name__, message
 
     def print_document(self) -> None:
-        """Print the document on the real standard output."""
+        """Print the document on the real standard output, once; a command that serves does so early."""
         from escape_hw.io.documents import dumps
 
         if self.json and self._document is not None:
+            document, self._document = self._document, None
             try:
-                self._stdout.write(dumps(self._document) + "\n")
+                self._stdout.write(dumps(document) + "\n")
                 self._stdout.flush()
             except OSError as error:
                 self._nobody_reads(error)

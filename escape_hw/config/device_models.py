@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from escape_hw.api.frames import CameraSettings, Region
+from escape_hw.api.mirror import DMInfo
 from escape_hw.config import layouts
+from escape_hw.config.modulator_models import StageConfig, WireConfig
 from escape_hw.config.section import Breach, Listed, Section, enforce
 from escape_hw.safety.limits import MirrorLimits
 
@@ -97,6 +99,23 @@ class MirrorConfig(DeviceConfig):
         """Actuator positions ``(n_act, 2)`` as (x, y) from the mirror's centre, in pitches."""
         return layouts.positions(self.layout)
 
+    def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
+        """Identity and nominal geometry, as a driver or twin of this mirror tells them.
+
+        Parameters
+        ----------
+        model
+            What the device is.
+        simulated
+            It is a twin.
+        serial
+            As the device says; by default as configured.
+        """
+        places = self.positions() * self.pitch_m
+        return DMInfo(
+            model, serial or self.serial, self.n_act, self.actuator_map(), places, self.stroke_m, simulated
+        )
+
     @model_validator(mode="after")
     def _rules(self) -> Self:
         last = self.n_act - 1
@@ -164,12 +183,20 @@ class ModulatorConfig(DeviceConfig):
     frequency_hz: float = Field(
         gt=0, le=5000, description="turns per second that are asked for, hertz; the stage's clock rounds them"
     )
+    beam_m: float | None = Field(
+        None, gt=0, le=10, description="diameter of the beam on the modulator's mirror, metres"
+    )
     rad_per_lambda_d: float = Field(
-        gt=0, le=0.1, description="mirror tilt that moves the beam by 1 lambda/D on the pyramid, radians"
+        gt=0,
+        le=0.1,
+        description="mirror tilt that moves the beam by 1 lambda/D on the pyramid, radians; absent: "
+        "wavelength / (2 beam_m)",
     )
     max_tilt_rad: float = Field(
         gt=0, le=0.1, description="largest tilt of the mirror from its centre, radians"
     )
+    wire: WireConfig = Field(default_factory=WireConfig, description="connection of the real controller")
+    stage: StageConfig = Field(default_factory=StageConfig, description="axes of the real stage")
 
 
 class ScreenConfig(DeviceConfig):

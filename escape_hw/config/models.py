@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal, Self, TypeVar, get_args
+from typing import Any, Literal, Self, TypeVar, get_args
 
 from pydantic import Field, model_validator
 
 from escape_hw.config.device_models import DeviceConfig, DevicesConfig, Mode
+from escape_hw.config.modulator_models import with_tilt
 from escape_hw.config.section import Breach, Section, enforce
 from escape_hw.config.sensor_models import AnySensor, PyramidSection, SensorSection
 from escape_hw.config.telescope_models import TelescopeSection
 from escape_hw.config.toml_text import dump_toml
+from escape_hw.config.tracking_models import TrackingSection
 from escape_hw.config.twin_models import TwinConfig
 from escape_hw.errors import ConfigError
 
@@ -21,6 +23,16 @@ S = TypeVar("S", bound=SensorSection)
 Estimator = Literal["auto", "matrix", "telemetry"]
 #: What SPRINT can fit within ESCAPE.
 ESTIMATORS: tuple[str, ...] = get_args(Estimator)
+Pokes = Literal["white", "shaped", "equal-snr"]
+Solver = Literal["effects", "light", "frozen", "batches", "diagonal"]
+#: How SPRINT solves.
+SOLVERS: tuple[str, ...] = get_args(Solver)
+ModesChoice = Literal["snr", "first", "d-optimal", "a-optimal"]
+#: How SPRINT chooses its modes.
+MODES_CHOICES: tuple[str, ...] = get_args(ModesChoice)
+Loss = Literal["squares", "huber"]
+#: What SPRINT minimises.
+LOSSES: tuple[str, ...] = get_args(Loss)
 
 
 class SystemSection(Section):
@@ -44,8 +56,9 @@ class SystemSection(Section):
 class BasisSection(Section):
     """Modal basis of the calibration."""
 
-    kind: Literal["kl", "zonal", "file"] = Field(
-        "kl", description="'kl' (Karhunen-Loeve), 'zonal' (single actuators) or 'file'"
+    kind: Literal["kl", "zonal", "zernike", "fourier", "file"] = Field(
+        "kl",
+        description="'kl' (Karhunen-Loeve), 'zonal' (single actuators), 'zernike', 'fourier' or 'file'",
     )
     n_modes: int = Field(ge=1, le=10000, description="number of modes")
     file: str = Field("", description="FITS file of the mode-to-command matrix, for kind = 'file'")
@@ -84,6 +97,11 @@ class CalibrationSection(Section):
         le=1,
         description="largest command of any actuator in the poke of one mode, fraction of full stroke",
     )
+    pokes: Pokes = Field(
+        "white",
+        description="DO-CRIME: 'white' pokes, 'shaped' ones that change sign more often than not, or white "
+        "ones that share the same Strehl budget so that modes have 'equal-snr'",
+    )
     frames: int = Field(10000, ge=1, le=100_000_000, description="DO-CRIME: number of frames")
     push_pull_poke: float = Field(
         0.01, gt=0, le=1, description="push-pull: poke of each mode, rms surface as fraction of full stroke"
@@ -106,6 +124,20 @@ class CalibrationSection(Section):
         description="what SPRINT fits: the 'matrix' or the whitened 'telemetry'; 'auto': the telemetry",
     )
     sprint_modes: int = Field(50, ge=1, le=10000, description="SPRINT: largest number of modes used")
+    modes_choice: ModesChoice = Field(
+        "snr",
+        description="SPRINT: which modes: 'snr' (best measured), 'first', or those that tell most of the "
+        "registration, 'd-optimal' or 'a-optimal'",
+    )
+    solver: Solver = Field(
+        "effects",
+        description="SPRINT: 'effects' (with what the model does not know), 'light' (gain and registration), "
+        "'frozen' (the same, derivatives of the start), 'batches' (the paper's, few modes at a time), "
+        "'diagonal' (a gain for every mode)",
+    )
+    loss: Loss = Field(
+        "squares", description="SPRINT: 'squares', or 'huber' where some sub-apertures are not to be trusted"
+    )
     learning_rate: float = Field(1.0, gt=0, le=1, description="SPRINT: share of each step that is taken")
     model: str = Field(
         "fast", min_length=1, description="SPRINT: synthetic model (entry point in escape.models)"
@@ -127,7 +159,14 @@ class SystemConfig(Section):
     calibration: CalibrationSection = Field(
         default_factory=CalibrationSection, description="defaults of the calibration procedures"
     )
+    tracking: TrackingSection = Field(default_factory=TrackingSection, description="the tracker")
     twin: TwinConfig = Field(default_factory=TwinConfig, description="the simulated bench")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _derived(cls, document: Any) -> Any:
+        """Keys that follow from others."""
+        return with_tilt(document)
 
     @property
     def simulated(self) -> bool:
@@ -187,6 +226,12 @@ class SystemConfig(Section):
         if radius and modulator is None:
             text = "needs a modulator, [devices.modulator]; 0 is a pyramid without modulation"
             yield Breach("sensor.modulation", radius, text)
+        beam_m = None if modulator is None else modulator.beam_m
+        if modulator is not None and beam_m is not None:
+            tilt = self.system.wavelength_m / (2 * beam_m)
+            if abs(modulator.rad_per_lambda_d / tilt - 1) > 0.05:
+                text = f"a beam of {beam_m:g} m has {tilt:.3g} (wavelength / (2 beam_m)); leave one out"
+                yield Breach("devices.modulator.rad_per_lambda_d", modulator.rad_per_lambda_d, text)
         if modulator is not None and radius * modulator.rad_per_lambda_d > modulator.max_tilt_rad:
             largest = modulator.max_tilt_rad / modulator.rad_per_lambda_d
             yield Breach("sensor.modulation", radius, f"the modulator reaches {largest:.4g} lambda/D")

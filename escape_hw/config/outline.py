@@ -137,6 +137,9 @@ def nearest_key(path: Sequence[str | int]) -> str | None:
     if neighbour is not None:
         return dotted((*place.known, neighbour, *path[depth + 1 :]))
     elsewhere = [key for key in all_keys() if key.rpartition(".")[2] == str(path[-1])]
+    # Who forgets a section forgets one; a deeper key only looks nearer when its sections are short.
+    levels = min((key.count(".") for key in elsewhere), default=0)
+    elsewhere = [key for key in elsewhere if key.count(".") == levels]
     return nearest(dotted(path), elsewhere or all_keys()) or (elsewhere[0] if elsewhere else None)
 
 

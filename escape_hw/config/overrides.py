@@ -12,8 +12,8 @@ from escape_hw.config import outline
 from escape_hw.config.problems import Problem, show, unknown_key
 from escape_hw.errors import ConfigError
 
-#: Text that may stand without quotes, since a shell takes them away.
-_WORD = re.compile(r"^[A-Za-z_/~.][\w./~ :+-]*$")
+#: Text that may stand without quotes, since a shell takes them away: words, paths, network addresses.
+_WORD = re.compile(r"^(?:[A-Za-z_/~.][\w./~ :+-]*|\d{1,3}(?:\.\d{1,3}){3})$")
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Finds drivers, twins and models by name, through entry points, so that anybody may add one."""
+"""Finds drivers, twins, models and emulators by name, through entry points, so that anybody may add one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from escape_hw.api.device import Device
+from escape_hw.api.emulator import EmulatorFactory
 from escape_hw.api.model import SyntheticModel
+from escape_hw.api.rehearsal import RehearsalFactory
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.config.models import SystemConfig
 from escape_hw.config.outline import nearest
@@ -15,7 +17,14 @@ from escape_hw.errors import ConfigError
 
 DEVICES = "escape.devices"
 MODELS = "escape.models"
-_KINDS = {DEVICES: "device driver", MODELS: "synthetic model"}
+EMULATORS = "escape.emulators"
+REHEARSALS = "escape.rehearsals"
+_KINDS = {
+    DEVICES: "device driver",
+    MODELS: "synthetic model",
+    EMULATORS: "emulator",
+    REHEARSALS: "rehearsal",
+}
 #: What the name of every twin begins with; other drivers drive real hardware.
 TWIN = "sim-"
 
@@ -52,7 +61,7 @@ def register_device(name: str, factory: DeviceFactory) -> None:
 
 
 def available(group: str) -> tuple[str, ...]:
-    """Names registered in a group (:data:`DEVICES` or :data:`MODELS`), sorted."""
+    """Names registered in a group (:data:`DEVICES`, :data:`MODELS`, :data:`EMULATORS`), sorted."""
     own = _OWN if group == DEVICES else ()
     return tuple(sorted({*own, *(entry.name for entry in importlib.metadata.entry_points(group=group))}))
 
@@ -84,6 +93,28 @@ def model_factory(name: str) -> ModelFactory:
         Unknown name (with the nearest one), or its package is not completely installed.
     """
     return cast(ModelFactory, _load(MODELS, name))
+
+
+def emulator_factory(name: str) -> EmulatorFactory:
+    """The factory of an emulator.
+
+    Raises
+    ------
+    ConfigError
+        Unknown name (with the nearest one), or its package is not completely installed.
+    """
+    return cast(EmulatorFactory, _load(EMULATORS, name))
+
+
+def rehearsal_factory() -> RehearsalFactory:
+    """The factory of the simulated bench behind real drivers.
+
+    Raises
+    ------
+    ConfigError
+        The package that holds it is not completely installed.
+    """
+    return cast(RehearsalFactory, _load(REHEARSALS, "bench"))
 
 
 def _load(group: str, name: str, hardware: bool = False) -> Any:

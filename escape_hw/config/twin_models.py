@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from escape_hw.api.registration import Registration
 from escape_hw.config.section import Breach, Listed, Section, enforce
+from escape_hw.config.twin_drift import TwinDrift, TwinSeeing
 from escape_hw.config.twin_sky import TwinAtmosphere, TwinContamination, TwinStar
 
 
@@ -179,6 +180,8 @@ class TwinConfig(Section):
     registration: TwinRegistration = Field(
         default_factory=TwinRegistration, description="hidden registration"
     )
+    drift: TwinDrift = Field(default_factory=TwinDrift, description="flexure: how the registration moves")
+    seeing: TwinSeeing = Field(default_factory=TwinSeeing, description="how the turbulence changes")
     mirror: TwinMirror = Field(default_factory=TwinMirror, description="imperfections of the mirror")
     wfs: TwinSensor = Field(default_factory=TwinSensor, description="light and noise of the sensor's camera")
     science: TwinCamera = Field(

@@ -13,26 +13,17 @@ from numpy.typing import ArrayLike, NDArray
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
-from escape_hw.errors import IncompatibleProduct, ProductError
+from escape_hw.errors import IncompatibleProduct
 from escape_hw.io import fits_file, fits_geometry, fits_parts
+from escape_hw.io.product import Product
 from escape_hw.io.provenance import Provenance
 
 KIND_MATRIX = "IM"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MatrixProduct:
-    """An interaction matrix read from disk.
-
-    ``config_text`` is the whole configuration it was measured with (TOML), ``header`` the primary
-    header's cards, ``sha256`` the checksum that a product made from this one names as its parent.
-    """
-
-    path: Path
-    result: CalibrationResult
-    config_text: str
-    header: dict[str, Any]
-    sha256: str
+class MatrixProduct(Product[CalibrationResult]):
+    """An interaction matrix read from disk."""
 
     @property
     def matrix(self) -> InteractionMatrix:
@@ -144,14 +135,8 @@ def load_matrix(
     IncompatibleProduct
         Sound, but not for this system, basis, mirror or mode.
     """
-    path = Path(path)
-    hdus, sha256 = fits_file.read(path, KIND_MATRIX)
-    header = fits_file.header_dict(hdus)
-    try:
-        result = _unpack(path, hdus, header)
-    except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise ProductError(f"{path}: its parts do not fit together ({error})") from error
-    product = MatrixProduct(path, result, fits_file.read_text(path, hdus, "CONFIG"), header, sha256)
+    product = MatrixProduct.read(path, KIND_MATRIX, _unpack)
+    path, header = product.path, product.header
     matrix = product.matrix
     _expect(
         path, "system", header["SYSTEM"], None if expect_system is None else fits_file.plain(expect_system)

@@ -91,7 +91,11 @@ def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
             "CHI2": np.array([step.chi2 for step in steps], float),
         },
     )
-    notes = {"chi2": float(estimate.chi2), "warnings": list(estimate.warnings)}
+    notes = {
+        "chi2": float(estimate.chi2),
+        "warnings": list(estimate.warnings),
+        "notes": list(estimate.notes),
+    }
     return [
         alpha,
         fits_file.image("COVAR", np.asarray(estimate.covariance, np.float64)),
@@ -128,6 +132,8 @@ def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate 
         ),
         chi2=float(notes["chi2"]),
         warnings=tuple(str(note) for note in notes["warnings"]),
+        # Products of earlier versions have none.
+        notes=tuple(str(note) for note in notes.get("notes", ())),
     )
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from escape_hw.api.gains import ClosureStep, GainRound, GainsResult, OpticalGains
 from escape_hw.api.results import Measured, StrehlEstimate
-from escape_hw.errors import ProductError
 from escape_hw.io import fits_file, fits_parts
 from escape_hw.io.fits import partial_path
+from escape_hw.io.product import Product
 from escape_hw.io.provenance import Provenance
 
 KIND_GAINS = "OG"
@@ -25,14 +25,8 @@ _WAYS = tuple(one.name for one in fields(StrehlEstimate))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GainsProduct:
-    """Optical gains read from disk; the fields are those of ``MatrixProduct``."""
-
-    path: Path
-    result: GainsResult
-    config_text: str
-    header: dict[str, Any]
-    sha256: str
+class GainsProduct(Product[GainsResult]):
+    """Optical gains read from disk."""
 
 
 def save_gains(
@@ -85,14 +79,7 @@ def load_gains(path: Path | str) -> GainsProduct:
     ProductError
         Not there, truncated, damaged, of another kind, incomplete or from a newer version.
     """
-    path = Path(path)
-    hdus, sha256 = fits_file.read(path, KIND_GAINS)
-    header = fits_file.header_dict(hdus)
-    try:
-        result = _unpack(path, hdus, header)
-    except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise ProductError(f"{path}: its parts do not fit together ({error})") from error
-    return GainsProduct(path, result, fits_file.read_text(path, hdus, "CONFIG"), header, sha256)
+    return GainsProduct.read(path, KIND_GAINS, _unpack)
 
 
 def _scalars(one: GainRound) -> dict[str, Any]:

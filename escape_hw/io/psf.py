@@ -10,9 +10,9 @@ import numpy as np
 from astropy.io import fits as astropy_fits
 
 from escape_hw.api.results import LoopResult, Measured, StrehlEstimate
-from escape_hw.errors import ProductError
 from escape_hw.io import fits_file, fits_parts
 from escape_hw.io.fits import partial_path
+from escape_hw.io.product import Product
 from escape_hw.io.provenance import Provenance
 
 KIND_PSF = "PSF"
@@ -27,14 +27,8 @@ _IMAGES = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LoopProduct:
-    """A closed-loop run read from disk; the fields are those of ``MatrixProduct``."""
-
-    path: Path
-    result: LoopResult
-    config_text: str
-    header: dict[str, Any]
-    sha256: str
+class LoopProduct(Product[LoopResult]):
+    """A closed-loop run read from disk."""
 
 
 def save_loop(
@@ -88,14 +82,7 @@ def load_loop(path: Path | str) -> LoopProduct:
     ProductError
         Not there, truncated, damaged, of another kind, incomplete or from a newer version.
     """
-    path = Path(path)
-    hdus, sha256 = fits_file.read(path, KIND_PSF)
-    header = fits_file.header_dict(hdus)
-    try:
-        result = _unpack(path, hdus, header)
-    except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise ProductError(f"{path}: its parts do not fit together ({error})") from error
-    return LoopProduct(path, result, fits_file.read_text(path, hdus, "CONFIG"), header, sha256)
+    return LoopProduct.read(path, KIND_PSF, _unpack)
 
 
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> LoopResult:

@@ -10,7 +10,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from escape_hw.io.storage import write_atomic
-from escape_hw.report import figures_bench, figures_gains, figures_matrix, figures_registration, html, tables
+from escape_hw.report import (
+    figures_bench,
+    figures_gains,
+    figures_matrix,
+    figures_registration,
+    figures_track,
+    html,
+    tables,
+)
 from escape_hw.report.content import RunContent, read_run
 
 REPORT = "report.html"
@@ -68,6 +76,7 @@ def render(run: RunContent) -> str:
         _registration(run),
         _gains(run),
         _loops(run),
+        _track(run),
         _matrices(run),
         _sky_time(run),
         _bench(run),
@@ -118,6 +127,7 @@ def _registration(run: RunContent) -> str:
                 )
             )
         parts.append(html.notes(list(estimate.warnings), "bad"))
+        parts.append(html.notes(list(estimate.notes)))
     return html.section("Registration", *parts)
 
 
@@ -167,6 +177,35 @@ def _loops(run: RunContent) -> str:
             html.figure("gains", figures_bench.gain_scan(scans), "Search for each matrix's own best gain.")
         )
     return html.section("Closed loop", *parts)
+
+
+def _track(run: RunContent) -> str:
+    track = run.document.get("track")
+    if not track or not track["seconds"]:
+        return ""
+    exchanges, alarms = run.document["exchanges"], run.document["alarms"]
+    drawing = figures_track.course(track, exchanges, alarms)
+    caption = (
+        "Live registration, optical gain and image quality, with standard errors. "
+        "Dotted: a new matrix was taken into use. Full line: an alarm."
+    )
+    lines = tuple(
+        (
+            f"{one['seconds']:.0f}", "exchanged" if one["accepted"] else "proposed",
+            f"{one['mismatch']:.1%} ± {one['mismatch_sigma']:.1%}",
+            f"{one['slowest']:.3f}", f"{one['fastest']:.3f}",
+        )
+        for one in exchanges
+    )  # fmt: skip
+    parts = [html.figure("track", drawing, caption)]
+    if lines:
+        heads = ("seconds", "", "change of the matrix", "slowest mode", "fastest mode")
+        what = (
+            "New matrices. Slowest, fastest: loop gain of the modes with the matrix before; 1 is asked for."
+        )
+        parts.append(html.table(tables.Table(heads, lines), what))
+    parts.append(html.notes([f"after {one['seconds']:.0f} s: {one['text']}" for one in alarms], "bad"))
+    return html.section("Tracking", *parts)
 
 
 def _matrices(run: RunContent) -> str:

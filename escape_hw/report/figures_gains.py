@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from escape_hw.api.gains import GainsResult, OpticalGains
 from escape_hw.report import style
@@ -34,12 +35,14 @@ def optical_gains(result: GainsResult) -> Figure:
         axes = left if label in below or right is left else right
         side = "" if right is left else (" (left)" if axes is left else " (right)")
         handles.append(_draw(axes, gains, label + side, colour))
-    style.legend(left, handles=handles)
+    left.xaxis.set_major_locator(MaxNLocator(integer=True))
+    # Above the drawing: within it there is a curve everywhere.
+    style.legend(left, handles=handles, loc="lower left", bbox_to_anchor=(0, 1), ncols=len(handles))
     return figure
 
 
 def _draw(axes: Axes, gains: OpticalGains, label: str, colour: str) -> object:
-    modes = np.arange(gains.n_modes)
+    modes = np.arange(1, gains.n_modes + 1)
     shown = np.isfinite(gains.sigma)
     axes.errorbar(
         modes[shown], gains.value[shown], gains.sigma[shown], fmt="o", ms=2.5, lw=0.7, color=colour, alpha=0.6
@@ -58,6 +61,7 @@ def bootstrap(result: GainsResult) -> Figure:
     effective = [step.gain * step.optical_gain for step in steps]
     top.plot(number, effective, "o-", ms=3, color=style.SERIES[0], label="effective gain")
     top.axhline(result.loop_gain, color=style.MUTED, lw=1.0, ls=":", label="wanted")
+    top.xaxis.set_major_locator(MaxNLocator(integer=True))
     style.tidy(top).set(xlabel="gain tried in the first closure", ylabel="effective gain")
     residual = top.twinx()
     line = residual.plot(

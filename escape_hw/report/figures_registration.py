@@ -56,6 +56,13 @@ def convergence(estimate: RegistrationEstimate, planted: Registration | None = N
     return figure
 
 
+#: Bounds, how they are drawn, and what they are called.
+_BOUNDS = (
+    ("bound", "--", "Cramér-Rao bound, real mirror"),
+    ("exact_bound", ":", "Cramér-Rao bound, exact model"),
+)
+
+
 def error_curves(curves: Mapping[str, Any]) -> Figure:
     """Error of the registration against the number of frames.
 
@@ -63,7 +70,8 @@ def error_curves(curves: Mapping[str, Any]) -> Figure:
     ----------
     curves
         ``{"frames": [...], "estimators": {name: {parameter: [rms, ...]}}, "bound": {parameter:
-        [...]}, "goal": {parameter: value}}``; ``bound`` (Cramér-Rao) and ``goal`` may be missing.
+        [...]}, "goal": {parameter: value}}``; ``bound`` (Cramér-Rao, random effects included),
+        ``exact_bound`` (for an exact model) and ``goal`` may be missing.
     """
     frames = np.asarray(curves["frames"], float)
     figure = style.new_figure(9.2, 5.2)
@@ -73,9 +81,9 @@ def error_curves(curves: Mapping[str, Any]) -> Figure:
         for (label, errors), colour in zip(curves["estimators"].items(), style.SERIES, strict=False):
             if name in errors:
                 panel.loglog(frames, _positive(errors[name]), "o-", ms=3, lw=1.4, color=colour, label=label)
-        if name in curves.get("bound", {}):
-            bound = _positive(curves["bound"][name])
-            panel.loglog(frames, bound, "--", lw=1.1, color=style.INK, label="Cramér-Rao bound")
+        for key, line, label in _BOUNDS:
+            if name in curves.get(key, {}):
+                panel.loglog(frames, _positive(curves[key][name]), line, lw=1.1, color=style.INK, label=label)
         if name in curves.get("goal", {}):
             panel.axhline(curves["goal"][name], color=style.MUTED, lw=1.0, ls=":", label="goal")
         style.tidy(panel).set_title(title, fontsize=9.5)

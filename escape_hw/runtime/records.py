@@ -41,6 +41,8 @@ class BenchRecord:
         named = {"dm": bench.dm, "wfs": bench.wfs, "modulator": bench.modulator, "science": bench.science}
         simulated = bool(bench.simulated)
         science = config.devices.science
+        # A registration that moves is not one that a single number could be held against.
+        stands = simulated and not config.twin.drift.moves
         return cls(
             system=config.system.name,
             simulated=simulated,
@@ -51,7 +53,7 @@ class BenchRecord:
             layout=_layout(bench),
             places_m=_places(bench),
             psf_px=None if science is None else float(science.psf_px),
-            planted=config.twin.registration.to_registration() if simulated else None,
+            planted=config.twin.registration.to_registration() if stands else None,
         )
 
     def origin(self, parents: Mapping[str, str] | None = None) -> Provenance:

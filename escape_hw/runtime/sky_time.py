@@ -13,14 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.procedure import Procedure, Reporter, run
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.calibration.acquire import measured_matrix
 from escape_hw.calibration.bound import registration_bound
 from escape_hw.calibration.docrime import MOST_CORRELATED, docrime_run
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.docrime_solution import DocrimeSolution
 from escape_hw.calibration.escape import escape
-from escape_hw.calibration.sprint import sprint
+from escape_hw.calibration.poke_session import Record
+from escape_hw.calibration.response import filtered
+from escape_hw.calibration.sprint import fit_steps, sprint
+from escape_hw.calibration.telemetry_sprint import independent_columns, time_line
 from escape_hw.config.device_models import DeviceConfig
 from escape_hw.config.load import load_system, load_text
 from escape_hw.config.models import SystemConfig
@@ -45,12 +51,14 @@ _PATIENCE_S = 0.2
 class PlantErrors:
     """Errors and stated standard errors of one plant, ``(n_estimators, n_frames, 5)``; NaN if refused.
 
-    ``bound`` is the Cramer-Rao bound at the largest number of frames ``(5,)``.
+    ``exact`` and ``hybrid`` are the Cramer-Rao bounds ``(n_frames, 5)``, see
+    :class:`~escape_hw.calibration.bound.Bound`.
     """
 
     errors: NDArray[np.float64]
     sigmas: NDArray[np.float64]
-    bound: NDArray[np.float64]
+    exact: NDArray[np.float64]
+    hybrid: NDArray[np.float64]
 
 
 def random_plant(number: int) -> Registration:
@@ -97,14 +105,14 @@ def run_plant(
     plant = random_plant(number)
     config = twins_of(system, [*overrides, *plant_overrides(plant)], seed=number + 1)
     errors = np.full((len(ESTIMATORS), len(frames), 5), np.nan)
-    sigmas, bound = errors.copy(), np.full(5, np.nan)
+    sigmas, bounds = errors.copy(), np.full((2, len(frames), 5), np.nan)
     with System.from_config(config) as bench:
         c = bench.config.calibration
-        run = bench.run(docrime_run(bench, frames=max(frames), record=True))
-        if run.record is None:
+        measured = bench.run(docrime_run(bench, frames=max(frames), record=True))
+        if measured.record is None:
             raise RuntimeError("the run was not recorded")
-        index, slopes, pokes = run.record
-        grid, m2c = run.result.grid, run.result.matrix.m2c
+        index, slopes, pokes = measured.record
+        grid, m2c = measured.result.grid, measured.result.matrix.m2c
         model = bench.model(grid)
         for e, order in enumerate((0, c.whiten_order)):
             for f, count in enumerate(frames):
@@ -120,8 +128,8 @@ def run_plant(
                     continue
                 errors[e, f] = found.registration.to_array() - plant.to_array()
                 sigmas[e, f] = found.sigma
-                if order and count == max(frames) and solution.covariance is not None:
-                    bound = registration_bound(matrix, solution.covariance, model, found.registration)
+                if order and count == max(frames):
+                    bounds = _bounds(measured.record, c.lags, solution, matrix, model, frames)
         for f, count in enumerate(frames):
             # Frames of its own: a run this short must find the sensor's geometry on them as well.
             try:
@@ -131,7 +139,38 @@ def run_plant(
             if short is not None:
                 errors[2, f] = short.registration.to_array() - plant.to_array()
                 sigmas[2, f] = short.sigma
-    return PlantErrors(errors, sigmas, bound)
+    return PlantErrors(errors, sigmas, *bounds)
+
+
+def _bounds(
+    record: Record,
+    lags: int,
+    solution: DocrimeSolution,
+    matrix: InteractionMatrix,
+    model: SyntheticModel,
+    frames: Sequence[int],
+) -> NDArray[np.float64]:
+    """Exact and hybrid bound ``(2, n_frames, 5)`` for the pokes of a run's first frames.
+
+    Noise, whitening filter, registration and scatter of the random effects are those that the whole run
+    tells: the bound knows them, as it must.
+    """
+    columns = independent_columns(matrix, solution.gram, solution.variance)
+    fit = run(fit_steps(columns, model, covariance=solution.covariance))
+    if fit.learned is None:
+        raise RuntimeError("the solver fitted no random effects")
+    data = time_line(*record, before=solution.whitener.size + lags)
+    pokes = filtered(data, solution.whitener, lags).driven(solution.response.weights).astype(float)
+    noise = solution.variance if solution.covariance is None else solution.covariance
+    rows = len(pokes) - matrix.n_modes
+    out = np.empty((2, len(frames), 5))
+    for f, count in enumerate(frames):
+        few = pokes[:count] - pokes[:count].mean(axis=0)
+        bound = registration_bound(
+            matrix, few.T @ few, noise, rows, model, fit.estimate.registration, fit.learned().priors
+        )
+        out[:, f] = bound.exact, bound.hybrid
+    return out
 
 
 def sky_time(
@@ -241,8 +280,10 @@ def summary(
     met = np.isfinite(errors).all(axis=(0, 3)) & np.all(np.sqrt(np.mean(errors**2, axis=0)) <= goal, axis=2)
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
     chi2 = np.mean(np.square(errors / sigmas), axis=0)
-    bound = np.sqrt(np.mean(np.square(np.stack([p.bound for p in plants])), axis=0))
-    scale = np.sqrt(max(frames) / np.asarray(frames, dtype=float))
+    exact, hybrid = (
+        np.sqrt(np.mean(np.square(np.stack([getattr(p, name) for p in plants])), axis=0))
+        for name in ("exact", "hybrid")
+    )
     fewest: dict[str, int | None] = {}
     for e, name in enumerate(ESTIMATORS):
         enough = [int(n) for f, n in enumerate(frames) if met[e, f]]
@@ -258,7 +299,8 @@ def summary(
             name: {p: _plain(chi2[e, :, k]) for k, p in enumerate(PARAMETERS)}
             for e, name in enumerate(ESTIMATORS)
         },
-        "bound": {p: _plain(bound[k] * scale) for k, p in enumerate(PARAMETERS)},
+        "exact_bound": {p: _plain(exact[:, k]) for k, p in enumerate(PARAMETERS)},
+        "bound": {p: _plain(hybrid[:, k]) for k, p in enumerate(PARAMETERS)},
         "goal": {p: float(goal[k]) for k, p in enumerate(PARAMETERS)},
         "fewest_frames": fewest,
     }
@@ -278,5 +320,7 @@ def rows(curves: dict[str, Any]) -> Iterator[tuple[str, ...]]:
                 cells.append("refused" if error is None else f"{error:.3g} ({chi2:.2g})")
             yield (name, str(count), *cells)
     for i, count in enumerate(curves["frames"]):
-        found = (curves["bound"][p][i] for p in PARAMETERS)
-        yield ("bound", str(count), *("unknown" if value is None else f"{value:.3g}" for value in found))
+        for name in ("exact_bound", "bound"):
+            found = (curves[name][p][i] for p in PARAMETERS)
+            cells = ["unknown" if value is None else f"{value:.3g}" for value in found]
+            yield (name.replace("_", " "), str(count), *cells)

@@ -19,6 +19,7 @@ from escape_hw.config.load import load_system
 
 if TYPE_CHECKING:
     from escape_hw.calibration.checkpoint import Checkpoint
+    from escape_hw.calibration.gain_bootstrap import GainsRun
     from escape_hw.calibration.sensor_setup import SensorSetup
     from escape_hw.calibration.stopping import Target
 
@@ -190,7 +191,15 @@ class System(Bench):
 
         settings = self.config.calibration
         modes = min(settings.sprint_modes, matrix.n_modes)
-        return sprint(matrix, self.model(grid), modes=modes, learning_rate=settings.learning_rate)
+        return sprint(
+            matrix,
+            self.model(grid),
+            modes=modes,
+            choice=settings.modes_choice,
+            solver=settings.solver,
+            loss=settings.loss,
+            learning_rate=settings.learning_rate,
+        )
 
     def take_model_psf(self, *, frames: int = 20, progress: bool = False) -> NDArray[np.float32]:
         """The PSF of the flat mirror without turbulence, which Strehl ratios are measured against.
@@ -304,6 +313,53 @@ class System(Bench):
         from escape_hw.calibration.gain_search import best_gain
 
         procedure = best_gain(self, matrix, grid, gains=gains, frames=frames, model_psf=model_psf)
+        return self.run(procedure, progress=progress)
+
+    def find_optical_gains(
+        self,
+        calibration: CalibrationResult,
+        *,
+        poke: float = 0.002,
+        accuracy: float = 0.01,
+        frames: int = 20000,
+        model_psf: NDArray[np.float32] | None = None,
+        progress: bool = False,
+    ) -> GainsRun:
+        """Close the loop on a matrix of unknown scale and scale it, mode by mode, to the turbulence there.
+
+        Parameters
+        ----------
+        calibration
+            From :meth:`calibrate`, best with ``"escape"``.
+        poke
+            Last poke of each mode, rms surface as fraction of full stroke; lowered to a cost of 1 % of the
+            Strehl ratio.
+        accuracy
+            Relative standard error of the gains to go on for.
+        frames
+            Frames per round at most.
+        model_psf
+            From :meth:`take_model_psf`; with it every round tells its Strehl ratio.
+        progress
+            Show a bar with the time left.
+
+        Returns
+        -------
+        GainsRun
+            ``result`` holds the gains, ``rescaled`` the matrix to close the loop with.
+
+        Raises
+        ------
+        CalibrationError
+            The loop does not close, or does not stay closed; says why.
+        Aborted
+            Stopped by Ctrl-C.
+        """
+        from escape_hw.calibration.gain_bootstrap import bootstrap_gains
+
+        procedure = bootstrap_gains(
+            self, calibration, poke=poke, accuracy=accuracy, frames=frames, model_psf=model_psf
+        )
         return self.run(procedure, progress=progress)
 
 

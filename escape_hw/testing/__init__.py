@@ -17,6 +17,7 @@ from escape_hw.testing.faults import FaultyCamera, FaultyMirror
 from escape_hw.testing.mirror import mirror_checks
 from escape_hw.testing.modulator import modulator_checks
 from escape_hw.testing.screen import screen_checks
+from escape_hw.testing.secondary import secondary_checks
 from escape_hw.testing.suite import CheckResult, checks_for, parametrize_device_checks, run_checks
 
 __all__ = [
@@ -32,4 +33,5 @@ __all__ = [
     "parametrize_device_checks",
     "run_checks",
     "screen_checks",
+    "secondary_checks",
 ]

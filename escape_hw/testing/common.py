@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellState
 from escape_hw.api.camera import Camera
 from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror
@@ -101,12 +102,13 @@ def check_clock_never_runs_backwards(factory: Factory) -> None:
 def _uses(device: Any) -> dict[str, Callable[[], object]]:
     """Calls that need an open device of this kind."""
     if isinstance(device, DeformableMirror):
-        return {
+        uses: dict[str, Callable[[], object]] = {
             "send": lambda: device.send([0.0]),
             "flatten": device.flatten,
             "set_flat": lambda: device.set_flat([0.0]),
             "shape": lambda: device.shape,
         }
+        return uses | _uses_of_a_secondary(device)
     if isinstance(device, Camera):
         return {"start": device.start, "next_frame": device.next_frame, "poll": device.poll}
     if isinstance(device, TipTiltModulator):
@@ -119,6 +121,18 @@ def _uses(device: Any) -> dict[str, Callable[[], object]]:
     if isinstance(device, PhaseScreen):
         return {"set": device.set}
     return {"require_open": device.require_open}
+
+
+def _uses_of_a_secondary(device: Any) -> dict[str, Callable[[], object]]:
+    if not isinstance(device, AdaptiveSecondary):
+        return {}
+    return {
+        "state": lambda: device.state,
+        "health": lambda: device.health,
+        "measured_positions": device.measured_positions,
+        "go": lambda: device.go(ShellState.RESTED),
+        "recover": device.recover,
+    }
 
 
 COMMON: tuple[Check, ...] = (

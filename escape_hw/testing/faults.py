@@ -73,14 +73,16 @@ class FaultyMirror(DeformableMirror):
     def _present_shape(self) -> NDArray[np.float64]:
         return self.inner.shape
 
-    def _send(self, command: NDArray[np.float64]) -> None:
+    def _send(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
         number = self.transfers
         self.transfers += 1
         if self.lost_from is not None and number >= self.lost_from:
             raise DeviceLost(self.name, f"lost at transfer {number}, as arranged")
         if number in self.fail_sends:
             raise DeviceError(self.name, f"transfer {number} failed, as arranged")
-        self.reached.append(self.inner.send(command).sent.copy())
+        report = self.inner.send(command)
+        self.reached.append(report.sent.copy())
+        return report.sent if report.skipped else None
 
 
 class FaultyCamera(Camera):

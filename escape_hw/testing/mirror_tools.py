@@ -32,16 +32,18 @@ def gentle(dm: DeformableMirror, amplitude: float = 0.01) -> NDArray[np.float64]
 
 @contextmanager
 def spied(dm: DeformableMirror) -> Iterator[list[NDArray[np.float64]]]:
-    """Record every command whose transfer to the device succeeded, in order."""
+    """Record every command that the device took, in order."""
     reached: list[NDArray[np.float64]] = []
     transfer = dm._send  # noqa: SLF001 - what reaches the driver's transfer is what is checked
 
-    def recording(command: NDArray[np.float64]) -> None:
+    def recording(command: NDArray[np.float64]) -> NDArray[np.float64] | None:
         assert command.dtype == np.float64, f"the driver got {command.dtype}, not float64"
         assert command.flags.c_contiguous, "the driver got a command that is not contiguous"
         assert command.shape == (dm.info.n_act,), f"the driver got shape {command.shape}"
-        transfer(command)
-        reached.append(command.copy())
+        kept = transfer(command)
+        if kept is None:
+            reached.append(command.copy())
+        return kept
 
     with replaced(dm, "_send", recording):
         yield reached

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
+from escape_hw.api.modulator import Modulation, ModulatorInfo, ModulatorStatus, TipTiltModulator
 from escape_hw.errors import SettingRejected
 from escape_hw.testing.checks import READS, TINY, Check, Factory, check, opened, refused, replaced, up_to
 from escape_hw.testing.common import COMMON
@@ -111,6 +111,25 @@ def check_modulator_is_parked_when_closed(factory: Factory) -> None:
         assert at_the_end == [None], f"the stage was left at {at_the_end} when it was disconnected"
 
 
+@check(TINY)
+def check_modulator_status_moves_nothing(factory: Factory) -> None:
+    """``status`` says what the stage does, turning, parked and closed, and leaves it so."""
+    with opened(factory) as modulator:
+        for turning in (False, True):
+            if turning:
+                modulator.modulate(_wish(modulator))
+            now = modulator.modulation
+            status = modulator.status()
+            assert isinstance(status, ModulatorStatus), f"status() gave {type(status).__name__}"
+            assert status.info == modulator.info, f"status() speaks of {status.info}, not {modulator.info}"
+            assert status.modulation == now, f"status() tells {status.modulation}, modulation says {now}"
+            assert modulator.modulation == now, f"status() changed {now} to {modulator.modulation}"
+        modulator.close()
+        rest = modulator.status().modulation
+        assert rest is None, f"status() of the closed stage tells {rest}; closing parks"
+        assert not modulator.is_open, "status() left a stage open that was closed"
+
+
 MODULATOR: tuple[Check, ...] = (
     *COMMON,
     check_modulator_info,
@@ -119,6 +138,7 @@ MODULATOR: tuple[Check, ...] = (
     check_modulator_tells_the_truth,
     check_modulator_parks,
     check_modulator_is_parked_when_closed,
+    check_modulator_status_moves_nothing,
 )
 
 

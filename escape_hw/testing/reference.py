@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.camera import Camera
 from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
 from escape_hw.api.mirror import DeformableMirror, DMInfo
@@ -49,6 +50,44 @@ class RecordingMirror(DeformableMirror):
 
     def _send(self, command: NDArray[np.float64]) -> None:
         self.history.append(command.copy())
+
+
+class ObedientSecondary(AdaptiveSecondary):
+    """An adaptive secondary of 21 actuators that is at once wherever it is told to be."""
+
+    def __init__(self, name: str = "secondary", limits: MirrorLimits | None = None) -> None:
+        super().__init__(name, limits or MirrorLimits())
+        self._stands = ShellState.OFF
+        self._last = np.zeros(self.info.n_act)
+
+    @property
+    def info(self) -> DMInfo:
+        """Identity and geometry of :class:`RecordingMirror`."""
+        return RecordingMirror().info
+
+    def _open(self) -> None:
+        """Nothing to connect to."""
+
+    def _close(self) -> None:
+        """Nothing to disconnect from."""
+
+    def _drive(self, command: NDArray[np.float64]) -> None:
+        self._last = command
+
+    def _state(self) -> ShellState:
+        return self._stands
+
+    def _step(self, state: ShellState) -> None:
+        self._stands, self._last = state, self.flat
+
+    def _recover(self) -> None:
+        self._stands = ShellState.RESTED
+
+    def _measure(self) -> NDArray[np.float64]:
+        return self._last
+
+    def _health(self) -> ShellHealth:
+        return ShellHealth(self.now_ns(), self._stands, 50e-6, 0.1, 15.0, 0)
 
 
 class SyntheticCamera(Camera):

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from escape_hw.api.adaptive_secondary import AdaptiveSecondary
 from escape_hw.api.camera import Camera
 from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror
@@ -18,6 +19,7 @@ from escape_hw.testing.common import COMMON
 from escape_hw.testing.mirror import mirror_checks
 from escape_hw.testing.modulator import modulator_checks
 from escape_hw.testing.screen import screen_checks
+from escape_hw.testing.secondary import secondary_checks
 
 if TYPE_CHECKING:
     import pytest
@@ -35,6 +37,8 @@ class CheckResult:
 
 def checks_for(device: Device, max_level: int = 3) -> list[Check]:
     """Every check that fits the device's kind and changes no more than ``max_level`` allows."""
+    if isinstance(device, AdaptiveSecondary):
+        return secondary_checks(max_level)
     if isinstance(device, DeformableMirror):
         return mirror_checks(max_level)
     if isinstance(device, Camera):

@@ -78,7 +78,7 @@ class Atmosphere:
                 )
             )
 
-    def add(self, time_s: float, opd_m: NDArray[np.float32]) -> None:
-        """Add the optical path of a moment to ``opd_m (n, n)`` in metres."""
+    def add(self, time_s: float, opd_m: NDArray[np.float32], strength: float = 1.0) -> None:
+        """Add the optical path of a moment, times ``strength``, to ``opd_m (n, n)`` in metres."""
         for layer in self.layers:
-            layer.add(time_s, opd_m)
+            layer.add(time_s, opd_m, strength)

@@ -32,6 +32,12 @@ def shared_bench(config: SystemConfig, shared: dict[str, object]) -> SimBench:
     return bench
 
 
+def present_bench(shared: dict[str, object]) -> SimBench | None:
+    """The simulated bench of an opened system, if any of its devices is a twin that has been made."""
+    bench = shared.get(_SHARED)
+    return bench if isinstance(bench, SimBench) else None
+
+
 def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> SimMirror:
     """Entry point ``sim-alpao``."""
     return SimMirror(name, shared_bench(config, shared))
@@ -58,11 +64,7 @@ class SimMirror(DeformableMirror):
     def __init__(self, name: str, bench: SimBench) -> None:
         super().__init__(name, bench.config.devices.dm.limits.to_limits())
         self._bench = bench
-        dm = bench.config.devices.dm
-        self._info = DMInfo(
-            "simulated ALPAO DM97-15", dm.serial, dm.n_act, dm.actuator_map(), dm.positions() * dm.pitch_m,
-            dm.stroke_m, True,
-        )  # fmt: skip
+        self._info = bench.config.devices.dm.info("simulated ALPAO DM97-15", simulated=True)
 
     @property
     def info(self) -> DMInfo:
@@ -79,15 +81,13 @@ class SimMirror(DeformableMirror):
         return self._bench.now_ns
 
     def _open(self) -> None:
-        self._bench.dynamics.command(self._bench.now_s, np.zeros(self._info.n_act))
+        self._bench.place(np.zeros(self._info.n_act))
 
     def _close(self) -> None:
         """Nothing to release."""
 
     def _send(self, command: NDArray[np.float64]) -> None:
-        twin = self._bench.config.twin
-        jitter = twin.latency_jitter_s * abs(self._bench.latency_rng.standard_normal())
-        self._bench.dynamics.command(self._bench.now_s + twin.latency_s + jitter, command)
+        self._bench.drive(command)
 
 
 class _SimCamera(Camera):

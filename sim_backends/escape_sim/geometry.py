@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.obscuration import passed_share
 from escape_sim.telescope_pupil import soiled_share
 
 if TYPE_CHECKING:
+    from escape_hw.api.pyramid import PyramidPupils
     from escape_hw.config.models import SystemConfig
 
 #: Pupil samples across one lenslet: alias-free to +-4 lambda/d, several times the largest tilt.
@@ -76,6 +78,22 @@ def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeome
         # A sample that is covered in part keeps its share of the light, not of the amplitude.
         amplitude *= np.sqrt(passed_share(config.telescope, diameter, x))
     return PupilGeometry(n_sub, n_pix, d, x, amplitude.astype(np.float32))
+
+
+def pupil_of_images(config: SystemConfig, pupils: PyramidPupils) -> PupilGeometry:
+    """The pupil that a pyramid's images show.
+
+    Raises
+    ------
+    CalibrationError
+        The images have another size than the design's.
+    """
+    pupil = pupil_geometry(config)
+    if pupils.valid.shape != (pupil.n_sub, pupil.n_sub):
+        raise CalibrationError(
+            f"the pupil images have {pupils.valid.shape} pixels; sensor.n_sub is {pupil.n_sub}"
+        )
+    return pupil
 
 
 def usual_samples(config: SystemConfig) -> int:

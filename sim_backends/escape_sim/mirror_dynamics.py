@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 from collections import deque
 
 import numpy as np
@@ -14,6 +15,8 @@ _SETTLED = 4.744
 
 class MirrorDynamics:
     """Critically damped actuators with a slow creep, driven by time-stamped commands.
+
+    Commands may come from another thread than the one that lets time pass.
 
     Parameters
     ----------
@@ -36,26 +39,33 @@ class MirrorDynamics:
         self._speed = np.zeros(n_act)
         self._creep = np.zeros(n_act)
         self._pending: deque[tuple[float, NDArray[np.float64]]] = deque()
+        self._lock = threading.RLock()
 
     def command(self, time_s: float, shape: NDArray[np.float64]) -> None:
         """Take a command that reaches the actuators at ``time_s``; it saturates at full stroke."""
-        self._pending.append((time_s, np.clip(shape, -1.0, 1.0)))
+        with self._lock:
+            self._pending.append((time_s, np.clip(shape, -1.0, 1.0)))
 
     def mean(self, start_s: float, end_s: float) -> NDArray[np.float64]:
         """Mean displacement ``(n_act,)`` over an interval, in fractions of full stroke.
 
         Intervals must come in order of time; what lies before the last one is cut off.
         """
-        start = max(start_s, self._time)
-        self._advance(start)
-        if end_s <= start:
-            return self._position + self._creep_share * self._creep
-        total = self._advance(end_s)
-        return total / (end_s - start) + self._creep_share * self._creep
+        with self._lock:
+            start = max(start_s, self._time)
+            self._advance(start)
+            if end_s <= start:
+                return self._position + self._creep_share * self._creep
+            total = self._advance(end_s)
+            return total / (end_s - start) + self._creep_share * self._creep
 
     def at(self, time_s: float) -> NDArray[np.float64]:
         """Displacement ``(n_act,)`` at a moment to come, fractions of full stroke; time does not pass."""
-        return copy.deepcopy(self).mean(time_s, time_s)
+        with self._lock:
+            # No array is ever written into, so the copy may share them.
+            ahead = copy.copy(self)
+            ahead._pending = self._pending.copy()  # noqa: SLF001 - it is one of us
+            return ahead.mean(time_s, time_s)
 
     def _advance(self, until_s: float) -> NDArray[np.float64]:
         """Move on and return the integral of the position over the way."""
@@ -77,6 +87,6 @@ class MirrorDynamics:
         total = self._target * span + lag * (1 - decay) / w + slope * (1 - decay * (1 + w * span)) / w**2
         self._position = self._target + (lag + slope * span) * decay
         self._speed = (self._speed - w * slope * span) * decay
-        self._creep += (self._target - self._creep) * -np.expm1(-span / self._creep_time)
+        self._creep = self._creep + (self._target - self._creep) * -np.expm1(-span / self._creep_time)
         self._time = until_s
         return np.asarray(total)

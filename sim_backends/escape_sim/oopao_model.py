@@ -9,21 +9,17 @@ from numpy.typing import NDArray
 
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.pyramid import PyramidPupils
-from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, of_kind
 from escape_hw.config.sensor_models import ShackHartmannSection
 from escape_hw.errors import CalibrationError
 from escape_sim.geometry import pupil_geometry
 from escape_sim.model import nominal_grid
 from escape_sim.oopao_bridge import make_lenslets, make_light, quiet
-from escape_sim.oopao_mirror import STEP_M, NominalMirror
+from escape_sim.oopao_push_pull import PushPullModel
 from escape_sim.oopao_readout import SAMPLING, window_levers
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
-
-#: Actuators propagated together; bounds the memory.
-_BATCH = 16
 
 
 def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticModel:
@@ -45,7 +41,7 @@ def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticMo
     return OOPAOModel(config, nominal_grid(config) if grid is None else of_kind(grid, SubApertureGrid))
 
 
-class OOPAOModel:
+class OOPAOModel(PushPullModel):
     """Small-signal slopes with mirror, registration, field and diffraction by OOPAO 1.0.
 
     Slopes are push minus pull, the centre of gravity without threshold over the camera's own windows
@@ -61,15 +57,13 @@ class OOPAOModel:
         The grid found on the camera.
     """
 
-    name = "oopao"
-
     def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
         pupil = pupil_geometry(config)
         n_sub = pupil.n_sub
         if grid.valid.shape != (n_sub, n_sub):
             raise CalibrationError(f"the grid has {grid.valid.shape} lenslets; sensor.n_sub is {n_sub}")
-        self._pupil = pupil
         self._light = make_light(pupil.amplitude, pupil.sub_aperture_m * n_sub, config.system.wavelength_m)
+        super().__init__(config, pupil, self._light)
         self._lenslets = make_lenslets(self._light, n_sub, SAMPLING * pupil.n_pix)
         lit = self._lenslets.sh_data["src_0"].valid_subapertures
         if (grid.valid & ~lit).any():
@@ -77,7 +71,6 @@ class OOPAOModel:
                 f"{int((grid.valid & ~lit).sum())} valid sub-apertures of the grid lie outside the design's "
                 "pupil; check the grid and sensor.n_sub"
             )
-        self._n_slopes = grid.n_slopes
         self._levers = window_levers(
             grid,
             np.asarray(lit),
@@ -85,44 +78,6 @@ class OOPAOModel:
             pupil.n_pix,
             config.sensor_as(ShackHartmannSection).spot_px,
         )
-        self._mirror = NominalMirror(config, pupil, self._light)
-
-    @property
-    def n_act(self) -> int:
-        """Number of actuators."""
-        return self._mirror.n_act
-
-    @property
-    def sub_aperture_m(self) -> float:
-        """Size of a sub-aperture on the pupil in metres."""
-        return self._pupil.sub_aperture_m
-
-    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-        """Nominal influence functions ``(n_act, n, n)``, pupil ``(n, n)`` and pixel size in metres."""
-        return self._mirror.influence_functions()
-
-    def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
-        """Slopes in camera pixels per unit command ``(n_slopes, n_act)``, all x then all y.
-
-        Parameters
-        ----------
-        registration
-            Registration of the mirror.
-        width
-            Scale of the influence functions' width relative to nominal.
-        """
-        mirror = self._mirror.moved(registration, width)
-        # The mirror reflects: a surface of STEP_M changes the path by twice that.
-        pokes = np.eye(self.n_act) * 2 * STEP_M
-        out = np.empty((self._n_slopes, self.n_act))
-        for start in range(0, self.n_act, _BATCH):
-            part = pokes[:, start : start + _BATCH]
-            out[:, start : start + _BATCH] = self._slopes(mirror, part) - self._slopes(mirror, -part)
-        return out * self._mirror.per_step
-
-    def variants(self) -> list[OOPAOModel]:
-        """None: spots at rest leave nothing in doubt, see :class:`SyntheticModel`."""
-        return []
 
     def _slopes(self, mirror: Any, paths_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Spot positions ``(n_slopes, n)`` in camera pixels for mirror shapes ``(n_act, n)``."""

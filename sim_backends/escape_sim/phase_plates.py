@@ -55,10 +55,10 @@ class PhasePlates:
         """Turn at another speed from now on."""
         self._path, self._since, self._speed = self._path_at(now_s), now_s, speed_m_s
 
-    def add(self, time_s: float, opd_m: NDArray[np.float32]) -> None:
-        """Add the optical path of a moment to ``opd_m (n, n)`` in metres."""
+    def add(self, time_s: float, opd_m: NDArray[np.float32], strength: float = 1.0) -> None:
+        """Add the optical path of a moment, times ``strength``, to ``opd_m (n, n)`` in metres."""
         if self.inserted:
-            self._plate().add(self._path_at(time_s), opd_m)
+            self._plate().add(self._path_at(time_s), opd_m, strength)
 
     def _path_at(self, time_s: float) -> float:
         return self._path + self._speed * (time_s - self._since)

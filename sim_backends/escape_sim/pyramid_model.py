@@ -12,10 +12,9 @@ from escape_hw.api.pyramid import PyramidPupils, boxes
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes import karhunen_loeve
 from escape_hw.config.sensor_models import PyramidSection
-from escape_hw.errors import CalibrationError
 from escape_sim.air_scatter import air_scatter
 from escape_sim.fourier_filter import good_length
-from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry, pupil_of_images
 from escape_sim.influence import InfluenceFunctions
 from escape_sim.mode_surfaces import (
     N_DERIVATIVES,
@@ -99,11 +98,7 @@ class PyramidModel:
         modulation: Modulation | None = None,
         turbulence: float | None = None,
     ) -> None:
-        pupil = pupil_geometry(config)
-        if pupils.valid.shape != (pupil.n_sub, pupil.n_sub):
-            raise CalibrationError(
-                f"the pupil images have {pupils.valid.shape} pixels; sensor.n_sub is {pupil.n_sub}"
-            )
+        pupil = pupil_of_images(config, pupils)
         self._config, self._pupils, self._pupil = config, pupils, pupil
         self._positions = actuator_positions(config)
         self._pitch = pitch_on_pupil(config)

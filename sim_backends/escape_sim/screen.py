@@ -96,13 +96,15 @@ class RotatingScreen:
         self._first = np.where(lit.any(axis=1), lit.argmax(axis=1), 0)
         self._last = np.where(lit.any(axis=1), lit.shape[1] - lit[:, ::-1].argmax(axis=1), 0)
 
-    def add(self, path_m: float, out: NDArray[np.float32]) -> None:
+    def add(self, path_m: float, out: NDArray[np.float32], strength: float = 1.0) -> None:
         """Add the plate's optical path in metres to ``out (n, n)``.
 
         Parameters
         ----------
         path_m
             Length of the arc travelled at the pupil's centre in metres.
+        strength
+            Factor on it.
         """
         angle = path_m / self._radius
         c, s = float(np.cos(angle)), float(np.sin(angle))
@@ -111,6 +113,6 @@ class RotatingScreen:
         px, py = self._radius / self._pixel - half, -half
         middle = self._opd.shape[0] / 2
         _sample(
-            self._opd, np.float32(1), middle + c * px - s * py, middle + s * px + c * py, c, s,
+            self._opd, np.float32(strength), middle + c * px - s * py, middle + s * px + c * py, c, s,
             self._first, self._last, out,
         )  # fmt: skip

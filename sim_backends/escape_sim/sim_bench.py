@@ -14,13 +14,15 @@ from escape_hw.errors import ConfigError
 from escape_sim.atmosphere import Atmosphere
 from escape_sim.beam_circle import BeamCircle
 from escape_sim.detector import Detector
+from escape_sim.flexure import FlexingSurface, Flexure
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry, soiled_pupil
 from escape_sim.influence import InfluenceFunctions
 from escape_sim.measured_influence import MeasuredInfluence, read_influence
 from escape_sim.mirror_dynamics import MirrorDynamics
-from escape_sim.mirror_surface import InfluenceShapes, mirror_surface
+from escape_sim.mirror_surface import InfluenceShapes
 from escape_sim.phase_plates import PhasePlates
 from escape_sim.psf import FocalPlane
+from escape_sim.seeing import Seeing
 from escape_sim.sensor_optics import ModulatedOptics, SensorOptics, make_sensor_optics
 
 if TYPE_CHECKING:
@@ -55,9 +57,12 @@ class SimBench:
         self._wall_start = time.monotonic()
         dm, twin = config.devices.dm, config.twin
         self.influence = self._true_influence(truth)
-        self.registration = twin.registration.to_registration()
+        #: Where the mirror sits at a time: for tests and reports of a twin, never for an estimator.
+        self.flexure = Flexure(twin.registration.to_registration(), twin.drift)
+        #: How strong the turbulence is at a time; hidden likewise.
+        self.seeing = Seeing(twin.seeing)
         x = self.pupil.coordinates_m
-        self._surface = mirror_surface(self.influence, self.registration, self.pupil.sub_aperture_m, x, x)
+        self._surface = FlexingSurface(self.influence, self.flexure, self.pupil.sub_aperture_m, x, x)
         self.dynamics = MirrorDynamics(
             self.influence.n_act, twin.mirror.settling_s, twin.mirror.creep_fraction, twin.mirror.creep_time_s
         )
@@ -106,23 +111,42 @@ class SimBench:
                 # The wall clock went on while nobody looked (set-up, a long sum): that is not made up for.
                 self._wall_start -= wait
 
+    # ------------------------------------------------------------------ mirror
+    def drive(self, shape: NDArray[np.float64]) -> None:
+        """Send the actuators a shape ``(n_act,)``, which arrives after the twin's latency and jitter."""
+        twin = self.config.twin
+        jitter = twin.latency_jitter_s * abs(self.latency_rng.standard_normal())
+        self.dynamics.command(self.now_s + twin.latency_s + jitter, shape)
+
+    def place(self, shape: NDArray[np.float64]) -> None:
+        """Have the actuators take a shape ``(n_act,)`` from now on."""
+        self.dynamics.command(self.now_s, shape)
+
+    def positions(self) -> NDArray[np.float64]:
+        """Where the actuators are now ``(n_act,)``, fractions of full stroke."""
+        return self.dynamics.at(self.now_s)
+
     # ------------------------------------------------------------------ beam
     def optical_path(self, start_s: float, end_s: float) -> NDArray[np.float32]:
         """Mean optical path ``(n, n)`` in metres over an exposure, common to both cameras."""
         middle = 0.5 * (start_s + end_s)
-        opd = self.mirror_path(self.dynamics.mean(start_s, end_s))
-        self.plates.add(middle, opd)
+        opd = self.mirror_path(self.dynamics.mean(start_s, end_s), middle)
+        strength = self.seeing.strength(middle)
+        self.plates.add(middle, opd, strength)
         if self.air is not None:
-            self.air.add(middle, opd)
+            self.air.add(middle, opd, strength)
         tip, tilt = self._vibration(middle)
         if tip or tilt:
             x = self.pupil.coordinates_m.astype(np.float32)
             opd += (np.float32(tip) * x)[None, :] + (np.float32(tilt) * x)[:, None]
         return opd
 
-    def mirror_path(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Optical path ``(n, n)`` in metres that the settled mirror makes of a command ``(n_act,)``."""
-        opd = self._surface(command)
+    def mirror_path(self, command: NDArray[np.float64], time_s: float | None = None) -> NDArray[np.float32]:
+        """Optical path ``(n, n)`` in metres that the settled mirror makes of a command ``(n_act,)``.
+
+        Where the mirror sits at a time, in seconds; now by default.
+        """
+        opd = self._surface(command, self.now_s if time_s is None else time_s)
         opd *= self._metres
         return opd
 
@@ -160,7 +184,7 @@ class SimBench:
         """The sensor's optics, built when first used."""
         if self._sensor is None:
             self._sensor = make_sensor_optics(self.config, self.pupil)
-        circle = self.beam_circle.modulation
+        circle = self.beam_circle.state
         if circle is not self._circle_in_force:
             self._circle_in_force = circle
             if isinstance(self._sensor, ModulatedOptics):

@@ -10,19 +10,11 @@ from numpy.typing import NDArray
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.mirror import DMInfo
 from escape_sim.devices import shared_bench
+from escape_sim.shell import AMBIENT_C, RISE_C_PER_A, STEP_S, Shell
 from escape_sim.sim_bench import SimBench
 
 if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
-
-#: Gap of the floating shell (paper: about 50 um) and of one that lies on its reference body, metres.
-GAP_M, RESTED_GAP_M = 50e-6, 2e-6
-#: Noise of a capacitive position sensor in metres.
-SENSOR_NOISE_M = 3e-9
-#: Time in seconds that each step of the ladder takes.
-STEP_S = {ShellState.OFF: 0.5, ShellState.RESTED: 1.0, ShellState.SET: 2.0, ShellState.RUNNING: 0.1}
-#: Coil current in amperes that holds the shell, and what full stroke against the stiff shell adds.
-HOLD_A, STROKE_A = 0.05, 0.5
 
 
 def make_secondary(name: str, config: SystemConfig, shared: dict[str, object]) -> SimAdaptiveSecondary:
@@ -41,15 +33,9 @@ class SimAdaptiveSecondary(AdaptiveSecondary):
         dm = bench.config.devices.dm
         super().__init__(name, dm.limits.to_limits(), lift=bool(dm.options.get("lift", True)))
         self._bench = bench
-        self._now_in = ShellState.OFF
-        self._fault = ""
-        self._noise = np.random.default_rng(
-            np.random.SeedSequence(bench.config.system.seed, spawn_key=(0xA5,))
-        )
-        self._info = DMInfo(
-            "simulated MMT adaptive secondary", dm.serial, dm.n_act, dm.actuator_map(),
-            dm.positions() * dm.pitch_m, dm.stroke_m, True,
-        )  # fmt: skip
+        self._info = dm.info("simulated MMT adaptive secondary", simulated=True)
+        noise = np.random.SeedSequence(bench.config.system.seed, spawn_key=(0xA5,))
+        self._shell = Shell(bench, dm.n_act, dm.stroke_m, np.random.default_rng(noise))
 
     @property
     def info(self) -> DMInfo:
@@ -62,8 +48,7 @@ class SimAdaptiveSecondary(AdaptiveSecondary):
 
     def trip(self, reason: str) -> None:
         """Play a fault: coils off, the shell falls back on its reference body, latched."""
-        self._now_in, self._fault = ShellState.FAULT, reason
-        self._bench.dynamics.command(self._bench.now_s, np.zeros(self._info.n_act))
+        self._shell.trip(reason)
 
     def _open(self) -> None:
         """Nothing to connect."""
@@ -72,32 +57,28 @@ class SimAdaptiveSecondary(AdaptiveSecondary):
         """The mirror stays as it is."""
 
     def _drive(self, command: NDArray[np.float64]) -> None:
-        twin = self._bench.config.twin
-        jitter = twin.latency_jitter_s * abs(self._bench.latency_rng.standard_normal())
-        self._bench.dynamics.command(self._bench.now_s + twin.latency_s + jitter, command)
+        self._bench.drive(command)
 
     def _state(self) -> ShellState:
-        return self._now_in
+        return self._shell.state
 
     def _step(self, state: ShellState) -> None:
         self._bench.advance_to(self._bench.now_s + STEP_S[state])
-        self._now_in = state
-        # Afloat, the shell takes its flat shape; at rest it has that of its reference body.
-        shape = self.flat if state in (ShellState.SET, ShellState.RUNNING) else np.zeros(self._info.n_act)
-        self._bench.dynamics.command(self._bench.now_s, shape)
+        self._shell.arrive(state, self.flat)
 
     def _recover(self) -> None:
-        self._now_in, self._fault = ShellState.RESTED, ""
+        self._shell.recover()
 
     def _measure(self) -> NDArray[np.float64]:
-        true = self._bench.dynamics.at(self._bench.now_s)
-        return true + self._noise.standard_normal(true.size) * (SENSOR_NOISE_M / self._info.stroke_m)
+        return self._shell.measured()
+
+    def _glance(self) -> ShellHealth:
+        return self._health()
 
     def _health(self) -> ShellHealth:
-        places = self._bench.dynamics.at(self._bench.now_s)
-        floats = self._now_in in (ShellState.SET, ShellState.RUNNING)
-        gap = GAP_M + float(places.mean()) * self._info.stroke_m if floats else RESTED_GAP_M
-        current = HOLD_A + STROKE_A * float(np.abs(places).max()) if floats else 0.0
+        shell = self._shell
+        current = float(shell.currents_a().max())
         return ShellHealth(
-            self._bench.now_ns, self._now_in, gap, current, 15.0 + 10 * current, 0, self._fault
-        )
+            self._bench.now_ns, shell.state, shell.gap_m(), current, AMBIENT_C + RISE_C_PER_A * current, 0,
+            shell.fault,
+        )  # fmt: skip

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.config.sensor_models import ShackHartmannSection
@@ -18,8 +19,8 @@ if TYPE_CHECKING:
 
 #: Steps (rows down, columns right) from a window to the lenslets whose light it sees.
 STEPS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
-#: Nodes per axis of the Gauss-Hermite average over spot motion.
-_NODES = 5
+#: Nodes of the average over spot motion, and the step of their lattice: neighbouring Fibonacci numbers.
+_NODES, _STEP = 34, 21
 
 
 def slope_weights(
@@ -50,14 +51,27 @@ def slope_weights(
         For each step in :data:`STEPS`: ``(2, n_valid, p, p)`` in pixels per metre, x then y.
     """
     views = _Views(config, grid, pupil)
-    nodes, shares = np.polynomial.hermite_e.hermegauss(_NODES if grid.motion_px else 1)
-    shares = shares / shares.sum()
+    moves = grid.motion_px * gaussian_lattice() if grid.motion_px else np.zeros((1, 2))
     out = {step: np.zeros((2, grid.n_valid, pupil.n_pix, pupil.n_pix)) for step in STEPS}
-    for dy, wy in zip(nodes * grid.motion_px, shares, strict=True):
-        for dx, wx in zip(nodes * grid.motion_px, shares, strict=True):
-            views.accumulate(out, float(dx), float(dy), float(wx * wy))
+    for dx, dy in moves.tolist():
+        views.accumulate(out, dx, dy, 1 / len(moves))
     wave = 2 * np.pi / config.system.wavelength_m
     return {step: block * wave for step, block in out.items()}
+
+
+def gaussian_lattice() -> NDArray[np.float64]:
+    """Places ``(n, 2)`` of equal weight whose mean stands for that over a round Gaussian of unit rms.
+
+    What pixels and threshold do to a slope repeats from pixel to pixel, and a grid of few nodes that lie
+    more than half a pixel apart takes the repetition for a constant: with five Gauss-Hermite nodes per
+    axis the response kept a pattern of 4 %, and slopes seemed to sample the wavefront up to 2.5 % of a
+    sub-aperture off. On a Fibonacci lattice (Sloan & Joe 1994), mapped to the Gaussian axis by axis, no
+    two nodes share a coordinate; it is shifted so that every node has its mirror image.
+    """
+    i = np.arange(_NODES)
+    paired = (i * _STEP + (_STEP - 1) // 2) % _NODES
+    places = ndtri((np.stack([i, paired], axis=1) + 0.5) / _NODES)
+    return np.asarray(places / places.std(axis=0))
 
 
 class _Views:

@@ -85,13 +85,13 @@ class TurbulentLayer:
         """Time in seconds after which the correlation has really fallen to 1/e."""
         return _DECAY / self.rate if self.rate else math.inf
 
-    def add(self, time_s: float, out: NDArray[np.float32]) -> None:
-        """Add the layer at a moment to ``out (n, n)``."""
+    def add(self, time_s: float, out: NDArray[np.float32], strength: float = 1.0) -> None:
+        """Add the layer at a moment, times ``strength``, to ``out (n, n)``."""
         angle = self._start + self.rate * time_s
         quarter = math.floor(angle / (math.pi / 2))
         angle -= quarter * math.pi / 2
         one, two = self._pair(quarter)
-        share = np.array([math.cos(angle), math.sin(angle)]) * self._scale
+        share = np.array([math.cos(angle), math.sin(angle)]) * (self._scale * strength)
         # The air moves, so the pupil reads ever further upstream.
         x, y = (-v * time_s / self._source.pixel_m for v in self._wind)
         column, row = math.floor(x), math.floor(y)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from escape_hw.api.device import Device
-from escape_hw.api.modulator import ModulatorInfo
+from escape_hw.api.modulator import ModulatorInfo, ModulatorStatus
 from escape_hw.api.screen import ScreenInfo
 from escape_hw.errors import SettingRejected
 from escape_hw.testing import modulator_checks, screen_checks
@@ -61,6 +61,11 @@ def brags(self: Any) -> ModulatorInfo:
     return ModulatorInfo("bragging", "REF-MOD", math.inf, simulated=True)
 
 
+def tells_of_rest(self: Any) -> ModulatorStatus:
+    """Tell that nothing moves, always."""
+    return ModulatorStatus(self.info, None)
+
+
 BROKEN: list[Broken] = [
     ("brags of its reach", QuantisedModulator, "modulator_info", {"info": property(brags)}),
     ("check moves", QuantisedModulator, "modulator_check_changes_nothing", {"_check": checks_by_moving}),
@@ -73,6 +78,7 @@ BROKEN: list[Broken] = [
         "modulator_is_parked_when_closed",
         {"_before_close": lambda self: None},
     ),
+    ("status lies", QuantisedModulator, "modulator_status_moves_nothing", {"_status": tells_of_rest}),
     ("nobody's", SteadyScreen, "screen_info", {"info": ScreenInfo(" ", "1", True)}),
     ("counts from one", SteadyScreen, "screen_state_makes_sense", {"n_screens": property(lambda self: 1)}),
     ("takes anything", SteadyScreen, "screen_refuses_meaningless", {"set": repairs_screen}),

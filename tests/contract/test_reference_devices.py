@@ -14,7 +14,13 @@ from escape_hw.testing import (
     parametrize_device_checks,
     run_checks,
 )
-from escape_hw.testing.reference import QuantisedModulator, RecordingMirror, SteadyScreen, SyntheticCamera
+from escape_hw.testing.reference import (
+    ObedientSecondary,
+    QuantisedModulator,
+    RecordingMirror,
+    SteadyScreen,
+    SyntheticCamera,
+)
 
 TIGHT = MirrorLimits(max_stroke=0.8, max_slew=0.05, max_neighbour=0.4, max_mean=0.1, disabled=(3, 20))
 
@@ -33,6 +39,7 @@ FACTORIES: dict[str, Factory] = {
     "mirror-biased": biased_mirror,
     "mirror-wrapped": lambda: FaultyMirror(RecordingMirror("tight", TIGHT)),
     "mirror-biased-wrapped": lambda: FaultyMirror(biased_mirror()),
+    "secondary": ObedientSecondary,
     "camera": SyntheticCamera,
     "camera-wrapped": lambda: FaultyCamera(SyntheticCamera()),
     "modulator": QuantisedModulator,

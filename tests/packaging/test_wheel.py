@@ -83,6 +83,8 @@ def test_wheel_holds_four_packages_and_its_data(wheel: Path) -> None:
     stem = f"escape_hw-{escape_hw.__version__}"
     assert {name.split("/")[0] for name in names} == PACKAGES | {f"{stem}.dist-info", f"{stem}.data"}
     assert "escape_hw/config/systems/razor-shwfs.toml" in names
+    sources = {f"escape_sim/stand_ins/{part}" for part in ("stand_in.h", "asdk.c", "m3api.c", "aravis.c")}
+    assert sources <= set(names), "stand-ins are compiled where they are needed"
     assert f"{stem}.dist-info/licenses/LICENSE" in names
     assert any(name.startswith(f"{stem}.data/data/share/escape/udev/") for name in names)
     assert not [name for name in names if "__pycache__" in name or name.endswith(".pyc")]

@@ -8,7 +8,8 @@ import pytest
 from escape_hw.api.adaptive_secondary import LADDER, AdaptiveSecondary, ShellState
 from escape_hw.config.load import load_system
 from escape_hw.errors import DeviceError, NotOpen
-from escape_sim.sim_secondary import GAP_M, SimAdaptiveSecondary, make_secondary
+from escape_sim.shell import GAP_M
+from escape_sim.sim_secondary import SimAdaptiveSecondary, make_secondary
 
 QUICK = [
     "devices.dm.layout=rings-336",
@@ -35,7 +36,7 @@ def test_opening_leads_to_running_and_closing_to_rest() -> None:
         mirror.send(np.full(336, 0.1))
     with pytest.raises(NotOpen):
         _ = mirror.state
-    assert mirror._now_in is ShellState.RESTED
+    assert mirror._shell.state is ShellState.RESTED
     assert mirror.sent_count > 0
 
 

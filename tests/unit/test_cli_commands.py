@@ -24,7 +24,8 @@ def test_help_is_quick_and_light():
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     for command in (
-        "systems", "config", "calibrate", "sprint", "loop", "reproduce", "show", "compare", "report", "perf",
+        "systems", "config", "calibrate", "sprint", "gains", "loop", "track", "reproduce", "show", "compare",
+        "report", "perf", "dm", "camera", "asm", "doctor", "discover", "udev", "emulate",
     ):  # fmt: skip
         assert command in done.stdout
 
@@ -102,10 +103,20 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
     code, found, _ = document("sprint", "razor-shwfs", "--im", im, "--out", tmp_path / "run")
     assert code == 0
     assert set(found["registration"]) == REGISTRATION
-    asked = {"method": "docrime-whitened", "modes": 94, "learning_rate": 1.0, "misfit": True}
+    asked = {
+        "method": "docrime-whitened",
+        "modes": 94,
+        "learning_rate": 1.0,
+        "solver": "effects",
+        "choice": "snr",
+        "loss": "squares",
+    }
     assert bench.calls == [("sprint", asked)]
-    assert document("sprint", "razor-shwfs", "--im", im, "--light", "--out", tmp_path / "light")[0] == 0
-    assert bench.calls[1:] == [("sprint", {**asked, "misfit": False})]
+    assert (
+        document("sprint", "razor-shwfs", "--im", im, "--solver", "light", "--out", tmp_path / "light")[0]
+        == 0
+    )
+    assert bench.calls[1:] == [("sprint", {**asked, "solver": "light"})]
     assert not bench.benches
     product = load_matrix(found["products"]["im"])
     assert product.registration is not None

@@ -23,6 +23,10 @@ def test_show_and_compare(escape, document, im, tmp_path):
     assert len(found["correlation"]) == 94
     assert found["correlation"][50] > 0.99
     assert found["registration_difference"] is None
+    assert set(found["optical_gain"]) == {"deviation_ratio", "projection"}
+    for one in found["optical_gain"].values():
+        assert len(one["value"]) == len(one["sigma"]) == 94
+        assert one["value"][50] == pytest.approx(found["gain_ratio"][50], rel=0.05)
     assert "relative rms difference" in escape("compare", im, im)[1]
 
 

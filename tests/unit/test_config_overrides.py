@@ -16,6 +16,7 @@ from escape_hw.errors import ConfigError
         ("a.b=[1, 2]", [1, 2]),
         ('a.b="x = y"', "x = y"),
         ("a.b=hardware", "hardware"),
+        ("a.b=192.168.0.10", "192.168.0.10"),
         ("a.b=/data/my modes.fits", "/data/my modes.fits"),
         ("a.b=inf", float("inf")),
     ],
@@ -51,7 +52,7 @@ def test_overrides_apply_in_order_and_reach_keys_the_file_leaves_out() -> None:
             "loop.gain=0.1",
             "loop.gain=0.2",
             "devices.dm.limits.max_neighbour=0.4",
-            "devices.wfs.options.buffers=8",
+            "devices.dm.options.sync=wait",
             "devices.wfs.mode=hardware",
             "twin.registration={shift_x = 5}",
         ],
@@ -60,7 +61,7 @@ def test_overrides_apply_in_order_and_reach_keys_the_file_leaves_out() -> None:
     )
     assert config.loop.gain == 0.2
     assert config.devices.dm.limits.max_neighbour == 0.4
-    assert config.devices.wfs.options == {"buffers": 8}
+    assert config.devices.dm.options == {"sync": "wait"}
     assert (config.devices.wfs.mode, config.system.mode, config.system.seed) == ("hardware", "sim", 11)
     assert config.twin.registration.to_registration().to_array().tolist() == [5, 0, 0, 0, 0]
 

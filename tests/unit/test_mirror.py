@@ -168,6 +168,22 @@ def test_the_first_cause_comes_out_of_with() -> None:
     assert dm.closings == 1
 
 
+def test_what_is_lost_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
+    dm = Flaky()
+
+    def work() -> None:
+        with dm:
+            dm.send(np.full(N, 0.1))
+            dm.lost = True
+            dm.send(np.full(N, 0.2))
+
+    with pytest.raises(DeviceLost, match="cable out") as caught:
+        work()
+    assert not getattr(caught.value, "__notes__", [])
+    assert not caplog.records
+    assert dm.closings == 1
+
+
 def test_a_failed_flatten_is_not_hidden_by_a_failed_disconnection() -> None:
     dm = Flaky()
     dm.open()
@@ -310,3 +326,15 @@ def test_guard_report_reaches_the_counters() -> None:
     dm.open()
     assert (dm.clipped_count, dm.sent_count, dm.rejected_count) == (0, 0, 0)
     dm.close()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(-1.2, 1.2), min_size=N, max_size=N), st.floats(0.05, 1.0))
+def test_what_obeys_is_sent_as_it_is_and_nothing_else_is(values: list[float], slew: float) -> None:
+    with RecordingMirror("dm", MirrorLimits(max_stroke=0.9, max_slew=slew, max_mean=0.3)) as dm:
+        shape = np.array(values)
+        obeys = dm.obeys(shape)
+        assert dm.sent_count == 0
+        report = dm.send(shape)
+        assert obeys == report.guard.untouched
+        assert not obeys or np.array_equal(report.sent, shape)

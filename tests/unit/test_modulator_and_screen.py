@@ -58,6 +58,16 @@ def test_parking_needs_an_open_stage() -> None:
         QuantisedModulator().park()
 
 
+def test_a_stage_without_a_clock_of_its_own_is_parked_when_released() -> None:
+    stage = QuantisedModulator()
+    with pytest.raises(NotOpen):
+        stage.release()
+    stage.open().modulate(Modulation(1e-5, 300.0))
+    assert not stage.release()
+    assert not stage.is_open
+    assert stage.status().modulation is None
+
+
 def test_screen_keeps_what_is_not_given() -> None:
     with SteadyScreen() as screen:
         assert screen.set(inserted=False) == ScreenState(1, False, 0.0135)

@@ -166,7 +166,7 @@ def _narrower(bench: escape_hw.System) -> Any:
 
 def test_an_unknown_method_moves_nothing(bench: escape_hw.System) -> None:
     before = bench.dm.sent_count
-    methods = "push-pull, modulated, docrime, escape"
+    methods = "push-pull, push-pull-fast, modulated, docrime, escape"
     with pytest.raises(ConfigError, match=rf"'pushpull' is unknown; it is one of {methods}"):
         bench.calibrate("pushpull")
     assert bench.dm.sent_count == before

@@ -32,7 +32,7 @@ def test_ours_and_oopaos_sensor_give_the_same_matrix_and_ours_solves_it(alike, m
     ours = make_model(alike, None).modal_matrix(sprint.PLANTED, modes)
     scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
     assert np.linalg.norm(scale * ours - theirs) < 5e-6 * np.linalg.norm(theirs)
-    answer = sprint.Ours(alike, modes).solver(misfit=False, noise=False)(theirs)
+    answer = sprint.Ours(alike, modes).solver("light", noise=False)(theirs)
     assert answer.valid
     error = np.abs(answer.registration.to_array() - sprint.PLANTED.to_array())
     assert (error < [0.01, 0.01, 1e-4, 1e-3, 1e-3]).all()
@@ -51,7 +51,7 @@ def test_on_the_pyramid_both_solve_oopaos_matrix_and_ours_is_nearer():
     peer.set_up()
     mine, other = (
         np.abs(solve(theirs).registration.to_array() - at.to_array())
-        for solve in (sprint.Ours(config, low).solver(misfit=False, noise=False), peer.solve)
+        for solve in (sprint.Ours(config, low).solver("light", noise=False), peer.solve)
     )
     assert (mine < [0.02, 0.02, 1e-4, 1e-3, 1e-3]).all()
     assert (other < [0.2, 0.2, 1e-3, 0.05, 0.05]).all()
@@ -99,7 +99,9 @@ def test_far_answers_count_as_found_only_when_right_and_vouched_for(monkeypatch,
             return Answer(Registration(), self.calls % 2 == 0)
 
     monkeypatch.setattr(
-        sprint.Ours, "solver", lambda self, **given: lambda data: Answer(Registration.from_array(data), True)
+        sprint.Ours,
+        "solver",
+        lambda self, how, **given: lambda data: Answer(Registration.from_array(data), True),
     )
     found, wrong = sprint._from_afar(alike, Lost(), "sprint")
     n = len(sprint.PITCHES) * len(sprint.DIRECTIONS)

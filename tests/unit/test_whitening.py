@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from escape_hw.calibration.whitening import apply_filter, prediction_error_filter
+from escape_hw.calibration.whitening import (
+    apply_filter,
+    filter_by_past,
+    filters_by_past,
+    known_past,
+    prediction_error_filter,
+)
 
 PROCESSES = {
     "AR(1)": [0.95],
@@ -104,3 +110,34 @@ def test_applying_a_filter_is_a_convolution(dtype):
     assert apply_filter(x, w, at, 3) == pytest.approx(want[:, 3:], abs=1e-5)
     assert apply_filter(x, w, np.empty(0, np.intp), 3).shape == (0, 4)
     assert apply_filter(np.asfortranarray(x), w, at) == pytest.approx(want, abs=1e-5)
+
+
+def test_the_past_of_a_frame_ends_where_one_was_lost():
+    present = np.array([0, 1, 1, 1, 0, 1, 1, 1, 1, 1], bool)
+    assert known_past(present, 3).tolist() == [-1, 0, 1, 2, -1, 0, 1, 2, 3, 3]
+    assert known_past(np.ones(4, bool), 2).tolist() == [0, 1, 2, 2]
+
+
+def test_frames_with_a_short_past_are_whitened_as_well_and_weighted():
+    rng = np.random.default_rng(8)
+    n, copies = 40, 4000
+    noise = rng.standard_normal((n + 300, copies))
+    slow = np.zeros_like(noise)
+    for t in range(2, len(noise)):
+        slow[t] = 1.5 * slow[t - 1] - 0.56 * slow[t - 2] + noise[t]
+    rows, present = slow[300:], np.ones(n, bool)
+    present[20] = False
+    filters = filters_by_past(rows.astype(np.float32), present, 2)
+    np.testing.assert_allclose(filters[2], [1, -1.5, 0.56], atol=0.02)
+    white = filter_by_past(rows, filters, known_past(present, 2))
+    # All but the first frame and those lost or first after the loss.
+    assert white.shape == (n - 3, copies)
+    covariance = white @ white.T / copies
+    np.testing.assert_allclose(np.diag(covariance), 1.0, rtol=0.15)
+    assert np.abs(covariance - np.diag(np.diag(covariance))).max() < 0.2
+
+
+def test_without_prediction_every_frame_stays_as_it_is():
+    rows = np.arange(12.0).reshape(6, 2)
+    past = known_past(np.array([1, 1, 0, 1, 1, 1], bool), 0)
+    np.testing.assert_array_equal(filter_by_past(rows, [np.ones(1)], past), rows[[0, 1, 3, 4, 5]])

@@ -22,6 +22,7 @@ from escape_hw.calibration.derivatives import modal_jacobian, modal_matrix
 from escape_hw.calibration.modes import karhunen_loeve
 from escape_hw.calibration.sprint import sprint
 from escape_hw.config.load import load_system
+from escape_hw.config.models import Solver
 from escape_sim.benchmarks.oopao_sprint import Answer, Mirror, OopaoPeer
 from escape_sim.benchmarks.specula_sprint import MISSING, specula_peer
 from escape_sim.geometry import pitch_on_pupil, pupil_geometry
@@ -51,6 +52,8 @@ PITCHES, DIRECTIONS = (0.25, 0.5, 1.0, 1.5, 2.0), (20.0, 200.0)
 ELSE = (1.0, 2.0, 0.0)
 #: What counts as found from afar, in the units of the parameters; there is no noise in these.
 NEAR = np.array([5.0, 5.0, 0.1, 0.5, 0.5])
+#: Gain and registration only, and with what the model does not know.
+_HOW: tuple[Solver, ...] = ("light", "effects")
 _OOPAO_SENSOR = ("sensor.pitch_px=16", "sensor.spot_px=2")
 #: OOPAO's pupil images stand on a square around the middle of its grid.
 _OOPAO_PYRAMID = (
@@ -76,7 +79,7 @@ def run() -> list[BenchmarkRow]:
         oopao = OopaoPeer(alike, modes)
         rows += _matrices(alike, oopao, what)
         rows += _times(alike, oopao, what, NOISE)
-        rows += _exact(alike, oopao, what, (("no noise, light", False),))
+        rows += _exact(alike, oopao, what, (("no noise, light", "light"),))
         rows += _accuracy(alike, bench, oopao, what)
         rows += _from_afar(alike, oopao, what)
         rows += _beside_specula(bench, modes)
@@ -92,7 +95,9 @@ def pyramid_rows() -> list[BenchmarkRow]:
         oopao = OopaoPeer(alike, modes)
         rows += _matrices(alike, oopao, what)
         rows += _times(alike, oopao, what, 0.0)
-        rows += _exact(alike, oopao, what, (("no noise, light", False), ("no noise, with misfit", True)))
+        rows += _exact(
+            alike, oopao, what, (("no noise, light", "light"), ("no noise, with misfit", "effects"))
+        )
         rows += _from_afar(alike, oopao, what)
     return rows
 
@@ -121,7 +126,7 @@ class Ours:
     config: SystemConfig
     m2c: NDArray[np.float64]
 
-    def solver(self, *, misfit: bool, noise: bool = True) -> Solve:
+    def solver(self, how: Solver, noise: bool = True) -> Solve:
         """The model built, and the solver on it, told of the noise or of none."""
         grid = _sensor(self.config)
         model = make_model(self.config, grid)
@@ -137,7 +142,7 @@ class Ours:
                 "push-pull",
                 True,
             )
-            found = sprint(matrix, model, misfit=misfit)
+            found = sprint(matrix, model, solver=how)
             return Answer(found.registration, found.converged)
 
         return solve
@@ -219,7 +224,7 @@ def _times(config: SystemConfig, oopao: OopaoPeer, what: str, noise: float) -> l
     who, note = f"{oopao.name}, 6 iterations", f"OOPAO's matrix, {noise:.0%} noise"
     set_up = alternate(lambda: make_model(config, None), oopao.set_up, rounds=2)
     wide_up = alternate(lambda: list(make_model(config, None).variants()), None, rounds=2)[0]
-    light, full = (ours.solver(misfit=misfit, noise=noisy) for misfit in (False, True))
+    light, full = (ours.solver(how, noise=noisy) for how in _HOW)
     solve = alternate(lambda: light(data), lambda: oopao.solve(data), rounds=3)
     wide = alternate(lambda: full(data), None, rounds=3)[0]
     theirs = _sum(set_up[1], solve[1])
@@ -238,22 +243,22 @@ def _sum(a: float | None, b: float | None) -> float | None:
 
 
 def _exact(
-    config: SystemConfig, oopao: OopaoPeer, what: str, cases: Sequence[tuple[str, bool]]
+    config: SystemConfig, oopao: OopaoPeer, what: str, cases: Sequence[tuple[str, Solver]]
 ) -> list[BenchmarkRow]:
     """Errors on a matrix of OOPAO's without noise, for solvers with a label and with misfit or not."""
     oopao.set_up()
     at, ours = planted(config), Ours(config, oopao.m2c)
     matrix = [oopao.matrix(at, mirror(False))]
     theirs, rows = _errors(oopao.solve, matrix, at), []
-    for label, misfit in cases:
-        mine = _errors(ours.solver(misfit=misfit, noise=False), matrix, at)
+    for label, how in cases:
+        mine = _errors(ours.solver(how, noise=False), matrix, at)
         rows += _error_rows(what, label, mine, theirs, f"{oopao.name}, 6 iterations")
     return rows
 
 
 def _accuracy(alike: SystemConfig, bench: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
     """Errors on OOPAO's noisy matrices, and each on its own."""
-    light, full = (Ours(alike, oopao.m2c).solver(misfit=misfit) for misfit in (False, True))
+    light, full = (Ours(alike, oopao.m2c).solver(how) for how in _HOW)
     own = Ours(bench, oopao.m2c)
     who, rows = f"{oopao.name}, 6 iterations", []
     for kind in ("ideal", "real"):
@@ -263,14 +268,14 @@ def _accuracy(alike: SystemConfig, bench: SystemConfig, oopao: OopaoPeer, what: 
             mine = _errors(solve, matrices, PLANTED)
             rows += _error_rows(what, f"{kind} mirror, {label}", mine, theirs, who)
         if kind == "ideal":
-            mine = _errors(own.solver(misfit=False), _draws(own.matrix(PLANTED)), PLANTED)
+            mine = _errors(own.solver("light"), _draws(own.matrix(PLANTED)), PLANTED)
             rows += _error_rows(what, "ideal mirror, each its own sensor", mine, theirs, who)
     return rows
 
 
 def _from_afar(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
     """How many far registrations are found, and how many wrong ones are vouched for."""
-    light = Ours(config, oopao.m2c).solver(misfit=False, noise=False)
+    light = Ours(config, oopao.m2c).solver("light", noise=False)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
     # The same share of the pupil on every sensor.
     near = NEAR * ([config.sensor.n_sub / PLANTED_SUB] * 2 + [1] * 3)
@@ -300,7 +305,7 @@ def _from_afar(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[Benchm
 
 def _beside_specula(config: SystemConfig, modes: NDArray[np.float64]) -> list[BenchmarkRow]:
     ours = Ours(config, modes)
-    light, what = ours.solver(misfit=False), f"sprint, {modes.shape[1]} modes"
+    light, what = ours.solver("light"), f"sprint, {modes.shape[1]} modes"
     mine = _draws(ours.matrix(PLANTED_EVEN))
     peer = specula_peer(config, modes, make_model(config, None))
     label, note = "each its own sensor, light", "one scaling planted; SPECULA knows no more"

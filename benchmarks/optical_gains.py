@@ -1,0 +1,208 @@
+"""Optical gains on a pyramid twin: against the twin's truth, and what they do for the loop.
+
+    python benchmarks/optical_gains.py gains --seeds 1 2 3      bias and errors against the truth
+    python benchmarks/optical_gains.py loops --seeds 1 2 3      Strehl ratios of three matrices, paired
+    python benchmarks/optical_gains.py pokes --seeds 1 2 3      Strehl ratio with and without the last pokes
+
+One JSON document per seed and line. The truth is push-pull around wavefronts frozen while the loop ran.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.api.results import CalibrationResult, LoopResult
+from escape_hw.calibration.closed_loop import closed_loop
+from escape_hw.calibration.gain_bootstrap import GainsRun, bootstrap_gains
+from escape_hw.calibration.gain_loop import GainLoop
+from escape_hw.calibration.gain_smoothing import smoothed
+from escape_hw.calibration.optical_gain import projector, slope_weights
+from escape_hw.calibration.poke_cost import strehl_loss, within_budget
+from escape_hw.calibration.sensor_setup import poke_amplitudes
+from escape_hw.pipeline.strehl import strehl
+from escape_hw.runtime.system import System, open_system
+from escape_sim.local_response import FrozenWavefronts, local_gains, twin_behind
+
+
+def calibrated(bench: System, frames: int) -> tuple[CalibrationResult, CalibrationResult]:
+    """ESCAPE under turbulence, and the baseline (push-pull without it) on the same geometry."""
+    escape = bench.calibrate("escape", frames=frames)
+    baseline = bench.calibrate("push-pull", frames=5, grid=escape.grid)
+    return escape, baseline
+
+
+def gains(bench: System, options: argparse.Namespace) -> dict[str, Any]:
+    """Gains at pokes of 0.2 % of the stroke against push-pull around the frozen wavefronts."""
+    _, baseline = calibrated(bench, options.calibration)
+    pupils, twin = baseline.grid, twin_behind(bench)
+    if not isinstance(pupils, PyramidPupils):
+        raise SystemExit("optical gains are a pyramid's; choose another system")
+    loop = GainLoop(bench, baseline, {})
+    loop.control.set_gain(bench.config.loop.gain)
+    amplitude = poke_amplitudes(bench, baseline.matrix.m2c, options.poke)
+    watching = None
+    try:
+        loop.start()
+        bench.run(loop.measure(400, amplitude, "settling"))
+        watching = FrozenWavefronts(twin, max(1, options.frames // options.wavefronts))
+        stretch = bench.run(loop.measure(options.frames, amplitude, "gains"))
+    finally:
+        loop.open_again()
+        if watching is not None:
+            watching.close()
+    if stretch.gains is None or watching is None:
+        raise SystemExit(f"no gains: {stretch.why}")
+    rows = projector(baseline.matrix, slope_weights(baseline.matrix))
+    every = range(0, baseline.matrix.n_modes, options.every)
+    true = local_gains(twin, pupils, baseline.matrix.m2c, rows, watching.kept, modes=list(every))[:, every]
+    mean, error = true.mean(axis=0), true.std(axis=0, ddof=1) / np.sqrt(len(true))
+    value, sigma = stretch.gains.value[0][every], stretch.gains.sigma[0][every]
+    best = smoothed(stretch.gains.value[0], stretch.gains.sigma[0], stretch.gains.common_sigma)
+    weights = sigma**-2.0
+    off = float(np.average(value / mean - 1, weights=weights))
+    # All modes of a wavefront are weak or strong together, so the few wavefronts' level is uncertain, too.
+    level = true.mean(axis=1)
+    level_sigma = float(level.std(ddof=1) / level.mean() / np.sqrt(len(level)))
+    own = float(weights.sum() ** -0.5 / mean.mean())
+    noise = np.hypot(sigma, error)
+    return {
+        "frames": stretch.frames,
+        "truth": [float(mean.min()), float(np.median(mean)), float(mean.max())],
+        "bias": off,
+        "bias_sigma": float(np.linalg.norm([own, stretch.gains.common_sigma, level_sigma])),
+        "truth_level_sigma": level_sigma,
+        "chi2_beside_bias": float(np.mean(np.square((value - mean * (1 + off)) / noise))),
+        "rms_error": float(np.sqrt(np.mean(np.square(value / mean - 1)))),
+        "rms_error_best": float(np.sqrt(np.mean(np.square(best.best[every] / mean - 1)))),
+        "rms_sigma": float(np.sqrt(np.mean(np.square(sigma / mean)))),
+        "common_sigma": stretch.gains.common_sigma,
+        "residual_nm": stretch.residual_nm,
+    }
+
+
+def bootstrapped(bench: System, matrix: CalibrationResult, options: argparse.Namespace) -> GainsRun:
+    """The bootstrap from a matrix."""
+    return bench.run(bootstrap_gains(bench, matrix, frames=options.frames, accuracy=options.accuracy))
+
+
+def scaled(result: CalibrationResult, factor: float) -> CalibrationResult:
+    """A calibration whose matrix is wrong by a factor."""
+    matrix, f = result.matrix, np.float32(factor)
+    return replace(
+        result, matrix=replace(matrix, data=matrix.data * f, sigma=matrix.sigma * f), measured=None
+    )
+
+
+def loops(bench: System, options: argparse.Namespace) -> dict[str, Any]:
+    """Strehl ratios with the baseline, with ESCAPE scaled by its optical gains, with DO-CRIME alone."""
+    escape, baseline = calibrated(bench, options.calibration)
+    if escape.measured is None:
+        raise SystemExit("too few frames for a DO-CRIME matrix")
+    psf = bench.take_model_psf(frames=5)
+    run = bootstrapped(bench, escape, options)
+    docrime = replace(escape, matrix=escape.measured, measured=None)
+    document: dict[str, Any] = {
+        "converged": run.result.converged,
+        "bootstrap_frames": run.result.frames,
+        "steps": len(run.result.closure),
+        "rounds": len(run.result.rounds),
+    }
+    usual = bench.config.loop.gain
+    shares = [
+        float(np.median(m.matrix.data.std(0) / run.rescaled.matrix.data.std(0))) for m in (baseline, docrime)
+    ]
+    matrices = {
+        "escape+og": (run.rescaled, 1.0),
+        "baseline": (baseline, shares[0]),
+        "docrime": (docrime, shares[1]),
+    }
+    for name, (matrix, share) in matrices.items():
+        # Each around the gain that is the usual one for its scale, as a sweep would find it, and each on
+        # a bench of its own with the same seed: the same turbulence from the first frame on.
+        document[name] = []
+        for factor in options.factors:
+            with open_system(options.system, seed=bench.config.system.seed, set=options.set) as fresh:
+                document[name].append(_judged(fresh, matrix, usual * share * factor, options.loop, psf))
+    return document
+
+
+def _judged(bench: System, matrix: CalibrationResult, gain: float, frames: int, psf: Any) -> dict[str, Any]:
+    result: LoopResult = bench.run(
+        closed_loop(bench, matrix.matrix, matrix.grid, gain=gain, frames=frames, model_psf=psf)
+    )
+    peak = result.strehl.peak if result.strehl is not None else None
+    return {
+        "gain": gain,
+        "strehl": None if peak is None else [peak.value, peak.sigma],
+        "stable": result.stable,
+    }
+
+
+def pokes(bench: System, options: argparse.Namespace) -> dict[str, Any]:
+    """Strehl ratio with the budgeted pokes, with those of 0.2 % of the stroke, and with next to none."""
+    _, baseline = calibrated(bench, options.calibration)
+    psf = bench.take_model_psf(frames=5)
+    whole = poke_amplitudes(bench, baseline.matrix.m2c, options.poke)
+    optics = bench.dm.info.stroke_m, bench.config.system.wavelength_m
+    # Not zero, of which no estimator takes: a thousandth, which costs nothing.
+    kinds = {"none": 1e-3 * whole, "budget": within_budget(whole, 0.01, *optics), "whole": whole}
+    document: dict[str, Any] = {name: {"predicted": strehl_loss(a, *optics)} for name, a in kinds.items()}
+    for name, amplitude in kinds.items():
+        # Each on a bench of its own with the same seed: the same turbulence from the first frame on.
+        with open_system(options.system, seed=bench.config.system.seed, set=options.set) as fresh:
+            loop = GainLoop(fresh, baseline, {}, science=True)
+            loop.control.set_gain(fresh.config.loop.gain)
+            try:
+                loop.start()
+                stretch = fresh.run(loop.measure(options.frames, amplitude, name))
+            finally:
+                loop.open_again()
+        one = strehl(stretch.record.science.images(), psf).peak
+        document[name] |= {"strehl": [one.value, one.sigma], "poke": float(amplitude.max())}
+    return document
+
+
+def options_of(arguments: list[str] | None = None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("gains", "loops", "pokes"))
+    parser.add_argument("--system", default="razor-pywfs")
+    parser.add_argument("--set", nargs="*", default=[])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--calibration", type=int, default=1500, help="frames of ESCAPE")
+    parser.add_argument("--frames", type=int, default=4000, help="frames of a measurement, at most")
+    parser.add_argument("--accuracy", type=float, default=0.02)
+    parser.add_argument("--poke", type=float, default=0.002)
+    parser.add_argument("--wavefronts", type=int, default=60)
+    parser.add_argument(
+        "--every", type=int, default=6, help="modes from one to the next that the truth is made for"
+    )
+    parser.add_argument("--loop", type=int, default=900, help="frames of each closed loop")
+    parser.add_argument("--factors", nargs="+", type=float, default=[0.8, 1.2, 1.6])
+    return parser.parse_args(arguments)
+
+
+def documents(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """One for each seed."""
+    what: Callable[[System, argparse.Namespace], dict[str, Any]]
+    what = {"gains": gains, "loops": loops, "pokes": pokes}[options.what]
+    for seed in options.seeds:
+        began = time.monotonic()
+        with open_system(options.system, seed=seed, set=options.set) as bench:
+            document = what(bench, options)
+        yield {"what": options.what, "seed": seed, **document, "wall_s": round(time.monotonic() - began, 1)}
+
+
+if __name__ == "__main__":
+    for one in documents(options_of()):
+        print(json.dumps(one), flush=True)

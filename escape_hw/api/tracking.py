@@ -1,0 +1,118 @@
+"""What tracking yields, second by second."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import PARAMETERS
+from escape_hw.api.results import CalibrationResult
+
+#: Columns of the table, after those of the registration.
+_OTHERS = (
+    "optical_gain", "optical_gain_sigma", "misfit", "surprise", "noise", "mismatch", "residual_nm",
+    "strehl", "strehl_sigma", "exchanged",
+)  # fmt: skip
+COLUMNS = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS), *_OTHERS)
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """Something that a new registration does not explain.
+
+    Parameters
+    ----------
+    seconds
+        When, since tracking began.
+    kind
+        ``jump``, ``misfit``, ``noise``, ``actuator``, ``limit``, ``diverged`` or ``dark``.
+    text
+        What happened and what to do.
+    """
+
+    seconds: float
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """A new matrix, with the evidence for it.
+
+    Parameters
+    ----------
+    seconds
+        When it was proposed.
+    accepted
+        Whether the loop runs with it.
+    change
+        Change of the registration since the matrix in use, by parameter: value and standard error.
+    gain
+        Change of the mean optical gain, relative, and its standard error.
+    mismatch, mismatch_sigma
+        Rms relative difference of the two matrices, and how much of it the errors let one expect.
+    slowest, fastest
+        Least and largest loop gain of any combination of modes with the matrix in use, relative to what
+        was asked for (eigenvalues of ``R_use D_new``); the exchange makes both 1.
+    """
+
+    seconds: float
+    accepted: bool
+    change: dict[str, tuple[float, float]]
+    gain: tuple[float, float]
+    mismatch: float
+    mismatch_sigma: float
+    slowest: float
+    fastest: float
+
+
+@dataclass(slots=True, eq=False)
+class TrackResult:
+    """A stretch of tracking.
+
+    Parameters
+    ----------
+    rows
+        One list for each column of :data:`COLUMNS`, in its order; NaN where nothing was measured.
+    optical_gain, optical_gain_sigma
+        Gain of every mode at the end, relative to the matrix that tracking began with ``(n_modes,)``.
+    exchanges, alarms
+        In the order of time.
+    latest
+        The last pseudo-synthetic matrix, whether the loop runs with it or not; ``None`` before the first.
+    stable
+        False when the loop was opened because it diverged or went dark.
+    """
+
+    rows: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in COLUMNS})
+    optical_gain: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    optical_gain_sigma: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    exchanges: list[Exchange] = field(default_factory=list)
+    alarms: list[Alarm] = field(default_factory=list)
+    latest: CalibrationResult | None = None
+    frames: int = 0
+    lost_frames: int = 0
+    rate_hz: float = 0.0
+    poke: float = 0.0
+    stable: bool = True
+    partial: bool = False
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """A column of the table."""
+        return np.array(self.rows[name])
+
+    def add(self, **values: float) -> None:
+        """Append a row; what is not given is NaN."""
+        unknown = set(values) - set(self.rows)
+        if unknown:
+            raise ValueError(f"the table has no columns {', '.join(sorted(unknown))}")
+        for name, column in self.rows.items():
+            column.append(float(values.get(name, np.nan)))
+
+    def to_csv(self) -> str:
+        """The table as text, one line per update."""
+        lines = [",".join(COLUMNS)]
+        lines += [",".join(f"{v:.6g}" for v in row) for row in zip(*self.rows.values(), strict=True)]
+        return "\n".join(lines) + "\n"

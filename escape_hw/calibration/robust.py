@@ -1,0 +1,27 @@
+"""Sub-apertures that do not fit in with the others: less weight for them (Huber 1964)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Residual of a sub-aperture, relative to the median one, up to which it counts in full.
+_USUAL = 1.5
+#: Rounds of weighing and fitting; the weights hardly move after the second.
+ROUNDS = 3
+
+
+def trust(residual: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weight of every slope's squares ``(n_slopes,)``, in (0, 1].
+
+    Huber's weights, for sub-apertures instead of elements: dirt, a broken lenslet or a wrong window spoil a
+    sub-aperture in all modes and in both slopes.
+
+    Parameters
+    ----------
+    residual
+        What a fit leaves ``(n_slopes, n_modes)`` in standard errors, all x then all y.
+    """
+    by_place = np.square(residual).mean(axis=1).reshape(2, -1).mean(axis=0)
+    size = np.sqrt(by_place / max(float(np.median(by_place)), 1e-300))
+    return np.tile(np.minimum(1.0, _USUAL / np.maximum(size, 1e-300)), 2)

@@ -1,0 +1,174 @@
+"""The ways in which SPRINT solves its problem, each behind the same few words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.registration import Registration
+from escape_hw.api.results import SprintIteration
+from escape_hw.calibration.batches import BatchProblem
+from escape_hw.calibration.capture import capture, low_modes
+from escape_hw.calibration.covariance import Linearised
+from escape_hw.calibration.diagonal import DiagonalProblem
+from escape_hw.calibration.light import SMALL, LightFit, LightProblem
+from escape_hw.calibration.linearisation import Learned, Problem
+from escape_hw.calibration.misfit import Priors
+from escape_hw.calibration.weighted import WeightedMatrix
+from escape_hw.config.models import Solver
+
+T = TypeVar("T")
+
+#: Largest move in one iteration: the model is only locally linear.
+LARGEST = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
+#: Solvers that take the columns for modes, and so need a matrix.
+BY_MODES: tuple[Solver, ...] = ("batches", "diagonal")
+
+
+@dataclass(slots=True, eq=False)
+class Descent:
+    """What is the same for every solver of one matrix, and the steps that were taken.
+
+    Parameters
+    ----------
+    matrix, model, columns
+        The measured matrix, the model, and which columns to fit.
+    solver, learning_rate, max_iterations, priors
+        As for :func:`~escape_hw.calibration.sprint.sprint`.
+    """
+
+    matrix: InteractionMatrix
+    model: SyntheticModel
+    columns: NDArray[np.intp]
+    solver: Solver
+    learning_rate: float
+    max_iterations: int
+    priors: Priors
+    history: list[SprintIteration] = field(default_factory=list)
+    report: Reporter = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.report = Reporter("SPRINT", self.max_iterations, "iteration")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Where a descent ended, alike for every solver.
+
+    ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``, ``learned`` what the data say about the
+    scatter of the random effects, where there are any; ``scatter`` is what is to be added to the covariance
+    of the registration ``(5, 5)``.
+    """
+
+    system: Linearised
+    alpha: NDArray[np.float64]
+    gain: float
+    width: float
+    settled: bool
+    zonal: Callable[[], NDArray[np.float64]]
+    scatter: NDArray[np.float64] | None = None
+    learned: Callable[[], Learned] | None = None
+
+
+def solve(
+    descent: Descent, weighted: WeightedMatrix, start: NDArray[np.float64], reach: bool
+) -> Procedure[Solution]:
+    """Solve for a weighted matrix.
+
+    Parameters
+    ----------
+    descent
+        Matrix, model and how to solve; the steps are kept there.
+    weighted
+        The columns, weighted.
+    start
+        Registration to start from ``(5,)``.
+    reach
+        Whether to come from afar first.
+    """
+    model, rate, most = descent.model, descent.learning_rate, descent.max_iterations
+    if descent.solver in BY_MODES:
+        low = low_modes(descent.matrix, model, descent.columns, rate) if reach else None
+        if low is not None:
+            start = (yield from _watched(low.descend(start, most), descent)).alpha
+        if descent.solver == "diagonal":
+            return _of_light(
+                (yield from _watched(DiagonalProblem(weighted, model, rate).descend(start, most), descent)),
+                model,
+            )
+        steps = BatchProblem(weighted, model, rate).descend(start, most)
+        fit, scatter = yield from _watched(steps, descent)
+        return _of_light(fit, model, scatter)
+    frozen = descent.solver == "frozen"
+    if reach:
+        far = capture(descent.matrix, model, descent.columns, start, most, rate, frozen)
+        light = yield from _watched(far, descent)
+        start = light.alpha
+    elif descent.solver != "effects":
+        light = yield from _watched(LightProblem(weighted, model, rate, frozen).descend(start, most), descent)
+    if descent.solver != "effects":
+        return _of_light(light, model)
+    problem = Problem(weighted, model, descent.priors)
+    return (yield from _with_effects(problem, Registration.from_array(start), descent))
+
+
+def _of_light(fit: LightFit, model: SyntheticModel, scatter: NDArray[np.float64] | None = None) -> Solution:
+    def zonal() -> NDArray[np.float64]:
+        return np.asarray(fit.gain * model.zonal_matrix(Registration.from_array(fit.alpha)))
+
+    return Solution(fit, fit.alpha, fit.gain, 1.0, fit.settled, zonal, scatter)
+
+
+def _watched(steps: Generator[LightFit, None, T], descent: Descent) -> Procedure[T]:
+    """Hand on the progress of a descent and keep its steps."""
+    while True:
+        try:
+            fit = next(steps)
+        except StopIteration as done:
+            last: T = done.value
+            return last
+        norm = float(np.linalg.norm(fit.step / LARGEST))
+        descent.history.append(_record(fit.alpha, fit.gain, fit.residual, norm))
+        if progress := descent.report.step():
+            yield progress
+
+
+def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Procedure[Solution]:
+    """Gauss-Newton on registration and random effects together."""
+    state, settled = problem.start(start), False
+    system = problem.linearise(state)
+    for _ in range(descent.max_iterations):
+        if progress := descent.report.step():
+            yield progress
+        step = system.solve()
+        if not np.isfinite(step).all():
+            break
+        spread = np.sqrt(np.abs(np.diag(np.linalg.inv(system.information()))))[1:6]
+        spread *= problem.weighted.noise(system.residual)
+        relative = np.abs(step[1:6]) / np.maximum(SMALL, 0.02 * spread)
+        norm = float(np.linalg.norm(step[1:6] / LARGEST))
+        descent.history.append(_record(state.alpha, state.gain, system.residual, norm))
+        if relative.max() < 1.0:
+            settled = True
+            break
+        damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / LARGEST)))
+        state = problem.move(state, step * damping * descent.learning_rate)
+        system = problem.linearise(state)
+    return Solution(
+        system, state.alpha, state.gain, 1 + state.width, settled,
+        lambda: problem.zonal(state), learned=lambda: problem.learned(state, system),
+    )  # fmt: skip
+
+
+def _record(
+    alpha: NDArray[np.float64], gain: float, residual: NDArray[np.float64], norm: float
+) -> SprintIteration:
+    chi2 = float(np.mean(np.square(residual)))
+    return SprintIteration(Registration.from_array(alpha), gain, norm, chi2)

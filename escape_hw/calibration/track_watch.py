@@ -1,0 +1,100 @@
+"""Alarms of the tracker: what a new registration does not explain."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from escape_hw.api.registration import Registration
+from escape_hw.api.tracking import Alarm
+from escape_hw.calibration.live_registration import LiveEstimate
+
+#: Standard errors that an update may miss what was expected by.
+JUMP = 8.0
+#: Mean square misfit of an update's own frames beside the usual from which on the model does not hold; and
+#: how loud they may be beside the usual.
+MISFIT, LOUD = 2.5, 2.0
+#: An actuator that answers by less or more than this beside the others is not what the model takes it for.
+STRANGE_ACTUATOR = 0.5
+#: Updates after an alarm in which nothing is exchanged, and which alarms of one kind are one.
+QUIET = 5
+#: Updates that tell what is usual.
+_USUAL = 30
+
+
+class TrackWatch:
+    """Looks at every update.
+
+    Parameters
+    ----------
+    start
+        Registration that tracking began with.
+    largest_shift
+        How far the mirror may shift before a new calibration is due, % of a sub-aperture.
+    """
+
+    def __init__(self, start: Registration, largest_shift: float) -> None:
+        self._start, self._largest = start.to_array(), largest_shift
+        self._noise: deque[float] = deque(maxlen=_USUAL)
+        self._misfit: deque[float] = deque(maxlen=_USUAL)
+        self._last: dict[str, int] = {}
+        self._updates = 0
+
+    @property
+    def calm(self) -> bool:
+        """Whether there was no alarm lately."""
+        return all(self._updates - at > QUIET for at in self._last.values())
+
+    def look(self, live: LiveEstimate, seconds: float) -> list[Alarm]:
+        """New alarms of an update; one of a kind that is on already is not repeated."""
+        self._updates += 1
+        found = []
+        for kind, text in self._findings(live).items():
+            if self._updates - self._last.get(kind, -2 * QUIET) > QUIET:
+                found.append(Alarm(seconds, kind, text))
+            self._last[kind] = self._updates
+        if not found:
+            self._noise.append(live.noise)
+            self._misfit.append(live.misfit)
+        return found
+
+    def _findings(self, live: LiveEstimate) -> dict[str, str]:
+        found = {}
+        if live.surprise > JUMP:
+            found["jump"] = (
+                f"registration or gain jumped by {live.surprise:.1f} standard errors within one update; "
+                "the live registration starts anew"
+            )
+        misfit = _usual(self._misfit)
+        if live.misfit > MISFIT * max(misfit, 1.0):
+            found["misfit"] = (
+                f"the slopes do not follow the pokes as any registration would have it (mean square misfit "
+                f"{live.misfit:.2f} of the noise, usually {misfit:.2f}); look for dead actuators, a changed "
+                "flip, lost light"
+            )
+        usual = _usual(self._noise)
+        if live.noise > LOUD * usual:
+            found["noise"] = (
+                f"the slopes move {live.noise / usual:.1f} times as much as usual beyond what the mirror "
+                "explains; is there enough light, or does something vibrate?"
+            )
+        worst = int(np.argmax(np.abs(live.actuators)))
+        if abs(live.actuators[worst]) > STRANGE_ACTUATOR:
+            found["actuator"] = (
+                f"actuator {worst} answers by {1 + live.actuators[worst]:.0%} of the others; check it, and "
+                "disable it (devices.dm.limits.disabled) if it is dead"
+            )
+        moved = float(np.abs(live.registration.registration.to_array() - self._start)[:2].max())
+        if moved > self._largest:
+            found["limit"] = (
+                f"the mirror has shifted by {moved:.0f} % of a sub-aperture since the start, more than "
+                f"tracking.largest_shift ({self._largest:g}); calibrate anew"
+            )
+        return found
+
+
+def _usual(values: Sequence[float]) -> float:
+    """Median of what was seen lately; infinite before there is enough of it."""
+    return float(np.median(values)) if len(values) >= QUIET else float(np.inf)

@@ -1,0 +1,1 @@
+"""Emulators: devices that answer on their own wires."""

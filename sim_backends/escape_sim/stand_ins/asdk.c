@@ -1,0 +1,354 @@
+/* Stand-in of ALPAO's libasdk: one mirror, the plain C calls of asdkDM.h, strict about their order. */
+#define _GNU_SOURCE
+#include "stand_in.h"
+
+typedef double Scalar;
+typedef uint32_t UInt;
+typedef int32_t Int;
+typedef int COMPL_STAT;
+#define SUCCESS 0
+#define FAILURE (-1)
+#define MAX_ACT 4096
+#define MAX_DM 8
+#define STACK 64
+
+enum range_mode { REFUSE, SKIP, ACCEPT };
+
+typedef struct asdkDM {
+    int open;     /* 0 never or released, 1 ready, 2 failed to initialise */
+    int playing;  /* a pattern is being sent: repeats left, -1 endless */
+    int64_t played_until;
+    int touched;  /* moved, and not reset since */
+    int linked;   /* to a simulated bench */
+    Scalar shape[MAX_ACT];
+    struct si_link bench;
+} asdkDM;
+
+struct parameter {
+    const char *name;
+    int gets, sets;
+    Scalar low, high, initial, value;
+};
+
+static struct parameter parameters[] = {
+    {"NbOfActuator", 1, 0, 0, 0, 0, 0},
+    {"VersionInfo", 1, 0, 0, 0, 3040500612.0, 0},
+    {"ItfState", 1, 0, 0, 0, 0, 0},
+    {"SyncMode", 0, 1, 0, 1, 0, 0},
+    {"AckTimeout", 1, 1, 0, 60000, 1000, 0},
+    {"TriggerMode", 0, 1, 0, 1, 0, 0},
+    {"TriggerIn", 0, 1, 0, 2, 0, 0},
+    {"UseException", 1, 1, 0, 1, 0, 0},
+    {"LogPrintLevel", 1, 1, 0, 4, 1, 0},
+    {"LogDump", 0, 1, 1, 1, 0, 0},
+    {"DacReset", 0, 1, 1, 1, 0, 0},
+    {"NbSteps", 1, 1, 1, 1000, 1, 0},
+    {"Gain", 1, 1, 0, 65535, 8191, 0},
+    {"ResetOnClose", 1, 1, 0, 1, 0, 0},
+};
+#define N_PARAMETERS (int)(sizeof parameters / sizeof *parameters)
+
+static asdkDM mirrors[MAX_DM];
+static char my_serial[64];
+static int n_act, peeks;
+static enum range_mode range_mode;
+static struct {
+    UInt number;
+    char text[128];
+} errors[STACK];
+static int n_errors;
+static Scalar present[MAX_ACT];
+static long reached;
+
+static struct parameter *parameter_of(const char *name) {
+    for (int k = 0; k < N_PARAMETERS; k++)
+        if (name && strcasecmp(name, parameters[k].name) == 0) return &parameters[k];
+    return NULL;
+}
+
+static void si_forget(void) {
+    for (int k = 0; k < MAX_DM; k++) {
+        if (mirrors[k].open) si_unlink_bench(&mirrors[k].bench);
+        memset(&mirrors[k], 0, sizeof mirrors[k]);
+        mirrors[k].bench.fd = -1;
+    }
+    for (int k = 0; k < N_PARAMETERS; k++) parameters[k].value = parameters[k].initial;
+    snprintf(my_serial, sizeof my_serial, "SIM97");
+    n_act = 97;
+    peeks = n_errors = 0;
+    reached = 0;
+    range_mode = REFUSE;
+    memset(present, 0, sizeof present);
+}
+
+static int si_set(const char *key, const char *value) {
+    if (strcmp(key, "serial") == 0) return snprintf(my_serial, sizeof my_serial, "%s", value) > 0;
+    if (strcmp(key, "actuators") == 0) return (n_act = atoi(value)) >= 1 && n_act <= MAX_ACT;
+    if (strcmp(key, "peeks") == 0) return (peeks = atoi(value)) >= 0;
+    if (strcmp(key, "range") == 0) {
+        static const char *const names[] = {"refuse", "ignore", "accept"};
+        for (int k = 0; k < 3; k++)
+            if (strcmp(value, names[k]) == 0) return (range_mode = (enum range_mode)k), 1;
+    }
+    return 0;
+}
+
+EXPORT const char *escape_stand_in(void) { return "libasdk stand-in"; }
+
+/* The shape the mirror has now; the number of transfers that reached it. */
+EXPORT long escape_stand_in_shape(Scalar *out, int n) {
+    memcpy(out, present, sizeof(Scalar) * (size_t)(n < MAX_ACT ? n : MAX_ACT));
+    return reached;
+}
+
+static COMPL_STAT fails(UInt number, const char *what) {
+    pthread_mutex_lock(&si_mutex);
+    if (n_errors == STACK) memmove(errors, errors + 1, sizeof *errors * (STACK - 1)), n_errors--;
+    errors[n_errors].number = number;
+    snprintf(errors[n_errors].text, sizeof errors->text, "%s", what);
+    n_errors++;
+    pthread_mutex_unlock(&si_mutex);
+    return FAILURE;
+}
+
+/* What every call on a mirror begins with; 0 when it may go on, else its outcome is in *outcome. */
+static int refused(asdkDM *dm, struct si_function *function, struct si_rule *rule, COMPL_STAT *outcome) {
+    *rule = si_enter(function);
+    if (dm < mirrors || dm >= mirrors + MAX_DM || dm->open == 0) {
+        si_complain("%s: the handle is not that of an open mirror", function->name);
+        return *outcome = fails(0x100, "bad handle"), 1;
+    }
+    if (dm->open == 2 && strcmp(function->name, "asdkRelease") != 0)
+        si_complain("%s: asdkInit had failed; the real library may crash here", function->name);
+    if (si_unplugged) return *outcome = fails(0x101, "interface not connected"), 1;
+    switch (rule->action) {
+    case SI_ERROR: return *outcome = fails((UInt)rule->argument, "as the script says"), 1;
+    case SI_IGNORE: return *outcome = SUCCESS, 1;
+    case SI_TIMEOUT:
+        si_sleep_until(si_now_ns() + rule->argument * 1000000);
+        return *outcome = fails(0x10D, "acknowledge time-out"), 1;
+    case SI_RESET:
+        memset(present, 0, sizeof present);
+        return *outcome = fails(0x105, "the electronics were reset"), 1;
+    default: return 0;
+    }
+}
+
+static int is_playing(asdkDM *dm) {
+    if (dm->playing > 0 && si_now_ns() >= dm->played_until) dm->playing = 0;
+    return dm->playing != 0;
+}
+
+EXPORT asdkDM *asdkInit(const char *serial) {
+    static struct si_function f = {.name = "asdkInit"};
+    struct si_rule rule = si_enter(&f);
+    si_log("asdkInit %s", serial ? serial : "NULL");
+    if (si_unplugged) return fails(0x101, "interface not connected"), NULL;
+    if (rule.action == SI_ERROR) return fails((UInt)rule.argument, "as the script says"), NULL;
+    asdkDM *dm = NULL;
+    for (int k = MAX_DM - 1; k >= 0; k--)
+        if (mirrors[k].open == 0) dm = &mirrors[k];
+    for (int k = 0; k < MAX_DM; k++)
+        if (mirrors[k].open == 1) {
+            si_complain("asdkInit: the mirror has an owner already");
+            return fails(4, "already loaded"), NULL;
+        }
+    if (dm == NULL) return fails(2, "too many mirrors"), NULL;
+    if (rule.action == SI_HALF) {
+        dm->open = 2;
+        fails((UInt)rule.argument, "as the script says");
+        return dm;
+    }
+    uint32_t greeting[1] = {0};
+    int linked = si_link_bench(&dm->bench, "mirror", serial ? serial : "", greeting, sizeof greeting);
+    if (linked < 0 || (linked == 0 && (serial == NULL || strcmp(serial, my_serial) != 0)))
+        return fails(0x24, "cannot open the binary configuration of this serial number"), NULL;
+    if (linked) n_act = (int)greeting[0];
+    dm->open = 1;
+    dm->playing = dm->touched = 0;
+    dm->linked = linked;
+    parameters[0].value = n_act;
+    return dm;
+}
+
+EXPORT COMPL_STAT asdkRelease(asdkDM *dm) {
+    static struct si_function f = {.name = "asdkRelease"};
+    struct si_rule rule;
+    COMPL_STAT outcome = SUCCESS;
+    si_log("asdkRelease");
+    int no = refused(dm, &f, &rule, &outcome);
+    if (dm < mirrors || dm >= mirrors + MAX_DM || dm->open == 0) return outcome;
+    if (dm->open == 1 && is_playing(dm) && !si_unplugged)
+        si_complain("asdkRelease: a pattern is being sent; asdkStop first");
+    if (dm->open == 1 && dm->touched && !si_unplugged)
+        si_complain("asdkRelease: the mirror is not at zero; asdkReset first");
+    dm->open = 0;
+    si_unlink_bench(&dm->bench);
+    return no ? outcome : SUCCESS;
+}
+
+static COMPL_STAT transfer(asdkDM *dm, const Scalar *v) {
+    if (dm->linked && si_ask(&dm->bench, SI_SEND, v, (uint32_t)(sizeof *v * (size_t)n_act), NULL, 0, NULL))
+        return fails(0x101, "the simulated bench has gone");
+    memcpy(present, v, sizeof *v * (size_t)n_act);
+    dm->touched = 1;
+    reached++;
+    return SUCCESS;
+}
+
+/* 1 good, 0 refused, -1 quietly not moved. */
+static int within(const char *function, const Scalar *v, int n) {
+    for (int k = 0; k < n; k++) {
+        if (!isfinite(v[k])) {
+            si_complain("%s: value %d is not finite", function, k);
+            return 0;
+        }
+        if (fabs(v[k]) > 1 && range_mode != ACCEPT) {
+            si_complain("%s: value %d is %g, out of range", function, k, v[k]);
+            return range_mode == REFUSE ? 0 : -1;
+        }
+    }
+    return 1;
+}
+
+EXPORT COMPL_STAT asdkSend(asdkDM *dm, const Scalar *v) {
+    static struct si_function f = {.name = "asdkSend"};
+    struct si_rule rule;
+    COMPL_STAT outcome;
+    if (si_recording && v) si_log("asdkSend %.17g %.17g .. %.17g", v[0], v[1], v[n_act - 1]);
+    if (refused(dm, &f, &rule, &outcome)) return outcome;
+    if (v == NULL) return si_complain("asdkSend: no values"), fails(0x100, "missing parameter");
+    if (is_playing(dm)) {
+        si_complain("asdkSend: a pattern is being sent; asdkStop first");
+        return fails(0x106, "asynchronous transfer");
+    }
+    int fit = within("asdkSend", v, n_act);
+    if (fit == 0) return fails(0x11, "value out of range");
+    return fit < 0 ? SUCCESS : transfer(dm, v);
+}
+
+EXPORT COMPL_STAT asdkSendPattern(asdkDM *dm, const Scalar *p, UInt n_pattern, UInt n_repeat) {
+    static struct si_function f = {.name = "asdkSendPattern"};
+    struct si_rule rule;
+    COMPL_STAT outcome;
+    si_log("asdkSendPattern %u %u", n_pattern, n_repeat);
+    if (refused(dm, &f, &rule, &outcome)) return outcome;
+    if (p == NULL || n_pattern == 0) {
+        si_complain("asdkSendPattern: no values");
+        return fails(0x100, "missing parameter");
+    }
+    if (is_playing(dm)) {
+        si_complain("asdkSendPattern: a pattern is being sent; asdkStop first");
+        return fails(0x106, "asynchronous transfer");
+    }
+    if (within("asdkSendPattern", p, n_act * (int)n_pattern) == 0) return fails(0x11, "value out of range");
+    outcome = transfer(dm, p + (size_t)(n_pattern - 1) * (size_t)n_act);
+    dm->playing = n_repeat ? (int)n_repeat : -1;
+    /* A millisecond each: the class of this mirror's settling time. */
+    dm->played_until = si_now_ns() + (int64_t)n_pattern * n_repeat * 1000000;
+    return outcome;
+}
+
+EXPORT COMPL_STAT asdkStop(asdkDM *dm) {
+    static struct si_function f = {.name = "asdkStop"};
+    struct si_rule rule;
+    COMPL_STAT outcome;
+    si_log("asdkStop");
+    if (refused(dm, &f, &rule, &outcome)) return outcome;
+    dm->playing = 0;
+    return SUCCESS;
+}
+
+EXPORT COMPL_STAT asdkReset(asdkDM *dm) {
+    static struct si_function f = {.name = "asdkReset"};
+    static const Scalar zeros[MAX_ACT];
+    struct si_rule rule;
+    COMPL_STAT outcome;
+    si_log("asdkReset");
+    if (dm >= mirrors && dm < mirrors + MAX_DM) dm->touched = 0; /* asked for, even if it fails now */
+    if (refused(dm, &f, &rule, &outcome)) return outcome;
+    if (is_playing(dm)) si_complain("asdkReset: a pattern is being sent; asdkStop first");
+    if (dm->linked && transfer(dm, zeros) != SUCCESS) return FAILURE;
+    memset(present, 0, sizeof present);
+    dm->touched = 0;
+    return SUCCESS;
+}
+
+EXPORT COMPL_STAT asdkGet(asdkDM *dm, const char *name, Scalar *out) {
+    static struct si_function f = {.name = "asdkGet"};
+    struct si_rule rule;
+    COMPL_STAT outcome;
+    si_log("asdkGet %s", name ? name : "NULL");
+    if (refused(dm, &f, &rule, &outcome)) return outcome;
+    struct parameter *p = parameter_of(name);
+    if (p == NULL) return fails(0x10, "unknown command name");
+    if (!p->gets) return fails(0x10A, "not supported");
+    if (out == NULL) return si_complain("asdkGet: nowhere to write"), fails(0x100, "missing parameter");
+    *out = p->value;
+    return SUCCESS;
+}
+
+EXPORT COMPL_STAT asdkSet(asdkDM *dm, const char *name, Scalar value) {
+    static struct si_function f = {.name = "asdkSet"};
+    struct si_rule rule;
+    COMPL_STAT outcome;
+    si_log("asdkSet %s %g", name ? name : "NULL", value);
+    if (refused(dm, &f, &rule, &outcome)) return outcome;
+    struct parameter *p = parameter_of(name);
+    if (p == NULL) return fails(0x10, "unknown command name");
+    if (!p->sets) return fails(0x10A, "not supported");
+    if (!(value >= p->low && value <= p->high)) {
+        si_complain("asdkSet: %s = %g, out of range", p->name, value);
+        return fails(0x11, "value out of range");
+    }
+    p->value = value;
+    return SUCCESS;
+}
+
+EXPORT COMPL_STAT asdkSetString(asdkDM *dm, const char *name, const char *value) {
+    static struct si_function f = {.name = "asdkSetString"};
+    struct si_rule rule;
+    COMPL_STAT outcome;
+    si_log("asdkSetString %s %s", name ? name : "NULL", value ? value : "NULL");
+    if (refused(dm, &f, &rule, &outcome)) return outcome;
+    return name && strcasecmp(name, "CfgPath") == 0 ? SUCCESS : fails(0x10, "unknown command name");
+}
+
+EXPORT COMPL_STAT asdkSetVector(asdkDM *dm, const char *name, Scalar *v, Int n) {
+    static struct si_function f = {.name = "asdkSetVector"};
+    struct si_rule rule;
+    COMPL_STAT outcome;
+    si_log("asdkSetVector %s %d", name ? name : "NULL", n);
+    if (refused(dm, &f, &rule, &outcome)) return outcome;
+    if (v == NULL || n < 1) return fails(0x100, "missing parameter");
+    return name && strcasecmp(name, "mcff") == 0 ? SUCCESS : fails(0x10, "unknown command name");
+}
+
+/* Public users disagree whether reading takes the entry off the stack. Here it goes once its text was
+ * fetched, or, with 'set peeks 1', never by reading: a driver must get along with both. */
+EXPORT COMPL_STAT asdkGetLastError(UInt *number, char *text, size_t size) {
+    COMPL_STAT outcome = FAILURE;
+    pthread_mutex_lock(&si_mutex);
+    if (n_errors > 0) {
+        if (number) *number = errors[n_errors - 1].number;
+        if (text && size) snprintf(text, size, "%s", errors[n_errors - 1].text);
+        if (text && size && !peeks) n_errors--;
+        outcome = SUCCESS;
+    }
+    pthread_mutex_unlock(&si_mutex);
+    return outcome;
+}
+
+EXPORT void asdkPrintLastError(void) {
+    UInt number;
+    char text[128];
+    if (asdkGetLastError(&number, text, sizeof text) == SUCCESS) fprintf(stderr, "0x%X %s\n", number, text);
+}
+
+/* Nanoseconds per asdkSend when a C program calls it, the least there can be. */
+EXPORT double escape_stand_in_time(asdkDM *dm, const Scalar *v, long n) {
+    int64_t start = si_now_ns();
+    for (long k = 0; k < n; k++)
+        if (asdkSend(dm, v) != SUCCESS) return NAN;
+    return (double)(si_now_ns() - start) / (double)n;
+}

@@ -1,0 +1,302 @@
+"""A simulated bench that the stand-ins of vendor libraries talk to: real drivers close the loop on it.
+
+A driver's process loads a stand-in, which connects to this server over a local socket: shapes go in, frames
+come out, one request and one reply at a time. Time is the twin's: it advances when a frame is asked for, as
+it does for the twin's own devices, however long a driver takes.
+
+Request: verb and length (two uint32), then so many bytes. Reply: status (0 good, 1 nothing in time, 2
+refused) and length (two int32), then so many bytes. All in the machine's own byte order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import logging
+import os
+import shutil
+import socket
+import struct
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from escape_hw.api.camera import Camera
+from escape_hw.api.emulator import EmulatorRequest
+from escape_hw.api.frames import CameraSettings, Region
+from escape_hw.errors import EscapeError, FrameTimeout
+from escape_sim.devices import make_mirror, make_science_camera, make_wfs_camera, shared_bench
+from escape_sim.emulators.e727 import E727
+from escape_sim.stand_ins.build import build
+
+if TYPE_CHECKING:
+    from escape_hw.config.models import SystemConfig
+
+log = logging.getLogger(__name__)
+
+_HEAD, _ANSWER = struct.Struct("=II"), struct.Struct("=ii")
+_START, _FRAME, _FRAME_HEAD = struct.Struct("=4I3d"), struct.Struct("=d"), struct.Struct("=qq")
+_GOOD, _LATE, _REFUSED = 0, 1, 2
+#: Larger requests than any shape are nonsense.
+_LONGEST = 1 << 20
+#: A wait that only asks whether a frame is there; the twin's clock hardly moves.
+_NO_WAIT_S = 1e-6
+#: Environment variable that names each stand-in's library to its driver.
+VARIABLES = {
+    "asdk": "ESCAPE_ALPAO_LIBRARY",
+    "m3api": "ESCAPE_XIMEA_LIBRARY",
+    "aravis": "ESCAPE_ARAVIS_LIBRARY",
+}
+_SOCKET_VARIABLE = "ESCAPE_STAND_IN_BENCH"
+#: Environment variable that leads the modulator's driver to an emulated controller.
+E727_VARIABLE = "ESCAPE_E727"
+
+Answer = tuple[int, bytes]
+
+
+class Verb(enum.IntEnum):
+    """What a stand-in asks, see ``stand_in.h``."""
+
+    HELLO = 1
+    SEND = 2
+    START = 3
+    FRAME = 4
+    STOP = 5
+
+
+class BenchServer:
+    """The twin of a system behind a local socket; usable as a context manager.
+
+    Parameters
+    ----------
+    config
+        The system; its devices need not be in hardware mode here.
+    shared
+        Dictionary of the opened system, through which emulators of other devices find the same twin.
+
+    Attributes
+    ----------
+    environment
+        What a process needs in its environment for its drivers to find the stand-ins and this bench.
+    requests
+        Number of requests answered, per verb.
+    modulator
+        Emulated controller of the modulator, where the system has one.
+    """
+
+    def __init__(self, config: SystemConfig, shared: dict[str, object] | None = None) -> None:
+        self.config = config
+        self.shared: dict[str, object] = {} if shared is None else shared
+        self.environment: dict[str, str] = {}
+        self.requests = dict.fromkeys(Verb, 0)
+        # The twin is one world with one clock; its devices take turns.
+        self._turn = threading.Lock()
+        self._listener: socket.socket | None = None
+        self._folder: Path | None = None
+        self.modulator: E727 | None = None
+        self._connections: set[socket.socket] = set()
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> str:
+        """Build the twin and listen; returns the socket's path.
+
+        Raises
+        ------
+        StandInUnavailable
+            The stand-ins cannot be compiled on this machine.
+        """
+        libraries = {variable: str(build(name)) for name, variable in VARIABLES.items()}
+        shared_bench(self.config, self.shared)
+        self._folder = Path(tempfile.mkdtemp(prefix="escape-"))
+        path = str(self._folder / "bench")
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._listener.bind(path)
+        self._listener.listen()
+        self.environment = {**libraries, _SOCKET_VARIABLE: path, **self._emulated_modulator()}
+        thread = threading.Thread(target=self._accept, name="bench", daemon=True)
+        thread.start()
+        self._threads.append(thread)
+        return path
+
+    def _emulated_modulator(self) -> dict[str, str]:
+        """Start the controller of a modulator, which turns the twin's beam; returns where it listens."""
+        section = self.config.devices.modulator
+        if section is None or section.driver != "pi-e727":
+            return {}
+        options = {"serial": section.serial, "zeroed": "1"}
+        request = EmulatorRequest(port=0, options=options, shared=self.shared, config=self.config)
+        self.modulator = E727(request)
+        return {E727_VARIABLE: self.modulator.start().removeprefix("tcp ")}
+
+    def stop(self) -> None:
+        """Hang up and stop listening; may be repeated."""
+        if self.modulator is not None:
+            self.modulator.stop()
+            self.modulator = None
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            for one in (listener, *self._connections):
+                with contextlib.suppress(OSError):
+                    one.shutdown(socket.SHUT_RDWR)
+            listener.close()
+        for thread in self._threads:
+            thread.join(timeout=10)
+        self._threads.clear()
+        folder, self._folder = self._folder, None
+        if folder is not None:
+            shutil.rmtree(folder)
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _accept(self) -> None:
+        listener = self._listener
+        while listener is not None:
+            try:
+                connection, _ = listener.accept()
+            except OSError:
+                # Closed by stop(); there is no other way to end an accept.
+                return
+            self._connections.add(connection)
+            thread = threading.Thread(target=self._serve, args=(connection,), daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def _serve(self, connection: socket.socket) -> None:
+        """Answer one device's stand-in until it hangs up."""
+        answer: Callable[[Verb, bytes], Answer] = self._greeted
+        with connection:
+            try:
+                while (request := _receive(connection)) is not None:
+                    verb, payload = request
+                    self.requests[verb] += 1
+                    if verb is Verb.HELLO:
+                        status, reply, answer = self._hello(payload)
+                    else:
+                        with self._turn:
+                            status, reply = answer(verb, payload)
+                    connection.sendall(_ANSWER.pack(status, len(reply)) + reply)
+            except (OSError, ValueError, struct.error) as error:
+                log.info("a stand-in hung up: %s", error)
+            finally:
+                self._connections.discard(connection)
+
+    def _greeted(self, verb: Verb, payload: bytes) -> Answer:
+        """Refuse what comes before the greeting."""
+        return _REFUSED, b""
+
+    def _hello(self, payload: bytes) -> tuple[int, bytes, Callable[[Verb, bytes], Answer]]:
+        """Find the device that a stand-in wants to be; its serial number must be the configured one."""
+        kind, _, serial = payload.decode(errors="replace").partition(" ")
+        devices = self.config.devices
+        section = {"mirror": devices.dm, "wfs": devices.wfs, "science": devices.science}.get(kind)
+        if section is None or serial.upper() != section.serial.upper():
+            log.warning("no %s with serial number %r on this bench", kind, serial)
+            return _REFUSED, b"", self._greeted
+        with self._turn:
+            if kind == "mirror":
+                return _GOOD, struct.pack("=I", devices.dm.n_act), self._mirror()
+            make = make_wfs_camera if kind == "wfs" else make_science_camera
+            camera = make(kind, self.config, self.shared).open()
+            return _GOOD, struct.pack("=I", camera.info.bit_depth), _CameraEnd(camera)
+
+    def _mirror(self) -> Callable[[Verb, bytes], Answer]:
+        mirror = make_mirror("dm", self.config, self.shared).open()
+
+        def answer(verb: Verb, payload: bytes) -> Answer:
+            if verb is not Verb.SEND or len(payload) != 8 * mirror.info.n_act:
+                return _REFUSED, b""
+            # The guard stands before the driver; electronics take any shape, such as that of a reset.
+            mirror._send(np.frombuffer(payload))  # noqa: SLF001
+            return _GOOD, b""
+
+        return answer
+
+
+class _CameraEnd:
+    """What a stand-in of a camera's library gets to see of the twin's camera."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+
+    def __call__(self, verb: Verb, payload: bytes) -> Answer:
+        try:
+            if verb is Verb.START:
+                return self._start(*_START.unpack(payload))
+            if verb is Verb.FRAME:
+                return self._frame(*_FRAME.unpack(payload))
+            if verb is Verb.STOP:
+                self._camera.stop()
+                return _GOOD, b""
+        except FrameTimeout:
+            return _LATE, b""
+        except EscapeError as error:
+            log.warning("the twin refuses: %s", error)
+        return _REFUSED, b""
+
+    def _start(self, *numbers: float) -> Answer:
+        region = Region(*(int(number) for number in numbers[:4]))
+        exposure_us, rate_hz, gain_db = numbers[4:]
+        self._camera.stop()
+        self._camera.configure(CameraSettings(region, exposure_us * 1e-6, rate_hz, gain_db))
+        self._camera.start()
+        return _GOOD, b""
+
+    def _frame(self, wait_s: float) -> Answer:
+        frame = self._camera.next_frame(max(wait_s, _NO_WAIT_S))
+        return _GOOD, _FRAME_HEAD.pack(frame.index, frame.exposed_ns) + frame.data.tobytes()
+
+
+def _receive(connection: socket.socket) -> tuple[Verb, bytes] | None:
+    """One whole request, or ``None`` when the other side has hung up.
+
+    Raises
+    ------
+    ValueError
+        It is nonsense.
+    """
+    head = _exactly(connection, _HEAD.size)
+    if head is None:
+        return None
+    verb, length = _HEAD.unpack(head)
+    if length > _LONGEST:
+        raise ValueError(f"a request of {length} bytes")
+    payload = _exactly(connection, length)
+    return None if payload is None else (Verb(verb), payload)
+
+
+def _exactly(connection: socket.socket, length: int) -> bytes | None:
+    parts = bytearray()
+    while len(parts) < length:
+        part = connection.recv(length - len(parts))
+        if not part:
+            return None
+        parts += part
+    return bytes(parts)
+
+
+@contextmanager
+def in_environment(server: BenchServer) -> Iterator[None]:
+    """Let the drivers of this very process find the stand-ins and the bench."""
+    before = {key: os.environ.get(key) for key in server.environment}
+    os.environ.update(server.environment)
+    try:
+        yield
+    finally:
+        for key, value in before.items():
+            if value is None:
+                del os.environ[key]
+            else:
+                os.environ[key] = value

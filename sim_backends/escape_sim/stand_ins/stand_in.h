@@ -1,0 +1,287 @@
+/* Shared by the stand-ins of vendor libraries: fault script, call log, complaints, link to a simulated bench.
+ *
+ * A stand-in is strict, not obliging: whatever the real library leaves undefined is complained of. Control
+ * functions (escape_stand_in...) are exported beside the vendor's names; their presence tells a driver that
+ * it is not on metal.
+ *
+ * Script, one rule per line or separated by ';':
+ *     FUNCTION WHEN ACTION [ARGUMENT]     WHEN: N (the N-th call), N.. (from there on), N..M
+ *     set KEY VALUE                       a property of the device
+ * FUNCTION '*' counts the calls of all functions together. Actions: error CODE, ignore, timeout MS, reset,
+ * short BYTES, unplug, half CODE, lose N; a library says which of them mean something to which function.
+ */
+#ifndef ESCAPE_STAND_IN_H
+#define ESCAPE_STAND_IN_H
+
+#include <errno.h>
+#include <limits.h>
+#include <math.h>
+#include <pthread.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <strings.h>
+#include <sys/socket.h>
+#include <sys/time.h>
+#include <sys/un.h>
+#include <time.h>
+#include <unistd.h>
+
+#define EXPORT __attribute__((visibility("default")))
+#define SI_RULES 256
+#define SI_LOG_BYTES (8u << 20)
+#define SI_PATIENCE_S 60 /* a twin compiles its optics on the first frame */
+
+enum si_action { SI_NONE, SI_ERROR, SI_IGNORE, SI_TIMEOUT, SI_RESET, SI_SHORT, SI_UNPLUG, SI_HALF, SI_LOSE };
+static const char *const si_actions[] = {"", "error", "ignore", "timeout", "reset",
+                                         "short", "unplug", "half", "lose"};
+
+struct si_rule {
+    char function[32];
+    long first, last;
+    enum si_action action;
+    long argument;
+};
+
+/* One per vendor function, with its own count of calls. */
+struct si_function {
+    const char *name;
+    long calls;
+    struct si_function *next;
+};
+
+struct si_text {
+    char *bytes;
+    size_t length;
+};
+
+static pthread_mutex_t si_mutex = PTHREAD_MUTEX_INITIALIZER;
+static struct si_rule si_rules[SI_RULES];
+static int si_n_rules, si_recording, si_unplugged;
+static long si_calls;
+static struct si_function *si_functions;
+static struct si_text si_log_text, si_complaints;
+
+/* Supplied by each library: a property of the device; 0 when there is no such key or value. */
+static int si_set(const char *key, const char *value);
+/* Supplied by each library: everything as freshly loaded. */
+static void si_forget(void);
+
+static void si_append(struct si_text *text, const char *mark, const char *format, va_list arguments) {
+    if (text->bytes == NULL && (text->bytes = malloc(SI_LOG_BYTES)) == NULL) return;
+    size_t room = SI_LOG_BYTES - text->length;
+    if (room < 512) return;
+    int n = snprintf(text->bytes + text->length, room, "%s", mark);
+    n += vsnprintf(text->bytes + text->length + n, room - (size_t)n - 2, format, arguments);
+    if ((size_t)n > room - 2) n = (int)(room - 2);
+    text->length += (size_t)n;
+    text->bytes[text->length++] = '\n';
+    text->bytes[text->length] = 0;
+}
+
+__attribute__((format(printf, 1, 2))) static void si_log(const char *format, ...) {
+    if (!si_recording) return;
+    va_list arguments;
+    va_start(arguments, format);
+    pthread_mutex_lock(&si_mutex);
+    si_append(&si_log_text, "", format, arguments);
+    pthread_mutex_unlock(&si_mutex);
+    va_end(arguments);
+}
+
+__attribute__((format(printf, 1, 2))) static void si_complain(const char *format, ...) {
+    va_list arguments, again;
+    va_start(arguments, format);
+    va_copy(again, arguments);
+    pthread_mutex_lock(&si_mutex);
+    si_append(&si_complaints, "", format, arguments);
+    if (si_recording) si_append(&si_log_text, "! ", format, again);
+    pthread_mutex_unlock(&si_mutex);
+    va_end(again);
+    va_end(arguments);
+}
+
+/* Count a call; the rule that applies to it (action SI_NONE when none does). */
+static struct si_rule si_enter(struct si_function *function) {
+    struct si_rule found = {.action = SI_NONE};
+    pthread_mutex_lock(&si_mutex);
+    if (function->calls++ == 0) {
+        function->next = si_functions;
+        si_functions = function;
+    }
+    si_calls++;
+    for (int k = 0; k < si_n_rules; k++) {
+        const struct si_rule *rule = &si_rules[k];
+        int any = strcmp(rule->function, "*") == 0;
+        if (!any && strcmp(rule->function, function->name) != 0) continue;
+        long number = any ? si_calls : function->calls;
+        if (number < rule->first || number > rule->last) continue;
+        found = *rule;
+        break;
+    }
+    if (found.action == SI_UNPLUG) si_unplugged = 1;
+    pthread_mutex_unlock(&si_mutex);
+    return found;
+}
+
+static int si_rule_of(const char *line) {
+    char function[32], when[32], action[32], argument[64] = "";
+    int n = sscanf(line, " %31s %31s %31s %63s", function, when, action, argument);
+    if (n <= 0 || function[0] == '#') return 1;
+    if (strcmp(function, "set") == 0) return n == 3 && si_set(when, action);
+    if (n < 3 || si_n_rules == SI_RULES) return 0;
+    struct si_rule rule = {.action = SI_NONE};
+    snprintf(rule.function, sizeof rule.function, "%s", function);
+    for (int k = 1; k < (int)(sizeof si_actions / sizeof *si_actions); k++)
+        if (strcmp(action, si_actions[k]) == 0) rule.action = (enum si_action)k;
+    char *rest;
+    rule.first = rule.last = strtol(when, &rest, 10);
+    if (strncmp(rest, "..", 2) == 0) {
+        rest += 2;
+        rule.last = *rest ? strtol(rest, &rest, 10) : LONG_MAX;
+    }
+    if (*rest || rule.first < 1 || rule.action == SI_NONE) return 0;
+    rule.argument = strtol(argument, &rest, 0);
+    if (*rest) return 0;
+    si_rules[si_n_rules++] = rule;
+    return 1;
+}
+
+/* What kind of stand-in this is; the name alone tells a driver that there is no metal behind it. */
+EXPORT const char *escape_stand_in(void);
+
+/* Add rules; 0, or the number of the first line that means nothing (those before it are in force). */
+EXPORT int escape_stand_in_script(const char *text) {
+    char line[256];
+    int number = 1;
+    while (*text) {
+        size_t length = strcspn(text, "\n;");
+        snprintf(line, sizeof line, "%.*s", (int)length, text);
+        pthread_mutex_lock(&si_mutex);
+        int good = si_rule_of(line);
+        pthread_mutex_unlock(&si_mutex);
+        if (!good) return number;
+        text += length + (text[length] != 0);
+        number++;
+    }
+    return 0;
+}
+
+/* Forget calls, script, complaints and the device's state, as if freshly loaded. */
+EXPORT void escape_stand_in_clear(void) {
+    pthread_mutex_lock(&si_mutex);
+    si_n_rules = si_unplugged = si_recording = 0;
+    si_calls = 0;
+    si_log_text.length = si_complaints.length = 0;
+    for (struct si_function *f = si_functions; f; f = f->next) f->calls = 0;
+    si_functions = NULL;
+    si_forget();
+    pthread_mutex_unlock(&si_mutex);
+    const char *script = getenv("ESCAPE_STAND_IN_SCRIPT");
+    if (script != NULL && escape_stand_in_script(script) != 0) {
+        fprintf(stderr, "ESCAPE_STAND_IN_SCRIPT: a line means nothing: %s\n", script);
+        exit(2);
+    }
+}
+
+EXPORT void escape_stand_in_record(int on) { si_recording = on; }
+EXPORT long escape_stand_in_calls(void) { return si_calls; }
+
+/* Copy the log (which 0) or the complaints (which 1); the length of the whole text. */
+EXPORT size_t escape_stand_in_text(int which, char *out, size_t size) {
+    pthread_mutex_lock(&si_mutex);
+    const struct si_text *text = which ? &si_complaints : &si_log_text;
+    size_t length = text->length;
+    if (out != NULL && size > 0) {
+        size_t n = length < size - 1 ? length : size - 1;
+        if (n) memcpy(out, text->bytes, n);
+        out[n] = 0;
+    }
+    pthread_mutex_unlock(&si_mutex);
+    return length;
+}
+
+__attribute__((constructor)) static void si_loaded(void) { escape_stand_in_clear(); }
+
+static int64_t si_now_ns(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
+}
+
+static void si_sleep_until(int64_t ns) {
+    struct timespec t = {.tv_sec = ns / 1000000000, .tv_nsec = ns % 1000000000};
+    while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL) == EINTR) continue;
+}
+
+/* ---- link to a simulated bench: a local socket, one request and one reply at a time -------------------- */
+enum si_verb { SI_HELLO = 1, SI_SEND, SI_START, SI_FRAME, SI_STOP };
+
+struct si_link {
+    int fd;
+};
+
+static int si_all(int fd, void *bytes, size_t length, int out) {
+    char *at = bytes;
+    while (length) {
+        ssize_t n = out ? send(fd, at, length, MSG_NOSIGNAL) : recv(fd, at, length, 0);
+        if (n < 0 && errno == EINTR) continue;
+        if (n <= 0) return 0;
+        at += n;
+        length -= (size_t)n;
+    }
+    return 1;
+}
+
+/* Ask the bench; its status (0 good, 1 nothing in time, 2 refused) or -1 when the bench has gone.
+ * Up to size bytes of the reply go to out, *got says how many there were. */
+static int si_ask(struct si_link *link, uint32_t verb, const void *payload, uint32_t length, void *out,
+                  uint32_t size, uint32_t *got) {
+    uint32_t head[2] = {verb, length};
+    int32_t answer[2];
+    if (link->fd < 0) return -1;
+    if (!si_all(link->fd, head, sizeof head, 1) || !si_all(link->fd, (void *)payload, length, 1) ||
+        !si_all(link->fd, answer, sizeof answer, 0) || (uint32_t)answer[1] > size ||
+        !si_all(link->fd, out, (uint32_t)answer[1], 0)) {
+        close(link->fd);
+        link->fd = -1;
+        return -1;
+    }
+    if (got) *got = (uint32_t)answer[1];
+    return answer[0];
+}
+
+static void si_unlink_bench(struct si_link *link) {
+    if (link->fd >= 0) close(link->fd);
+    link->fd = -1;
+}
+
+/* Connect to the bench of ESCAPE_STAND_IN_BENCH as the device of this kind and serial number.
+ * 0: no bench is wanted; 1: connected, its greeting is in out; -1: it refused or is not there. */
+static int si_link_bench(struct si_link *link, const char *kind, const char *serial, void *out,
+                         uint32_t size) {
+    link->fd = -1;
+    const char *path = getenv("ESCAPE_STAND_IN_BENCH");
+    if (path == NULL || *path == 0) return 0;
+    struct sockaddr_un address = {.sun_family = AF_UNIX};
+    snprintf(address.sun_path, sizeof address.sun_path, "%s", path);
+    link->fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
+    if (link->fd < 0) return -1;
+    /* A bench that was stopped in its tracks must not hold a driver for ever. */
+    struct timeval patience = {.tv_sec = SI_PATIENCE_S};
+    setsockopt(link->fd, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
+    setsockopt(link->fd, SOL_SOCKET, SO_SNDTIMEO, &patience, sizeof patience);
+    char greeting[160];
+    int n = snprintf(greeting, sizeof greeting, "%s %s", kind, serial);
+    if (connect(link->fd, (struct sockaddr *)&address, sizeof address) != 0 ||
+        si_ask(link, SI_HELLO, greeting, (uint32_t)n, out, size, NULL) != 0) {
+        si_unlink_bench(link);
+        return -1;
+    }
+    return 1;
+}
+
+#endif

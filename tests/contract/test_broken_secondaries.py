@@ -1,0 +1,104 @@
+"""Every check on adaptive secondaries fails on one that breaks just what it checks."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellState
+from escape_hw.api.device import Device
+from escape_hw.api.mirror import DeformableMirror
+from escape_hw.errors import DeviceError
+from escape_hw.testing import mirror_checks, secondary_checks
+from escape_hw.testing.reference import ObedientSecondary
+
+Catches = Callable[[Callable[[], Device], str], None]
+
+
+def sticks_on_the_way_down(self: Any, state: ShellState) -> None:
+    if state is not ShellState.OFF:
+        ObedientSecondary._step(self, state)
+
+
+def health_of_another_state(self: Any) -> Any:
+    return replace(ObedientSecondary._health(self), state=ShellState.RUNNING)
+
+
+def always_follows(self: Any, command: Any) -> Any:
+    with contextlib.suppress(DeviceError):
+        return DeformableMirror.send(self, command)
+    self._guard.accept(np.asarray(command, dtype=float))
+    return None
+
+
+def keeps_its_shape(self: Any, state: ShellState) -> None:
+    while self._stands is not state:
+        ladder = [*ShellState]
+        step = 1 if ladder.index(state) > ladder.index(self._stands) else -1
+        self._stands = ladder[ladder.index(self._stands) + step]
+
+
+def goes_anywhere(self: Any, state: ShellState) -> None:
+    if state is not ShellState.FAULT:
+        AdaptiveSecondary.go(self, state)
+
+
+def half_of_them(self: Any) -> Any:
+    self.require_open()
+    return np.zeros(3)
+
+
+def in_metres_per_stroke(self: Any) -> Any:
+    return np.full(self.info.n_act, 1e4)
+
+
+def no_gap(self: Any) -> Any:
+    return replace(ObedientSecondary._health(self), gap_m=float("nan"))
+
+
+def drives_regardless(self: Any, command: Any) -> Any:
+    return self._drive(command)
+
+
+def hides_the_way_out(self: Any, fault: str) -> DeviceError:
+    return DeviceError(self.name, "broken")
+
+
+def recovers_always(self: Any) -> None:
+    self.require_open()
+    self._recover()
+
+
+def stays_afloat(self: Any) -> None:
+    DeformableMirror._before_close(self)
+
+
+BROKEN: list[tuple[str, str, dict[str, Any]]] = [
+    ("sticks", "secondary_walks_the_ladder", {"_step": sticks_on_the_way_down}),
+    ("health elsewhere", "secondary_walks_the_ladder", {"_health": health_of_another_state}),
+    ("follows asleep", "secondary_follows_commands_only_when_running", {"send": always_follows}),
+    ("remembers", "secondary_is_flat_when_it_floats_anew", {"go": keeps_its_shape}),
+    ("ignores a fault", "secondary_never_goes_to_a_fault", {"go": goes_anywhere}),
+    ("few positions", "secondary_measures_every_actuator", {"measured_positions": half_of_them}),
+    ("metres", "secondary_measures_every_actuator", {"_measure": in_metres_per_stroke}),
+    ("no gap", "secondary_tells_its_health", {"_health": no_gap}),
+    ("drives regardless", "secondary_latches_faults", {"_send": drives_regardless}),
+    ("no way out", "secondary_latches_faults", {"_latched": hides_the_way_out}),
+    ("recovers always", "secondary_recovers_only_from_faults", {"recover": recovers_always}),
+    ("closes afloat", "secondary_rests_when_closed", {"_before_close": stays_afloat}),
+]
+
+
+@pytest.mark.parametrize(("expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
+def test_check_catches(catches: Catches, expected: str, defects: dict[str, Any]) -> None:
+    catches(type("Broken", (ObedientSecondary,), defects), expected)
+
+
+def test_every_check_is_tested() -> None:
+    own = set(secondary_checks()) - set(mirror_checks())
+    assert {check.__name__ for check in own} == {f"check_{case[1]}" for case in BROKEN}

@@ -1,0 +1,72 @@
+"""The contract suite on the E-727's driver, over network, serial line and USB, against the emulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+from escape_drivers.pi_modulator import PiModulator, make_modulator
+from escape_drivers.pi_transports import SerialTransport
+from escape_drivers.pi_usb import UsbTransport
+from escape_hw.config.load import load_system
+from escape_hw.config.models import SystemConfig
+from escape_hw.testing import Check, Factory, parametrize_device_checks
+from escape_sim.emulators.e727_controller import Controller
+from escape_sim.emulators.e727_state import Make
+from escape_sim.emulators.e727_usb import VENDOR, UsbBackend
+from escape_sim.emulators.e727_wires import PtyServer, UsbPipe
+from escape_sim.emulators.faults import FaultyWire
+
+MAKE = Make(serial="SIMMOD", zeroed=True)
+
+
+@cache
+def configuration() -> SystemConfig:
+    wire = ('devices.modulator.wire.kind="emulator"', 'devices.modulator.options={zeroed="1"}')
+    return load_system("razor-pywfs", overrides=wire)
+
+
+class PtyTransport(SerialTransport):
+    """A serial line to an emulator that lives as long as the connection."""
+
+    def __init__(self) -> None:
+        super().__init__("not yet", 115200, 1.0)
+        self._server = PtyServer(Controller(MAKE), FaultyWire())
+
+    def open(self) -> None:
+        self.where = self._server.start().removeprefix("pty ")
+        super().open()
+
+    def close(self) -> None:
+        super().close()
+        self._server.stop()
+
+
+def over_tcp() -> PiModulator:
+    return make_modulator("modulator", configuration(), {})
+
+
+def with_wire(connect: Callable[[], SerialTransport | UsbTransport]) -> PiModulator:
+    section = configuration().devices.modulator
+    assert section is not None
+    return PiModulator("modulator", section, connect)
+
+
+def over_serial() -> PiModulator:
+    return with_wire(PtyTransport)
+
+
+def over_usb() -> PiModulator:
+    def connect() -> UsbTransport:
+        bus = UsbBackend(UsbPipe(Controller(MAKE), FaultyWire()), busy=True)
+        return UsbTransport(VENDOR, None, "SIMMOD", 1.0, bus)
+
+    return with_wire(connect)
+
+
+WIRES: dict[str, Factory] = {"tcp": over_tcp, "serial": over_serial, "usb": over_usb}
+
+
+@parametrize_device_checks(WIRES)
+def test_contract(factory: Factory, check: Check) -> None:
+    check(factory)

@@ -1,0 +1,30 @@
+"""The page for authors of drivers names the hooks that there are."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import escape_hw.api.adaptive_secondary
+import escape_hw.api.camera
+import escape_hw.api.mirror
+import escape_hw.api.modulator
+
+PAGE = (Path(__file__).parents[2] / "docs" / "devices" / "add-a-driver.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        escape_hw.api.mirror.DeformableMirror,
+        escape_hw.api.adaptive_secondary.AdaptiveSecondary,
+        escape_hw.api.camera.Camera,
+        escape_hw.api.modulator.TipTiltModulator,
+    ],
+)
+def test_the_hooks_to_fill_in_are_those_that_are_abstract(kind: type) -> None:
+    (row,) = (line for line in PAGE.splitlines() if line.startswith("|") and f"`{kind.__name__}`" in line)
+    hooks = set(re.findall(r"`(\w+)`", row)) - {kind.__name__}
+    assert hooks == set(kind.__abstractmethods__)

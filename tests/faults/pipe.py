@@ -1,0 +1,70 @@
+"""A driver and an emulated E-727 in one process, on a wire without delays and a clock that hurries."""
+
+from __future__ import annotations
+
+import time
+
+from escape_drivers.pi_modulator import PiModulator
+from escape_drivers.pi_transports import WireLost
+from escape_hw.config.load import load_system
+from escape_sim.emulators.e727_controller import Controller
+from escape_sim.emulators.e727_state import Make
+from escape_sim.emulators.e727_wires import UsbPipe
+from escape_sim.emulators.faults import Fault, FaultyWire
+
+#: How many times faster than real the emulated stage lives; the longest wait for a reply.
+HURRY, TIMEOUT_S = 40.0, 0.03
+
+
+class Pipe:
+    """Bytes from hand to hand; as a transport."""
+
+    where = "pipe"
+
+    def __init__(self, controller: Controller, wire: FaultyWire) -> None:
+        self._usb, self._held = UsbPipe(controller, wire), b""
+        self.is_open = False
+
+    def open(self) -> None:
+        self.is_open = self._usb.plugged = True
+
+    def close(self) -> None:
+        if self.is_open and self._usb.plugged:
+            self._usb.conversation.ended()
+        self.is_open = False
+
+    def write(self, data: bytes) -> None:
+        if not self.is_open:
+            raise WireLost("the pipe to the controller is closed; open it again")
+        try:
+            self._usb.write(data + b"\0" * (len(data) % 2))
+        except ConnectionError:
+            raise WireLost("the pipe to the controller broke; join it and open again") from None
+
+    def read(self, timeout_s: float) -> bytes:
+        if not self._usb.plugged:
+            raise WireLost("the pipe to the controller broke; join it and open again")
+        return self._usb.read(65536, timeout_s)
+
+
+class Peers:
+    """The emulated controller, and drivers for it."""
+
+    def __init__(self, *faults: Fault, zeroed: bool = True, correct: str = "none") -> None:
+        make = Make(serial="SIMMOD", zeroed=zeroed, auto_zero_s=2.0)
+        self.controller = Controller(make, lambda: HURRY * time.monotonic())
+        self.wire = FaultyWire(faults)
+        overrides = [f'devices.modulator.stage.correct="{correct}"', "devices.modulator.stage.settle_s=0.5"]
+        overrides.append(f"devices.modulator.wire.timeout_s={TIMEOUT_S}")
+        section = load_system("razor-pywfs", overrides=overrides).devices.modulator
+        assert section is not None
+        self.section = section
+
+    def driver(self) -> PiModulator:
+        return PiModulator(
+            "stage", self.section, lambda: Pipe(self.controller, self.wire), lambda s: time.sleep(s / HURRY)
+        )
+
+    @property
+    def condition(self) -> str:
+        return self.controller.state.describe()

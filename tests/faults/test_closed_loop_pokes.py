@@ -1,0 +1,225 @@
+"""DO-CRIME in closed loop on the small twin: right at 0.2 % of the stroke, and every fault is met."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_bench import PLANTED, assert_flat, small
+
+from escape_hw.api.results import CalibrationResult
+from escape_hw.calibration.docrime import docrime
+from escape_hw.calibration.docrime_closed import docrime_closed_loop
+from escape_hw.calibration.escape import escape
+from escape_hw.calibration.poke_patterns import PushPullPokes
+from escape_hw.calibration.stopping import Target
+from escape_hw.errors import CalibrationError, ConfigError, TooFewFrames
+
+NO_LOSS = "twin.loss_probability=0"
+#: Two tenths of a per cent of the stroke (the paper's closed loop).
+SMALL_POKE = 0.002
+
+
+def measure(closing, *more, seed=None, prepare=None, **options):
+    """A closed-loop run on a bench of its own."""
+    with small(NO_LOSS, *more) as bench:
+        if seed is not None:
+            bench.rng = np.random.default_rng(seed)
+        if prepare is not None:
+            prepare(bench)
+        options = {"frames": 2000, "poke": 0.01, **options}
+        try:
+            return bench.run(docrime_closed_loop(bench, closing, **options))
+        finally:
+            assert_flat(bench)
+
+
+def compare(one, other):
+    """Common gain of two matrices, and the mean square of their normalised differences beside it."""
+    a, b = one.matrix, other.matrix
+    gain = float(np.vdot(a.data, b.data) / np.vdot(b.data, b.data))
+    errors = (a.data - gain * b.data) / np.hypot(a.sigma, gain * b.sigma)
+    return gain, float(np.mean(np.square(errors)))
+
+
+@pytest.fixture(scope="module")
+def closing(good) -> CalibrationResult:
+    return good.run.result
+
+
+@pytest.fixture(scope="module")
+def truth(closing):
+    """The matrix of the closed loop, from larger pokes."""
+    return measure(closing, frames=4000, poke=0.02)
+
+
+def test_a_tiny_poke_gives_the_same_matrix_as_a_large_one(closing, truth):
+    gains = []
+    for seed in (1, 2):
+        found = measure(closing, seed=seed, frames=2500, poke=SMALL_POKE)
+        assert found.matrix.method == "docrime-closed"
+        assert found.frames == 2500
+        gain, chi2 = compare(found, truth)
+        assert chi2 == pytest.approx(1, abs=0.35)
+        assert abs(gain - 1) < 4 * found.matrix.metrics["gain_sigma"] + 0.01
+        gains.append(gain)
+        assert found.response.delay == pytest.approx(truth.response.delay, abs=0.03)
+        assert np.median(found.matrix.snr()) > 10
+        assert not found.notes
+    assert np.mean(gains) == pytest.approx(1, abs=0.015)
+
+
+def test_registration_from_tiny_pokes_in_closed_loop(closing):
+    with small(NO_LOSS) as bench:
+        found = bench.run(escape(bench, frames=2500, poke=SMALL_POKE, closing=closing))
+        assert_flat(bench)
+    estimate = found.registration
+    assert estimate.converged, estimate.warnings
+    assert found.measured.method == "docrime-closed"
+    assert np.abs((estimate.registration.to_array() - PLANTED) / estimate.sigma).max() < 4
+    assert (estimate.sigma < [0.6, 0.6, 0.03, 0.2, 0.2]).all()
+
+
+def test_fast_push_pull_in_closed_loop(closing, truth):
+    found = measure(closing, frames=3000, pattern=PushPullPokes)
+    gain, chi2 = compare(found, truth)
+    assert found.matrix.method == "push-pull-fast-closed"
+    assert gain == pytest.approx(1, abs=0.03)
+    assert chi2 < 2
+    assert found.matrix.snr().min() > 5
+
+
+def test_fast_push_pull_under_turbulence_in_open_loop(good):
+    with small(NO_LOSS) as bench:
+        found = bench.run(docrime(bench, frames=2000, poke=0.01, grid=good.grid, pattern=PushPullPokes))
+        assert_flat(bench)
+    gain, chi2 = compare(found, good.run.result)
+    assert found.matrix.method == "push-pull-fast"
+    assert gain == pytest.approx(1, abs=0.03)
+    assert chi2 == pytest.approx(1, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("more", "allowed"),
+    [
+        (("twin.loss_probability=0.05",), 0.03),
+        (("twin.vibration.amplitude_rad=[4e-6,2e-6]", "twin.vibration.frequency_hz=[37.0,111.0]"), 0.03),
+        (("devices.dm.limits.max_stroke=0.15",), 0.04),
+        (("devices.dm.limits.max_slew=0.03",), 0.04),
+    ],
+    ids=["lost frames", "vibration", "clipped by the stroke", "clipped by the slew"],
+)
+def test_faults_that_bias_nothing(closing, truth, more, allowed):
+    found = measure(closing, *more, frames=3000)
+    gain, chi2 = compare(found, truth)
+    assert gain == pytest.approx(1, abs=allowed)
+    assert chi2 < 2
+    if "loss" in more[0]:
+        assert found.lost_frames == pytest.approx(3000 * 0.05 / 0.95, abs=60)
+    if "limits" in more[0]:
+        assert found.matrix.metrics["shortened"] > 30
+        assert any("limits shortened" in note for note in found.notes)
+
+
+def dead(bench, *actuators):
+    """Actuators that take commands and do not move, which nobody knows."""
+    real = bench.dm._send
+
+    def send(command):
+        reached = command.copy()
+        reached[list(actuators)] = 0.0
+        real(reached)
+
+    bench.dm._send = send
+
+
+def test_dead_actuators_that_nobody_knows_show_in_the_matrix(closing, truth):
+    """What the mirror no longer does is missing from the matrix, as in open loop, and the rest is right."""
+    broken = (18, 25)
+    found = measure(closing, prepare=lambda bench: dead(bench, *broken), frames=2500)
+    with small(NO_LOSS) as bench:
+        dead(bench, *broken)
+        open_loop = bench.run(docrime(bench, frames=2000, poke=0.02, grid=closing.grid))
+    gain, chi2 = compare(found, open_loop)
+    assert gain == pytest.approx(1, abs=0.04)
+    assert chi2 < 3
+    assert compare(found, truth)[1] > 30
+
+
+def test_disabled_actuators(good):
+    disabled = "devices.dm.limits.disabled=[3,18]"
+    with small(NO_LOSS, disabled) as bench:
+        before = bench.run(docrime(bench, frames=2000))
+        found = bench.run(docrime_closed_loop(bench, before, frames=2500, poke=0.01))
+        assert_flat(bench)
+    gain, chi2 = compare(found, before)
+    assert not found.matrix.m2c[[3, 18]].any()
+    assert gain == pytest.approx(1, abs=0.04)
+    assert chi2 < 2.5
+
+
+@pytest.mark.parametrize(
+    ("more", "factor"),
+    [
+        # A matrix a tenth of the real one makes ten times the gain.
+        ((), 0.1),
+        # The delay is two frames longer than the gain was chosen for.
+        (("twin.latency_s=0.006", "loop.gain=0.9", "calibration.lags=9"), 1.0),
+    ],
+    ids=["wrong matrix", "wrong delay"],
+)
+def test_a_loop_that_diverges_is_opened_and_told(closing, more, factor):
+    spoilt = replace(closing, matrix=replace(closing.matrix, data=closing.matrix.data * np.float32(factor)))
+    with pytest.raises(CalibrationError, match=r"diverged after \d+ frames and was opened.*loop\.gain"):
+        measure(spoilt, *more)
+
+
+def test_a_delay_beyond_the_lags_is_told(closing):
+    with pytest.raises(CalibrationError, match=r"later than calibration\.lags = 3 frames can tell"):
+        measure(closing, "twin.latency_s=0.006", "loop.gain=0.1", "calibration.lags=3")
+
+
+def test_a_mirror_that_does_not_answer(closing):
+    with pytest.raises(CalibrationError, match="does not respond"):
+        measure(closing, "devices.dm.stroke_m=1e-12")
+
+
+def test_the_light_goes(closing):
+    with pytest.raises(CalibrationError, match="no light"):
+        measure(closing, prepare=lambda bench: bench.screen.set(blocked=True))
+
+
+def test_it_stops_at_the_ratio_asked_for(closing):
+    found = measure(closing, frames=20_000, until=Target(snr=20.0))
+    assert found.matrix.snr().min() >= 20
+    assert found.frames < 10_000
+    assert not found.partial
+
+
+@pytest.mark.parametrize("in_loop", [pytest.param(True, marks=pytest.mark.slow), False])
+def test_escape_stops_at_the_accuracy_asked_for(closing, in_loop):
+    with small(NO_LOSS) as bench:
+        options = {"closing": closing} if in_loop else {}
+        found = bench.run(escape(bench, frames=8000, until=Target(accuracy=0.2), **options))
+        assert_flat(bench)
+    assert found.registration.converged
+    # With the geometry of the whole run the last word may differ a little from the one that stopped it.
+    assert found.registration.sigma[:2].max() < 0.22
+    assert found.frames < 4000
+    assert (
+        np.abs((found.registration.registration.to_array() - PLANTED) / found.registration.sigma).max() < 4.5
+    )
+
+
+def test_what_is_refused_before_anything_moves(closing):
+    for more, options, error, match in (
+        ((), {"frames": 50}, TooFewFrames, "at least 82"),
+        ((), {"poke": 2.0}, ConfigError, "poke is 2"),
+        (("calibration.whiten_order=0",), {}, ConfigError, "whiten_order is 0"),
+        ((), {"until": Target(accuracy=1.0)}, ConfigError, "'escape'"),
+    ):
+        with small(NO_LOSS, *more) as bench:
+            with pytest.raises(error, match=match):
+                bench.run(docrime_closed_loop(bench, closing, **options))
+            assert bench.dm.sent_count == 0

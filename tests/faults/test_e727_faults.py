@@ -1,0 +1,87 @@
+"""Whatever fails between driver and controller, at whatever command: promised state, in time, and told."""
+
+from __future__ import annotations
+
+import re
+import time
+
+import pytest
+from pipe import TIMEOUT_S, Peers
+
+from escape_hw.api.modulator import Modulation
+from escape_hw.errors import DeviceError
+from escape_sim.emulators.faults import KINDS, Fault
+
+CIRCLE = Modulation(1.41e-4, 303.03)
+#: What a message tells the operator to do.
+WAY_OUT = re.compile(r"open again|again|see |is the|start|park")
+#: A call ends within three time-outs for each of the two things that it may have to give up, a fifth of a
+#: second; and what a busy machine makes of it.
+LONGEST_S = 180 * TIMEOUT_S
+
+
+def session(peers: Peers) -> list[str]:
+    """Open, turn, park, turn, close; what failed, as text."""
+    failures = []
+    stage = peers.driver()
+
+    def step(call, *args):
+        began = time.monotonic()
+        try:
+            result = call(*args)
+        except DeviceError as error:
+            failures.append(str(error))
+            result = None
+        assert time.monotonic() - began < LONGEST_S, f"{call} took {time.monotonic() - began:.1f} s"
+        return result
+
+    if step(stage.open) is not None:
+        reached = step(stage.modulate, CIRCLE)
+        if reached is not None:
+            assert peers.condition == "turning"
+        step(stage.park)
+    step(stage.close)
+    assert not stage.is_open
+    for failure in failures:
+        assert failure.startswith("stage: ")
+        assert WAY_OUT.search(failure), f"does not say what to do: {failure}"
+    return failures
+
+
+def commands_of_a_session() -> int:
+    peers = Peers()
+    assert session(peers) == []
+    assert peers.controller.state.complaints == []
+    return len(peers.controller.seen)
+
+
+def check(kind: str, at: int) -> None:
+    peers = Peers(Fault(kind, at))
+    failures = session(peers)
+    if kind in ("late", "double", "garbage") or (kind in ("drop", "truncate", "lose") and not failures):
+        assert peers.condition == "at rest", (kind, at, failures)
+    if kind in ("close", "reset", "power", "stall"):
+        assert failures, (kind, at, "a lost link must be told")
+    # Whatever happened: the next opening finds everything in order, and leaves it at rest.
+    peers.wire.stalled = False
+    with peers.driver() as again:
+        assert peers.condition == "servo on"
+        again.modulate(CIRCLE)
+        assert peers.condition == "turning"
+    assert peers.condition == "at rest"
+
+
+STRIDE = 12
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fault_now_and_then(kind: str) -> None:
+    for at in range(KINDS.index(kind) % STRIDE, commands_of_a_session(), STRIDE):
+        check(kind, at)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fault_at_every_command(kind: str) -> None:
+    for at in range(commands_of_a_session()):
+        check(kind, at)

@@ -1,0 +1,118 @@
+"""The live registration against planted truths, in closed loop with small pokes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_pyramid import small as small_pyramid
+from small_system import configuration
+
+from escape_hw.calibration.acquire import Motion
+from escape_hw.calibration.closed_loop import integrator_for
+from escape_hw.calibration.live_registration import LiveRegistration
+from escape_hw.calibration.loop_run import RunningLoop
+from escape_hw.calibration.loop_tape import LoopTape
+from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepare_sensor
+from escape_hw.errors import TooFewFrames
+from escape_hw.runtime.sky_time import GOAL, plant_overrides, random_plant
+from escape_hw.runtime.system import System, open_system
+
+SYSTEM = "razor-shwfs"
+
+
+def looked(bench, blocks, frames, poke=0.002, gain=None, curved=0, memory=1e9, start_frames=600):
+    """Calibrate, close the loop, and look at blocks of its frames; the last look, and the calibration."""
+    start = bench.calibrate(frames=start_frames)
+    prepare_sensor(bench)
+    control = integrator_for(bench, start.matrix, start.grid)
+    if gain is not None:
+        control.set_gain(gain(start.matrix.n_modes))
+    loop = RunningLoop(bench, start.matrix.m2c, extractor(bench, start.grid), control)
+    amplitude = poke_amplitudes(bench, start.matrix.m2c, poke)
+    motion = Motion(start.grid.n_slopes)
+    bench.run(loop.run(100))
+    bench.run(loop.run(300, observe=[lambda *frame: motion.add(frame[1])]))
+    c = bench.config.calibration
+    live = LiveRegistration(
+        start.matrix, bench.model(motion.of(start.grid)), start.registration,
+        order=c.whiten_order, lags=c.lags, memory=memory, curved=curved, response=start.response,
+        step_s=frames / bench.wfs.settings.frame_rate_hz,
+    )  # fmt: skip
+    tape = LoopTape(start.grid.n_slopes, start.matrix.n_modes, frames, live.memory_rows)
+    for _ in range(blocks):
+        bench.run(
+            loop.run(
+                frames, inject=lambda: amplitude * bench.rng.uniform(-1, 1, amplitude.size), observe=[tape]
+            )
+        )
+        found = live.update(*tape.handover())
+    bench.dm.flatten()
+    return found, start
+
+
+def errors_and_pulls(found, truth):
+    errors = found.registration.registration.to_array() - truth.to_array()
+    return errors, errors / found.registration.sigma
+
+
+def plant(number):
+    return open_system(SYSTEM, set=plant_overrides(random_plant(number)), seed=number + 1)
+
+
+def test_a_thousand_frames_in_closed_loop_at_small_pokes():
+    """1 % of a sub-aperture, 0.02 degrees, 0.1 %: pokes of 0.2 % of the stroke."""
+    with plant(0) as bench:
+        errors, pulls = errors_and_pulls(looked(bench, 2, 500)[0], random_plant(0))
+    assert (np.abs(errors) <= 2 * GOAL).all(), errors
+    assert np.abs(pulls).max() < 4
+
+
+@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("gain", [None, lambda n: np.linspace(0.5, 0.2, n)], ids=["one gain", "by mode"])
+def test_any_controller_gives_the_same(number, gain):
+    truth = random_plant(number)
+    with System.from_config(configuration(*plant_overrides(truth), seed=number)) as bench:
+        found, _ = looked(bench, 3, 500, gain=gain)
+    _, pulls = errors_and_pulls(found, truth)
+    # Twelve lenslets across five actuators: the scalings err by more than the noise.
+    assert np.abs(pulls[:3]).max() < 4
+    assert np.abs(pulls[3:]).max() < 6
+
+
+@pytest.mark.slow
+def test_the_matrix_it_fits_answers_as_the_bench_does():
+    """Held against push-pull without turbulence, whose spots are a little smaller."""
+    with plant(2) as bench:
+        found, start = looked(bench, 2, 500)
+        calm = bench.calibrate("push-pull", grid=start.grid).matrix
+    share = np.vdot(calm.data, found.matrix) / np.vdot(calm.data, calm.data)
+    assert share == pytest.approx(1.0, abs=0.03)
+
+
+def test_the_pyramid_has_gains_by_mode():
+    with small_pyramid("twin.loss_probability=0") as bench:
+        truth = bench.dm.twin.flexure.at(0.0)
+        found, _ = looked(bench, 4, 303, curved=3, start_frames=900)
+    errors, _ = errors_and_pulls(found, truth)
+    assert (np.abs(errors[:3]) < [4.0, 4.0, 0.2]).all()
+    assert found.gains.shape == found.gains_sigma.shape == (20,)
+    assert (found.gains_sigma < 0.15 * found.gains).all()
+    assert np.ptp(found.gains) > 0
+
+
+def test_too_few_frames_are_refused():
+    with small_pyramid() as bench, pytest.raises(TooFewFrames, match="at least 50"):
+        looked(bench, 1, 40, start_frames=900)
+
+
+@pytest.mark.slow
+def test_twelve_plants():
+    errors, pulls = [], []
+    for number in range(12):
+        with plant(number) as bench:
+            e, p = errors_and_pulls(looked(bench, 2, 500)[0], random_plant(number))
+        errors.append(e)
+        pulls.append(p)
+    assert (np.sqrt(np.mean(np.square(errors), axis=0)) <= GOAL).all()
+    chi2 = np.mean(np.square(pulls), axis=0)
+    assert ((chi2 > 0.2) & (chi2 < 2.6)).all(), chi2

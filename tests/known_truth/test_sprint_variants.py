@@ -1,0 +1,120 @@
+"""Scatter that SPRINT learns, sub-apertures that it distrusts, and options that it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.mode_choice import choose_modes
+from escape_hw.calibration.modes import karhunen_loeve
+from escape_hw.calibration.sprint import fit_steps, sprint
+from escape_hw.config.load import load_system
+from escape_sim.model import make_model, nominal_grid
+
+SMALL = (
+    "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
+    "devices.dm.pitches_across_pupil=5.0", "basis.n_modes=25", "loop.dropped_modes=0",
+)  # fmt: skip
+PLANTED = Registration(-16.0, 31.0, -0.77, 2.9, 0.5)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    config = load_system("razor-shwfs", overrides=SMALL)
+    model = make_model(config, None)
+    m2c = karhunen_loeve(*model.influence_functions(), 25, 4 * config.system.pupil_m)
+    return model, nominal_grid(config).valid, m2c
+
+
+def measured(bench, *, noise: float, actuators: float = 0.0, slopes: float = 0.0) -> InteractionMatrix:
+    model, valid, m2c = bench
+    rng = np.random.default_rng(6)
+    zonal = model.zonal_matrix(PLANTED) * (1 + actuators * rng.standard_normal(model.n_act))
+    exact = (zonal * (1 + slopes * rng.standard_normal(len(zonal)))[:, None]) @ m2c
+    sigma = np.full(exact.shape, noise * exact.std(), np.float32)
+    data = (exact + sigma * rng.standard_normal(exact.shape)).astype(np.float32)
+    return InteractionMatrix(data, sigma, m2c, valid, "razor-shwfs", "docrime", True)
+
+
+def solve(matrix, model, **options):
+    steps = fit_steps(matrix, model, **options)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as done:
+            return done.value
+
+
+@pytest.mark.parametrize(("actuators", "slopes"), [(0.05, 0.04), (0.15, 0.02)])
+def test_the_scatter_of_the_random_effects_is_learned(bench, actuators, slopes):
+    fit = solve(measured(bench, noise=0.05, actuators=actuators, slopes=slopes), bench[0], learn=True)
+    priors = fit.learned().priors
+    # 37 actuators tell their scatter to an eighth, 200 slopes to a twentieth, and noise blurs both.
+    assert priors.actuator_gain == pytest.approx(actuators, rel=0.45)
+    assert priors.slope_gain == pytest.approx(slopes, rel=0.45)
+
+
+def test_the_matrix_that_was_found_is_that_of_the_mirror_at_hand(bench):
+    model, _, m2c = bench
+    matrix = measured(bench, noise=0.02, actuators=0.1)
+    exact = measured(bench, noise=0.0, actuators=0.1).data
+    fit = solve(matrix, model)
+    found, nominal = fit.zonal() @ m2c, model.zonal_matrix(PLANTED) @ m2c
+    assert np.linalg.norm(found - exact) < 0.01 * np.linalg.norm(exact)
+    assert np.linalg.norm(nominal - exact) > 0.05 * np.linalg.norm(exact)
+
+
+@pytest.mark.parametrize("solver", ["effects", "light"])
+def test_hubers_loss_finds_home_among_bad_sub_apertures(bench, solver):
+    model = bench[0]
+    matrix = measured(bench, noise=0.02)
+    n = matrix.n_slopes // 2
+    data = matrix.data.copy()
+    # Rows of sub-apertures on one side that see the other: their lie has a direction.
+    bad, seen = np.arange(4, 9), n - 1 - np.arange(4, 9)
+    for half in (0, n):
+        data[half + bad] = matrix.data[half + seen]
+    spoiled = replace(matrix, data=data)
+    errors = {
+        loss: sprint(spoiled, model, solver=solver, loss=loss).registration.to_array() - PLANTED.to_array()
+        for loss in ("squares", "huber")
+    }
+    unit = np.array([1.0, 1.0, 0.05, 0.2, 0.2])
+    squares, huber = (np.linalg.norm(errors[loss] / unit) for loss in ("squares", "huber"))
+    assert huber < 0.7 * squares
+    assert huber < 3
+
+
+def test_informative_modes_beat_the_first_ones(bench):
+    model = bench[0]
+    matrix = measured(bench, noise=0.1)
+    sigma = {}
+    for choice in ("first", "snr", "d-optimal", "a-optimal"):
+        modes = choose_modes(matrix, 6, choice, model)
+        assert modes.size == 6
+        sigma[choice] = sprint(matrix, model, modes=modes, solver="light").sigma
+    for choice in ("d-optimal", "a-optimal"):
+        assert np.log(sigma[choice] / sigma["first"]).sum() < 0
+    with pytest.raises(ValueError, match="hand over the model"):
+        choose_modes(matrix, 6, "d-optimal")
+
+
+@pytest.mark.parametrize("option", ["solver", "choice", "loss"])
+def test_what_is_not_known_is_refused(bench, option):
+    with pytest.raises(ValueError, match=rf"{option} is 'best'; it is one of"):
+        sprint(measured(bench, noise=0.05), bench[0], **{option: "best"})
+
+
+def test_telemetry_is_not_fitted_by_modes():
+    from escape_hw.errors import ConfigError
+    from escape_hw.runtime.system import open_system
+
+    with (
+        open_system("razor-shwfs", set=["calibration.solver=diagonal"]) as system,
+        pytest.raises(ConfigError, match="telemetry has none"),
+    ):
+        system.calibrate(frames=300, estimator="telemetry")

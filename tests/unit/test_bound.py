@@ -1,0 +1,109 @@
+"""The hybrid bound's information against the Jacobian written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.bound import correlated_information, inverse_correlation, registration_bound
+from escape_hw.calibration.misfit import Priors, normal_equations
+from escape_hw.config.load import load_system
+from escape_sim.model import make_model, nominal_grid
+
+N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES = 7, 10, 5, 4, 3
+
+
+#: 12 x 12 lenslets and 37 actuators.
+SMALL = (
+    "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
+    "devices.dm.pitches_across_pupil=5.0", "basis.n_modes=8", "loop.dropped_modes=0",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def case():
+    rng = np.random.default_rng(0)
+    n = N_COMMON + N_LINES + 2 * N_ACT + N_SLOPES
+    return {
+        "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
+        "slopes_gain": rng.standard_normal((N_SLOPES, N_ACT)),
+        "slopes_width": rng.standard_normal((N_SLOPES, N_ACT)),
+        "modes": rng.standard_normal((N_ACT, N_MODES)),
+        "model": rng.standard_normal((N_SLOPES, N_MODES)),
+        "residual": rng.standard_normal((N_SLOPES, N_MODES)),
+        "precision": rng.uniform(0.5, 3, n),
+        "offset": np.zeros(n),
+        "sampled": rng.standard_normal((N_SLOPES, N_MODES)),
+        "lines": np.arange(N_SLOPES) % N_LINES,
+    }
+
+
+def jacobian(c):
+    """Derivatives of the matrix by every unknown ``(n_unknowns, n_slopes, n_modes)``."""
+    rows = list(c["common"])
+    rows += [np.where((c["lines"] == k)[:, None], c["sampled"], 0.0) for k in range(N_LINES)]
+    rows += [
+        np.outer(z[:, a], c["modes"][a]) for z in (c["slopes_gain"], c["slopes_width"]) for a in range(N_ACT)
+    ]
+    rows += [np.where((np.arange(N_SLOPES) == s)[:, None], c["model"], 0.0) for s in range(N_SLOPES)]
+    return np.stack(rows)
+
+
+def test_independent_slopes_give_the_solvers_own_system(case):
+    system = normal_equations(**case)
+    found = correlated_information(system, case["precision"], np.eye(N_SLOPES))
+    np.testing.assert_allclose(found, system.matrix, atol=1e-10)
+
+
+def test_correlated_slopes_count_by_the_inverse_of_their_correlation(case):
+    half = np.random.default_rng(3).standard_normal((N_SLOPES, N_SLOPES))
+    inverse = np.linalg.inv(half @ half.T + np.eye(N_SLOPES))
+    j = jacobian(case)
+    want = np.einsum("psm,st,qtm->pq", j, inverse, j) + np.diag(case["precision"])
+    found = correlated_information(normal_equations(**case), case["precision"], inverse)
+    np.testing.assert_allclose(found, want, atol=1e-10)
+
+
+@pytest.mark.parametrize("n_rows", [130, 1000])
+def test_an_inverse_from_few_rows_is_that_of_the_truth(n_rows):
+    rng, p = np.random.default_rng(5), 120
+    together = np.linalg.qr(rng.standard_normal((p, 2)))[0]
+    # Two patterns on top of white noise; what they add to the diagonal is spread evenly enough.
+    truth = 0.8 * np.eye(p) + (together * [14.0, 9.0]) @ together.T
+    sample = rng.multivariate_normal(np.zeros(p), truth, n_rows)
+    found = inverse_correlation(sample.T @ sample / n_rows, n_rows)
+    trial = rng.standard_normal((p, 40))
+    want = np.einsum("pk,pk->k", trial, np.linalg.solve(truth, trial))
+    got = np.einsum("pk,pk->k", trial, found @ trial)
+    assert np.mean(got / want) == pytest.approx(1.0, abs=0.06)
+    # Along the patterns little is left of the information.
+    weak = np.einsum("pk,pk->k", together, found @ together)
+    assert (weak < 0.3).all()
+    naive = np.linalg.inv(sample.T @ sample / n_rows)
+    assert np.mean(np.einsum("pk,pk->k", trial, naive @ trial) / want) > 1.1
+
+
+def test_the_bound_of_uncorrelated_slopes_is_the_same_by_either_way():
+    config = load_system("razor-shwfs", overrides=SMALL)
+    model, grid = make_model(config, None), nominal_grid(config)
+    rng = np.random.default_rng(7)
+    m2c = np.linalg.qr(rng.standard_normal((model.n_act, 8)))[0]
+    matrix = InteractionMatrix(
+        (0.9 * model.zonal_matrix(Registration()) @ m2c).astype(np.float32),
+        np.zeros((grid.n_slopes, 8), np.float32), m2c, grid.valid, "razor-shwfs", "docrime", True,
+    )  # fmt: skip
+    pokes = 0.01 * rng.standard_normal((6, 8))
+    variance = rng.uniform(0.005, 0.01, grid.n_slopes)
+    simple, full = (
+        registration_bound(matrix, pokes.T @ pokes, noise, 10**9, model, Registration(), Priors())
+        for noise in (variance, np.diag(variance))
+    )
+    np.testing.assert_allclose(simple.exact, full.exact, rtol=1e-3)
+    np.testing.assert_allclose(simple.hybrid, full.hybrid, rtol=1e-3)
+    # What is not known costs something, and twice the frames halve the variance of what is.
+    assert (simple.hybrid > simple.exact).all()
+    twice = registration_bound(matrix, 2 * pokes.T @ pokes, variance, 10**9, model, Registration(), Priors())
+    np.testing.assert_allclose(simple.exact / twice.exact, np.sqrt(2), rtol=1e-6)
+    assert (simple.hybrid / twice.hybrid < np.sqrt(2)).all()

@@ -1,0 +1,186 @@
+"""``escape dm``, ``camera`` and ``asm`` on twins and on an emulated mirror: what they do and say."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from escape_hw.api.emulator import EmulatorRequest
+from escape_hw.io import fits_file
+from escape_sim.emulators.asm import AsmEmulator, make_emulator
+
+LINKED = ("--set", "devices.dm.mode=hardware", "--set", "devices.dm.options.reply_s=10.0")
+
+
+@pytest.fixture
+def asm():
+    """An emulated mirror and the options that lead to it."""
+    made = make_emulator(EmulatorRequest(port=0, options={"speed": "1000", "hold": "20", "rest": "60"}))
+    with made:
+        port = made.start().rpartition(":")[2]
+        yield made, ("maps-nir", *LINKED, "--set", f"devices.dm.options.port={port}")
+
+
+# --------------------------------------------------------------------- mirror
+def test_dm_verbs_have_their_documents(document):
+    for verb, keys in (
+        (("flat", "razor-shwfs"), {"commands"}),
+        (("poke", "razor-shwfs", 48, 0.05, "--seconds", 0), {"asked", "peak", "skipped"}),
+        (("wave", "razor-shwfs", "--seconds", 0.2), {"asked", "peak", "commands"}),
+        (("status", "razor-shwfs"), {"model", "serial", "n_act", "limits", "stroke_m"}),
+    ):
+        code, found, _ = document("dm", *verb)
+        assert code == 0, verb
+        assert {"schema", "system", "simulated", "seed", "changed"} | keys <= set(found)
+        assert found["command"] == f"dm {verb[0]}"
+        assert found["simulated"] is True
+    assert document("dm", "poke", "razor-shwfs", 48, -0.05, "--seconds", 0)[1]["peak"] == 0.05
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (("poke", "razor-shwfs", 97, 0.1), 2, "numbered 0 to 96"),
+        (("poke", "razor-shwfs", 0, 0.9), 2, "max_stroke is 0.8"),
+        (("poke", "razor-shwfs", 0, "nan"), 2, "max_stroke"),
+        (("poke", "razor-shwfs", 0, 0.1, "--second", 1), 2, "--second"),
+        (("poke", "maps-nir", 248, 0.01), 2, "out of service"),
+        (("poke", "maps-nir", 0, 0.5, "--seconds", 0), 3, "beyond its limits, which allow 0.2"),
+        (("wave", "razor-shwfs", "--amplitude", 0.9), 3, "0.8 would not"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_it_moves(escape, words, code, message):
+    found, _, err = escape("dm", *words)
+    assert found == code
+    assert message in err
+
+
+def test_a_poke_reaches_the_mirror_and_nothing_is_left(escape, asm):
+    made, options = asm
+    code, out, err = escape("dm", "poke", *options, 40, 0.03, "--seconds", 0)
+    assert code == 0, err
+    assert "this changes hardware, devices.dm SIM336: flat, then actuator 40 by 0.03" in err
+    shapes = [np.asarray(what) for name, what in made.server.calls if name == "COMMAND"]
+    poked = [shape for shape in shapes if shape.any()]
+    assert len(poked) == 1
+    assert np.flatnonzero(poked[0]).tolist() == [40]
+    assert poked[0][40] == pytest.approx(0.03 * 1e-5)
+    assert not shapes[-1].any()
+    assert str(made.body.shell.state) == "rested"
+    assert "flat" in out
+
+
+def test_a_shell_that_floated_floats_on(escape, asm):
+    made, options = asm
+    assert escape("asm", "set", *options)[0] == 0
+    assert escape("dm", "flat", *options)[0] == 0
+    assert str(made.body.shell.state) == "set"
+
+
+# --------------------------------------------------------------------- adaptive secondary
+def test_asm_verbs_lead_the_mirror_and_tell(document, asm):
+    made, options = asm
+    code, found, _ = document("asm", "status", *options)
+    assert (code, found["state"], found["changed"], found["simulated"]) == (0, "off", False, True)
+    assert (found["serial"], "emulated" in found["model"]) == ("SIM336", True)
+    code, found, err = document("asm", "set", *options)
+    assert (code, found["before"], found["after"], found["changed"]) == (0, "off", "set", True)
+    assert "this changes hardware" in err
+    assert str(made.body.shell.state) == "set"
+    assert document("asm", "status", *options)[1]["gap_m"] == pytest.approx(50e-6, rel=0.01)
+    assert document("asm", "set", *options)[1]["changed"] is False
+    code, found, _ = document("asm", "rest", *options)
+    assert (code, found["after"]) == (0, "rested")
+    assert str(made.body.shell.state) == "rested"
+
+
+def test_a_fault_is_cleared_only_by_who_says_that_it_was_seen_to(document, escape, asm, monkeypatch):
+    made, options = asm
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
+    made.inject("trip")
+    code, found, _ = document("asm", "set", *options)
+    assert code == 3
+    assert "fault latched" in found["error"]["message"]
+    code, _, err = escape("asm", "clear", *options)
+    assert code == 2
+    assert "say so with --yes" in err
+    assert str(made.body.shell.state) == "fault"
+    code, found, _ = document("asm", "clear", *options, "--yes")
+    assert (code, found["before"], found["after"]) == (0, "fault", "rested")
+    assert found["fault"] == "panic, as arranged"
+    code, found, _ = document("asm", "clear", *options)
+    assert (code, found["changed"]) == (0, False)
+
+
+def test_looking_takes_no_control(escape, asm):
+    made, options = asm
+    with other_owner(made):
+        out = escape("asm", "status", *options)[1]
+        assert "emulated SIM336" in out
+        assert "controlled by somebody else" in out
+        code, _, err = escape("asm", "rest", *options)
+        assert code == 3
+        assert "somebody else controls it" in err
+
+
+def other_owner(made: AsmEmulator):
+    """Have another client control the mirror."""
+    import socket
+
+    from escape_drivers.asm_codec import AsmCodec
+    from escape_drivers.asm_messages import Hello, Role
+
+    client = socket.create_connection(("127.0.0.1", int(made.start().rpartition(":")[2])))
+    client.sendall(AsmCodec().request(1, 1, Hello(Role.CONTROL, 0, "somebody else")))
+    client.recv(1 << 16)
+    return client
+
+
+def test_only_an_adaptive_secondary_has_states(escape):
+    code, _, err = escape("asm", "status", "razor-shwfs")
+    assert code == 2
+    assert "AdaptiveSecondary" in err
+
+
+# --------------------------------------------------------------------- cameras
+def test_snap_writes_frames_with_their_times(document, tmp_path: Path):
+    file = tmp_path / "frames.fits"
+    code, found, _ = document("camera", "snap", "razor-shwfs", "--frames", 3, "--out", file)
+    assert code == 0
+    assert (found["frames"], found["shape"], found["file"]) == (3, [400, 400], str(file))
+    hdus, _ = fits_file.read(file, "FRAMES")
+    assert hdus["FRAMES"].data.shape == (3, 400, 400)
+    assert hdus["FRAMES"].data.max() == found["counts"]["max"]
+    assert np.diff(hdus["TIMES"].data["INDEX"]).tolist() == [1, 1]
+    assert hdus[0].header["SERIAL"] == "SIMWFS"
+    code, _, _ = document("camera", "snap", "razor-shwfs", "--out", file)
+    assert code == 2  # never overwritten
+
+
+def test_stream_counts_what_is_lost(document):
+    code, found, _ = document("camera", "stream", "razor-shwfs", "--seconds", 0.04)
+    assert code == 0
+    assert found["rate_hz"] == pytest.approx(500)
+    assert found["status"]["lost"] == 0
+    lossy = ("--seconds", 0.1, "--set", "twin.loss_probability=0.3")
+    code, found, _ = document("camera", "stream", "razor-shwfs", *lossy)
+    assert code == 1
+    assert found["status"]["lost"] > 0
+    assert found["rate_hz"] == pytest.approx(500, rel=0.01)
+
+
+def test_settings_are_checked_then_set(document, escape):
+    asked = ("--exposure", 0.00100049, "--region", "130,60,200,200", "--gain", 2)
+    code, found, _ = document("camera", "settings", "razor-shwfs", *asked, "--check")
+    assert (code, found["changed"], found["as_asked"]) == (0, False, False)
+    assert found["settings"]["exposure_s"] == pytest.approx(0.0010)
+    assert document("camera", "settings", "razor-shwfs", *asked)[1]["changed"] is True
+    out = escape("camera", "settings", "razor-shwfs", *asked)[1]
+    assert "[devices.wfs]\nregion = [130, 60, 200, 200]\nexposure_s = 0.001\n" in out
+    assert escape("camera", "settings", "razor-shwfs", "--region", "1,2,3")[0] == 2
+    assert escape("camera", "settings", "razor-shwfs", "--frame-rate", 1e6)[0] == 3
+    code, found, _ = document("camera", "settings", "razor-shwfs", "--camera", "science")
+    assert (code, found["as_asked"]) == (0, True)

@@ -1,0 +1,104 @@
+"""``escape modulator``: on the twin, and over the wire on the emulator."""
+
+from __future__ import annotations
+
+import pytest
+
+from escape_hw.api.emulator import EmulatorRequest
+from escape_sim.emulators.e727 import make_emulator
+
+HARDWARE = ("--set", "devices.modulator.mode=hardware")
+
+
+@pytest.fixture
+def stage():
+    """A controller on the network, and the options that lead to it."""
+    with make_emulator(EmulatorRequest(port=0, options={"serial": "SIMMOD", "zeroed": "1"})) as emulator:
+        where = (
+            "devices.modulator.wire.host=127.0.0.1",
+            f"devices.modulator.wire.port={emulator.server.port}",
+        )
+        yield emulator, (*HARDWARE, *(word for key in where for word in ("--set", key)))
+
+
+@pytest.mark.parametrize("verb", ["start", "stop", "status"])
+def test_the_twin_answers(document, verb):
+    code, found, err = document("modulator", verb, "razor-pywfs")
+    assert code == 0
+    assert found["command"] == f"modulator {verb}"
+    assert found["simulated"]
+    assert found["info"]["model"] == "simulated PI S-330 with E-727"
+    assert found["changed"] == (verb != "status")
+    assert "this moves" not in err
+    if verb == "start":
+        assert found["modulation"]["radius_lambda_d"] == pytest.approx(3.0)
+        assert found["left"] == "parked", "a twin ends with the command"
+
+
+def test_start_status_stop_on_the_wire(document, escape, stage):
+    emulator, here = stage
+    code, found, err = document("modulator", "start", "razor-pywfs", "--radius", 2, "--frequency", 300, *here)
+    assert code == 0, err
+    assert "this moves the modulator: servos on, auto-zero where needed, centre, then the circle" in err
+    assert "asked for 2 lambda/D (94 urad) at 300 Hz; it does 2 lambda/D (94 urad) at 298.507 Hz" in err
+    assert found["asked"] == {"radius_lambda_d": 2.0, "frequency_hz": 300.0}
+    assert found["foreseen"]["frequency_hz"] == pytest.approx(1 / (67 * 50e-6))
+    assert found["modulation"]["radius_lambda_d"] == pytest.approx(2.0)
+    assert found["details"]["circle_error"] < 0.02
+    assert found["left"] == "turning"
+    assert emulator.controller.state.describe() == "turning"
+
+    code, found, err = document("modulator", "status", "razor-pywfs", *here)
+    assert code == 0
+    assert "this moves" not in err
+    assert found["modulation"]["radius_lambda_d"] == pytest.approx(2.0, rel=0.01)
+    assert emulator.controller.state.describe() == "turning"
+    code, out, _ = escape("modulator", "status", "razor-pywfs", *here)
+    assert "turning: 2 lambda/D" in out or "turning: 1.99" in out or "turning: 2.00" in out
+
+    code, found, err = document("modulator", "stop", "razor-pywfs", *here)
+    assert code == 0
+    assert "this moves the modulator: centre, servos off" in err
+    assert (found["modulation"], found["left"]) == (None, "parked")
+    assert emulator.controller.state.describe() == "at rest"
+    assert emulator.complaints == ()
+
+
+def test_for_some_seconds_and_then_parked(document, stage):
+    emulator, here = stage
+    code, found, _ = document("modulator", "start", "razor-pywfs", "--seconds", 0.05, *here)
+    assert (code, found["left"]) == (0, "parked")
+    assert found["modulation"] is not None
+    assert emulator.controller.state.describe() == "at rest"
+
+
+def test_what_it_cannot_do_is_refused_before_it_turns(document, stage):
+    emulator, here = stage
+    code, found, err = document("modulator", "start", "razor-pywfs", "--radius", 30, *here)
+    assert code == 3
+    assert found["error"]["type"] == "SettingRejected"
+    assert "it does 0 to 0.001 rad" in err
+    assert not [line for line in emulator.controller.seen if line.startswith("WGO ")]
+    assert emulator.controller.state.describe() == "at rest"
+
+
+def test_a_controller_in_use_is_told(document, stage):
+    from escape_drivers.pi_transports import TcpTransport
+
+    emulator, here = stage
+    other = TcpTransport("127.0.0.1", emulator.server.port, 1.0, 1.0)
+    other.open()
+    try:
+        code, _, err = document("modulator", "status", "razor-pywfs", *here)
+    finally:
+        other.close()
+    assert code == 3
+    assert "one at a time" in err or "one client at a time" in err
+
+
+def test_a_system_without_one_says_so(document):
+    code, _, err = document("modulator", "status", "razor-shwfs")
+    assert code == 2
+    assert "has no modulator" in err
+    code, _, err = document("modulator", "status", "razor-pywfs", "--set", "devices.modulator.sim_driver=''")
+    assert code == 2

@@ -1,0 +1,57 @@
+"""Counters that start over, and camera clocks put on this computer's."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from escape_drivers.frame_counter import CameraClock, FrameCounter
+
+BLOCKS = (1, 65535)
+WORDS = (0, 2**32 - 1)
+
+
+@given(
+    st.sampled_from([BLOCKS, WORDS]),
+    st.integers(0, 65534),
+    st.lists(st.integers(1, 30000), min_size=1, max_size=60),
+)
+def test_steps_survive_any_number_of_turns(limits, start, steps) -> None:
+    first, last = limits
+    cycle = last - first + 1
+    counter, at = FrameCounter(first, last), start
+    indices = [counter.index(first + at % cycle)]
+    for step in steps:
+        at += step
+        indices.append(counter.index(first + at % cycle))
+    assert [b - a for a, b in pairwise(indices)] == steps
+
+
+def test_long_identifiers_go_on() -> None:
+    counter = FrameCounter(*BLOCKS)
+    assert [counter.index(n) for n in (65534, 65535, 65536, 70000)] == [65534, 65535, 65536, 70000]
+
+
+def test_a_counter_that_falls_a_little_stays_fallen() -> None:
+    counter = FrameCounter(*BLOCKS)
+    assert [counter.index(n) for n in (500, 499, 65535 // 2)] == [500, 499, 32767]
+
+
+@given(
+    st.integers(1, 10**15),
+    st.lists(st.tuples(st.integers(10**6, 10**8), st.integers(0, 10**8)), min_size=1, max_size=40),
+)
+def test_no_frame_is_exposed_after_it_arrived_and_times_rise(offset, frames) -> None:
+    clock, stamp, arrived, exposed = CameraClock(), 10**9, 0, []
+    for period, delay in frames:
+        stamp += period
+        arrived = max(arrived + 1, stamp + offset + delay)
+        exposed.append(clock.exposed_ns(stamp, arrived))
+        assert exposed[-1] <= arrived
+    assert all(b > a for a, b in pairwise(exposed))
+
+
+def test_without_time_stamps_the_arrival_has_to_do() -> None:
+    assert CameraClock().exposed_ns(0, 77) == 77

@@ -1,0 +1,69 @@
+"""Spectrum and amplitudes of random pokes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from escape_hw.calibration.poke_patterns import ALTERNATING, RandomPokes, random_pattern
+from escape_hw.calibration.pokes import equal_snr, information_gain
+
+AMPLITUDE = np.array([0.02, 0.005, 0.01])
+
+
+def drawn(kind: str, n: int = 20_000) -> np.ndarray:
+    pokes = random_pattern(kind)(AMPLITUDE, np.random.default_rng(4))
+    return np.array([pokes() for _ in range(n)])
+
+
+@pytest.mark.parametrize("kind", ["white", "shaped"])
+def test_they_have_the_rms_asked_for_and_the_modes_are_independent(kind):
+    pokes = drawn(kind)
+    np.testing.assert_allclose(pokes.std(axis=0), AMPLITUDE / np.sqrt(3), rtol=0.03)
+    correlation = np.corrcoef(pokes.T) - np.eye(3)
+    assert np.abs(correlation).max() < 5 / np.sqrt(len(pokes)) * 2
+
+
+def test_white_pokes_are_what_they_were():
+    rng = np.random.default_rng(4)
+    want = AMPLITUDE * rng.uniform(-1.0, 1.0, (50, 3))
+    np.testing.assert_array_equal(drawn("white", 50), want)
+    assert random_pattern("equal-snr") is RandomPokes
+
+
+def test_shaped_pokes_alternate():
+    pokes = drawn("shaped") / AMPLITUDE
+    by_lag = [np.mean(pokes[k:] * pokes[: len(pokes) - k]) / np.mean(pokes**2) for k in (1, 2)]
+    assert by_lag == pytest.approx([-ALTERNATING, ALTERNATING**2], abs=0.03)
+
+
+def test_information_gain_is_the_power_of_the_whitened_pokes():
+    whitener, response = np.array([1.0, -1.4, 0.4]), np.array([0.0, 0.8, 0.2])
+
+    def power(pokes: np.ndarray) -> float:
+        seen = np.apply_along_axis(np.convolve, 0, pokes / AMPLITUDE, np.convolve(whitener, response))
+        return float(np.square(seen).mean())
+
+    found = power(drawn("shaped")) / power(drawn("white"))
+    assert information_gain(whitener, response, ALTERNATING) == pytest.approx(found, rel=0.05)
+    assert information_gain(whitener, response, 0.0) == 1.0
+    # Without turbulence to whiten, a spectrum only loses what the response swallows.
+    assert information_gain(np.ones(1), response, 0.5) < 1
+
+
+def test_equal_snr_is_equal_and_keeps_the_budget():
+    columns = np.random.default_rng(1).standard_normal((40, 6)) * np.array([1, 2, 3, 4, 5, 6])
+    amplitude = equal_snr(columns, np.full(6, 1.0), 0.02)
+    snr = amplitude * np.linalg.norm(columns, axis=0)
+    np.testing.assert_allclose(snr, snr[0])
+    assert np.square(amplitude).sum() == pytest.approx(6 * 0.02**2)
+
+
+def test_equal_snr_respects_the_limits_and_gives_the_rest_to_the_others():
+    columns = np.diag([1.0, 10.0, 10.0])
+    most = np.array([0.01, 1.0, 1.0])
+    amplitude = equal_snr(columns, most, 0.02)
+    assert amplitude[0] == 0.01
+    assert amplitude[1] == amplitude[2]
+    assert np.square(amplitude).sum() == pytest.approx(0.01**2 + 2 * 0.02**2)
+    assert (equal_snr(columns, np.full(3, 1e-3), 0.02) <= 1e-3).all()

@@ -1,0 +1,97 @@
+"""Straight lines through estimates that fade: no lag, honest errors, surprises."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from escape_hw.calibration.straight_line import StraightLine
+
+KEEP = float(np.exp(-1 / 8))
+SIGMA = 0.3
+
+
+def follow(truth, noise, *, fastest=0.5, static=0.0):
+    """What comes of a run of updates: estimates are the faded means of truth and noise."""
+    line = StraightLine(KEEP, 1.0, np.array([fastest]))
+    weight = total = squares = 0.0
+    found = []
+    for value in truth + noise:
+        weight, total, squares = KEEP * weight + 1, KEEP * total + value, KEEP**2 * squares + 1
+        variance = SIGMA**2 * squares / weight**2
+        found.append(line.update(np.array([total / weight]), np.array([[variance]]), np.array([[static]])))
+    return found
+
+
+def test_a_line_is_followed_without_lag():
+    # Updates hold the mean over their second, and the truth now is half a second later.
+    truth = 0.2 * (np.arange(60) + 0.5)
+    found = follow(truth, np.zeros(60))
+    errors = np.array([one.value[0] for one in found]) - 0.2 * (np.arange(60) + 1.0)
+    assert np.abs(errors[10:]).max() < 0.02
+    assert found[-1].rate[0] == pytest.approx(0.2, rel=0.02)
+    # The faded mean itself lags by its memory.
+    assert 0.2 * 8 * 0.9 < 0.2 * 60 - np.average(truth, weights=KEEP ** np.arange(60)[::-1]) < 0.2 * 9
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+@pytest.mark.parametrize("at", [2, 6, 40])
+def test_errors_are_honest_while_the_memory_fills_and_after(rate, at):
+    rng = np.random.default_rng(7)
+    pulls = []
+    for _ in range(200):
+        truth = rate * (np.arange(at + 1) + 0.5)
+        last = follow(truth, SIGMA * rng.standard_normal(at + 1))[-1]
+        pulls.append((last.value[0] - rate * (at + 1)) / np.sqrt(last.covariance[0, 0]))
+    # 200 draws know the mean square to 10 %; the drift is assumed to have any rate up to the fastest.
+    assert 0.5 < np.mean(np.square(pulls)) < 1.3
+
+
+def test_what_does_not_change_is_not_averaged_away():
+    last = follow(np.zeros(80), np.zeros(80), static=0.04)[-1]
+    assert last.covariance[0, 0] == pytest.approx(0.04 + last.moving[0, 0])
+    assert last.moving[0, 0] < 0.03
+
+
+def test_a_jump_is_a_surprise_and_noise_is_none():
+    rng = np.random.default_rng(3)
+    truth = np.zeros(50)
+    truth[40:] = 10.0
+    found = follow(truth, SIGMA * rng.standard_normal(50))
+    surprises = np.array([abs(one.surprise[0]) for one in found])
+    assert surprises[:40].max() < 4
+    assert surprises[40] > 10
+
+
+def test_errors_cover_what_bends_within_the_memory():
+    rng = np.random.default_rng(9)
+    t = np.arange(120)
+    pulls = []
+    for _ in range(20):
+        phase = rng.uniform(0, 2 * np.pi)
+        truth = 1.5 * np.sin(2 * np.pi * (t + 0.5) / 48 + phase)
+        found = follow(truth, SIGMA * rng.standard_normal(120))
+        now = 1.5 * np.sin(2 * np.pi * (t + 1.0) / 48 + phase)
+        pulls += [
+            (one.value[0] - v) / np.sqrt(one.covariance[0, 0])
+            for one, v in zip(found[20:], now[20:], strict=True)
+        ]
+    assert 0.5 < np.mean(np.square(pulls)) < 2.0
+
+
+def test_what_bends_too_fast_widens_the_errors():
+    t = np.arange(60) + 0.5
+    swing = 5 * np.sin(2 * np.pi * t / 20)
+    calm, wild = follow(np.zeros(60), np.zeros(60), fastest=0.1), follow(swing, np.zeros(60), fastest=0.1)
+    assert wild[-1].moving[0, 0] > 4 * calm[-1].moving[0, 0]
+
+
+def test_a_restart_forgets():
+    line = StraightLine(KEEP, 1.0, np.array([0.1]))
+    one = np.eye(1)
+    for value in (1.0, 2.0, 3.0):
+        line.update(np.array([value]), 0.01 * one, 0 * one)
+    line.restart()
+    again = line.update(np.array([9.0]), 0.01 * one, 0 * one)
+    assert again.value[0] == 9.0
+    assert again.rate[0] == 0.0

@@ -1,0 +1,44 @@
+"""Real drivers on the stand-ins of their vendors' libraries."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import pytest
+
+from escape_hw.config.load import load_system
+from escape_hw.config.models import SystemConfig
+from escape_hw.config.registry import device_factory
+from escape_sim.stand_ins import StandIn, StandInUnavailable
+
+#: Driver, key in [devices] and stand-in.
+PARTS = {"alpao": ("dm", "asdk"), "ximea": ("wfs", "m3api"), "aravis": ("science", "aravis")}
+
+
+@cache
+def stand_in(name: str) -> StandIn:
+    """The stand-in, or a skip that says why there is none."""
+    try:
+        return StandIn(name)
+    except StandInUnavailable as reason:
+        pytest.skip(str(reason), allow_module_level=True)
+
+
+def fresh(name: str, script: str = "") -> StandIn:
+    """The stand-in with everything before forgotten, recording, with a script of faults."""
+    return stand_in(name).clear().script(script)
+
+
+@cache
+def _configuration(system: str, overrides: tuple[str, ...]) -> SystemConfig:
+    return load_system(system, mode="hardware", overrides=overrides)
+
+
+def make(driver: str, *more: str, system: str = "razor-shwfs") -> Any:
+    """A device of the system, not open, on the stand-in as it is."""
+    key, library = PARTS[driver]
+    path = stand_in(library).path
+    chosen = (f'devices.{key}.driver="{driver}"', f'devices.{key}.options.library="{path}"')
+    config = _configuration(system, (*chosen, *more))
+    return device_factory(driver, hardware=True)(key, config, {})

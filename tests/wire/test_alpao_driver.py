@@ -1,0 +1,208 @@
+"""What the ALPAO driver says to libasdk, call by call, and what it makes of every answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from driver_bench import fresh, make, stand_in
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from escape_drivers.alpao_errors import ERRORS, explain
+from escape_drivers.alpao_library import version_text
+from escape_hw.config.registry import available
+from escape_hw.errors import CommandRejected, ConfigError, DeviceError, DeviceLost
+
+OPENING = ["asdkInit SIM97", "asdkGet NbOfActuator", "asdkGet VersionInfo"]
+CLOSING = ["asdkStop", "asdkReset", "asdkRelease"]
+
+
+@pytest.fixture
+def asdk():
+    yield fresh("asdk")
+    stand_in("asdk").clear()
+
+
+def test_the_driver_is_offered() -> None:
+    assert "alpao" in available("escape.devices")
+
+
+def test_every_call_of_a_session_in_order(asdk) -> None:
+    command = np.linspace(-0.1, 0.1, 97)
+    with make("alpao") as dm:
+        assert asdk.calls == OPENING
+        dm.send(command)
+        assert np.array_equal(asdk.shape(97), command)
+    first, rest = asdk.calls[3], asdk.calls[4:]
+    assert first == f"asdkSend {command[0]:.17g} {command[1]:.17g} .. {command[-1]:.17g}"
+    assert [line.partition(" ")[0] for line in rest[:-3]] == ["asdkSend"] * (len(rest) - 3)
+    assert rest[-4].split()[1:] == ["0", "0", "..", "0"], "flat comes before the reset"
+    assert rest[-3:] == CLOSING
+    assert not asdk.complaints
+
+
+def test_a_stand_in_is_never_taken_for_metal(asdk) -> None:
+    with make("alpao") as dm:
+        assert dm.info.simulated
+        assert dm.info.model == "ALPAO mirror, SDK 3.04.05.0612 (stand-in)"
+
+
+def test_options_become_parameters_in_units_of_the_sdk(asdk) -> None:
+    options = {"sync": "return", "ack_timeout_ms": 20, "trigger_in": "falling", "trigger_out": "short"}
+    with make("alpao", *(f"devices.dm.options.{key}={value}" for key, value in options.items())):
+        assert asdk.calls[3:] == [
+            "asdkSet SyncMode 1", "asdkSet AckTimeout 20", "asdkSet TriggerMode 1", "asdkSet TriggerIn 2",
+        ]  # fmt: skip
+
+
+def test_the_serial_number_goes_out_in_capitals(asdk) -> None:
+    asdk.script("set serial BAX118")
+    with make("alpao", "devices.dm.serial=bax118"):
+        assert asdk.calls[0] == "asdkInit BAX118"
+
+
+def test_wrong_options_are_refused_before_anything_is_loaded() -> None:
+    with pytest.raises(ConfigError) as refused:
+        make("alpao", "devices.dm.options.trigger=rising", "devices.dm.options.ack_timeout_ms=1.5")
+    text = str(refused.value)
+    assert "devices.dm.options.trigger: unknown option (did you mean 'trigger_in'?" in text
+    assert "devices.dm.options.ack_timeout_ms: 1.5  must be of type int" in text
+    with pytest.raises(ConfigError, match=r"options\.ack_timeout_ms: -1  is out of range"):
+        make("alpao", "devices.dm.options.ack_timeout_ms=-1")
+    with pytest.raises(ConfigError, match="by its serial number only"):
+        make("alpao", 'devices.dm.serial=""')
+
+
+def test_a_missing_library_says_where_it_was_looked_for(monkeypatch) -> None:
+    dm = make("alpao", 'devices.dm.options.library=""')
+    monkeypatch.setenv("ESCAPE_ALPAO_LIBRARY", "/nowhere/libasdk.so")
+    with pytest.raises(DeviceError, match=r"/nowhere/libasdk\.so.*option 'library'.*ESCAPE_ALPAO_LIBRARY"):
+        dm.open()
+    monkeypatch.setenv("ESCAPE_ALPAO_LIBRARY", str(stand_in("asdk").path))
+    with dm:
+        assert dm.is_open
+    monkeypatch.delenv("ESCAPE_ALPAO_LIBRARY")
+    with pytest.raises(DeviceError, match=r"libasdk\.so"):
+        dm.open()
+
+
+def test_another_library_is_told_from_the_sdk() -> None:
+    with pytest.raises(DeviceError, match="does not export asdkInit"):
+        make("alpao", "devices.dm.options.library=libm.so.6").open()
+
+
+@pytest.mark.parametrize("peeks", [0, 1])
+def test_a_failed_init_says_why_and_is_never_reset(asdk, peeks) -> None:
+    asdk.script(f"set peeks {peeks}; asdkInit 1 error 0x22; asdkInit 2 half 0x20")
+    dm = make("alpao")
+    with pytest.raises(DeviceError, match=r"error 0x22, no interface in the configuration.*ACECFG"):
+        dm.open()
+    assert asdk.calls == ["asdkInit SIM97"]
+    # A handle without a configuration is no success; it is released and nothing else.
+    with pytest.raises(DeviceError, match="error 0x20, the interface library cannot be loaded"):
+        dm.open()
+    assert asdk.calls[1:] == ["asdkInit SIM97", "asdkRelease"]
+    with dm:
+        assert dm.is_open, "old entries on the error stack are no failure of this init"
+    assert not asdk.complaints
+
+
+def test_a_failure_without_a_reason_is_one(asdk) -> None:
+    library = stand_in("asdk")
+    with make("alpao") as dm:
+        library.script("asdkSend 1 error 0")
+        with pytest.raises(DeviceError, match="asdkSend failed, and the SDK does not say why"):
+            dm.send(np.zeros(97))
+
+
+def test_a_wrong_number_of_actuators_is_refused(asdk) -> None:
+    asdk.script("set actuators 277")
+    with pytest.raises(DeviceError, match="has 277 actuators, but the layout 'circle-11' has 97"):
+        make("alpao").open()
+    assert asdk.calls[-1] == "asdkRelease"
+    assert "asdkReset" not in asdk.calls, "nothing had moved"
+
+
+def test_one_mirror_has_one_owner(asdk) -> None:
+    with make("alpao"), pytest.raises(DeviceError, match="error 0x4, already in use"):
+        make("alpao").open()
+    assert asdk.complaints == ["asdkInit: the mirror has an owner already"]
+
+
+@pytest.mark.parametrize("number", sorted(ERRORS))
+def test_every_error_of_the_sdk_is_explained(asdk, number) -> None:
+    with make("alpao") as dm:
+        asdk.script(f"asdkSend 1 error {number:#x}")
+        with pytest.raises(DeviceError, match=f"error 0x{number:X}, {ERRORS[number][0]}") as failed:
+            dm.send(np.zeros(97))
+        assert isinstance(failed.value, DeviceLost) == (number == 0x101)
+        dm.send(np.zeros(97))
+
+
+def test_an_unknown_error_keeps_the_librarys_words() -> None:
+    assert explain(0x999, "smoke") == "error 0x999, unknown error; the library says: smoke"
+
+
+@given(st.integers(0, 9), st.integers(0, 99), st.integers(0, 99), st.integers(0, 99999))
+def test_versions_are_written_as_the_vendor_does(major, minor, patch, build) -> None:
+    number = ((major * 100 + minor) * 100 + patch) * 100000 + build
+    assert version_text(float(number)) == f"{major}.{minor:02}.{patch:02}.{build:04}"
+
+
+def test_patterns_reach_the_electronics_and_stop_before_anything_else(asdk) -> None:
+    wave = 0.01 * np.sin(np.arange(8) / 8 * 2 * np.pi)[:, None] * np.ones(97)
+    with make("alpao") as dm:
+        dm.play(wave, repeats=0)
+        assert dm.is_playing
+        dm.play(wave, repeats=3)
+        assert asdk.calls[3:] == ["asdkSendPattern 8 0", "asdkStop", "asdkSendPattern 8 3"]
+        dm.send(np.zeros(97))
+        assert asdk.names()[6:] == ["asdkStop", "asdkSend"]
+        assert not dm.is_playing
+        dm.play(wave, repeats=0)
+    assert asdk.names()[-5:] == ["asdkStop", "asdkSend", "asdkStop", "asdkReset", "asdkRelease"]
+    assert not asdk.complaints
+
+
+def test_a_pattern_that_breaks_a_limit_anywhere_is_refused_whole(asdk) -> None:
+    still, high = np.zeros((3, 97)), np.zeros((3, 97))
+    high[2, 5] = 0.9
+    with make("alpao", "devices.dm.limits.max_slew=0.1") as dm:
+        for wrong, why in ((high, "shape 2 .* exceeds max_stroke"), (still[:0], "0 shapes")):
+            with pytest.raises(CommandRejected, match=why):
+                dm.play(wrong, repeats=0)
+        jump = still.copy()
+        jump[1:, 5] = [0.1, 0.2]
+        dm.play(jump, repeats=1)
+        dm.send(np.zeros(97))
+        dm.flatten()
+        with pytest.raises(CommandRejected, match=r"shape 0 .* further from the one before than max_slew"):
+            dm.play(jump, repeats=2)
+        with pytest.raises(CommandRejected, match=r"not finite|NaN|nan"):
+            dm.play(still * np.nan)
+        assert asdk.names().count("asdkSendPattern") == 1
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=97, max_size=97))
+def test_whatever_is_sent_the_library_gets_finite_values_within_the_cap(values) -> None:
+    asdk = fresh("asdk")
+    with make("alpao") as dm:
+        try:
+            dm.send(values)
+        except CommandRejected:
+            assert not all(np.isfinite(values))
+            assert "asdkSend" not in asdk.names()
+        reached = asdk.shape(97)
+    assert np.isfinite(reached).all()
+    assert np.abs(reached).max() <= 0.8
+    assert not asdk.complaints
+
+
+@pytest.mark.parametrize("mode", ["refuse", "ignore", "accept"])
+def test_the_guard_does_not_rely_on_the_librarys_range_check(asdk, mode) -> None:
+    asdk.script(f"set range {mode}")
+    with make("alpao") as dm:
+        report = dm.send(np.full(97, 3.0) * np.where(np.arange(97) % 2, 1, -1))
+        assert report.guard.clipped == 97
+        assert np.array_equal(asdk.shape(97), report.sent)

@@ -1,0 +1,337 @@
+"""The driver of an adaptive secondary over a real socket: contract, and every call that arrives."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from asm_bench import driver, emulator, port_of, wait_for
+
+from escape_drivers import asm_messages as m
+from escape_drivers.asm_codec import AsmCodec
+from escape_drivers.asm_driver import AsmMirror, make_asm
+from escape_drivers.asm_observer import AsmObserver
+from escape_drivers.asm_options import AsmOptions
+from escape_hw.api.adaptive_secondary import ShellState
+from escape_hw.config.load import load_system
+from escape_hw.errors import ConfigError, DeviceError, FrameTimeout, SettingRejected
+from escape_hw.testing import Check, Factory, parametrize_device_checks
+from escape_sim.emulators.asm import AsmEmulator
+
+# --------------------------------------------------------------------- contract
+_EMULATOR = emulator()
+_SHARED: list[AsmEmulator] = []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_emulator() -> Iterator[None]:
+    yield
+    if _SHARED:
+        _SHARED.clear()
+        _EMULATOR.__exit__(None, None, None)
+
+
+def on_the_wire() -> AsmMirror:
+    if not _SHARED:
+        _SHARED.append(_EMULATOR.__enter__())
+    return driver(port_of(_SHARED[0]))
+
+
+def on_the_twin() -> AsmMirror:
+    words = ["devices.dm.mode=hardware", "devices.dm.options.host=emulator"]
+    return make_asm("dm", load_system("maps-nir", overrides=words), {})
+
+
+@parametrize_device_checks({"asm": on_the_wire})
+def test_contract(factory: Factory, check: Check) -> None:
+    factory()  # starts the emulator
+    before = len(_SHARED[0].complaints)
+    check(factory)
+    assert not _SHARED[0].complaints[before:]
+
+
+def test_an_emulator_joins_the_twin() -> None:
+    mirror = on_the_twin()
+    with mirror:
+        assert mirror.info.simulated
+        mirror.send(np.full(336, 0.01) * _enabled(mirror))
+        assert mirror.measured_positions().shape == (336,)
+    assert not mirror.is_open
+
+
+def _enabled(mirror: AsmMirror) -> np.ndarray:
+    mask = np.ones(336)
+    mask[list(mirror.limits.disabled)] = 0.0
+    return mask
+
+
+# --------------------------------------------------------------------- call by call
+def test_every_call_of_a_session_arrives_in_order() -> None:
+    with emulator() as made:
+        mirror = driver(port_of(made))
+        shape = np.linspace(-0.05, 0.05, 336) * _enabled(mirror)
+        with mirror:
+            mirror.send(shape)
+            mirror.send(0.5 * shape)
+        calls = [(name, what) for name, what in made.server.calls if name != "HEARTBEAT"]
+        assert made.complaints == ()
+    names = [name for name, _ in calls]
+    assert names == [
+        "SET_STATE", "SET_STATE", "SET_STATE", "COMMAND", "COMMAND", "COMMAND", "SET_STATE", "SET_STATE",
+    ]  # fmt: skip
+    states = [what for name, what in calls if name == "SET_STATE"]
+    assert states == [
+        ShellState.RESTED,
+        ShellState.SET,
+        ShellState.RUNNING,
+        ShellState.SET,
+        ShellState.RESTED,
+    ]
+    sent = [np.asarray(what) for name, what in calls if name == "COMMAND"]
+    # Metres of surface from flat: fractions of a stroke of 10 um.
+    assert sent[0] == pytest.approx(shape * 1e-5, abs=1e-12)
+    assert sent[1] == pytest.approx(shape * 0.5e-5, abs=1e-12)
+    assert not sent[2].any()
+
+
+def test_disabled_actuators_are_told_and_never_driven() -> None:
+    off = [7, 248, 249, 250, 251, 307, 308, 309, 310, 311, 312]
+    with emulator() as made, driver(port_of(made), f"devices.dm.limits.disabled={off}") as mirror:
+        assert made.server.calls[0] == ("SET_DISABLED", (tuple(off), "devices.dm.limits.disabled"))
+        report = mirror.send(np.full(336, 0.01))
+        assert report.guard.disabled == 11
+        name, what = made.server.calls[-1]
+        assert name == "COMMAND"
+        assert not np.asarray(what)[[7, 248, 312]].any()
+
+
+def test_acknowledgements_bring_positions_and_times() -> None:
+    with emulator() as made, driver(port_of(made)) as mirror:
+        shape = 0.02 * _enabled(mirror)
+        mirror.send(shape)
+        ack = mirror.last_ack
+        assert ack is not None
+        assert ack.result is m.Result.APPLIED
+        assert 0 < ack.received_ns <= ack.applied_ns
+        wait_for(lambda: bool(np.allclose(mirror.measured_positions(), shape, atol=3e-3)), "it moved")
+
+
+def test_a_blind_sensor_is_nan_and_no_other() -> None:
+    with emulator() as made, driver(port_of(made)) as mirror:
+        made.inject("stuck:5")
+        wait_for(lambda: bool(np.isnan(mirror.measured_positions()[5])), "the sensor went blind")
+        assert np.isnan(mirror.measured_positions()).sum() == 1
+
+
+def test_a_skipped_command_keeps_the_shape_and_says_so() -> None:
+    with emulator() as made, driver(port_of(made)) as mirror:
+        made.inject("skip")
+        skipped = mirror.send(0.02 * _enabled(mirror))
+        assert skipped.skipped
+        assert not skipped.sent.any()
+        assert not mirror.shape.any()
+        assert not mirror.send(0.01 * _enabled(mirror)).skipped
+        assert mirror.health.skipped == 1
+
+
+def test_too_many_skipped_commands_in_a_row_are_an_error() -> None:
+    with emulator() as made, driver(port_of(made), max_skips=3) as mirror:
+        for _ in range(3):
+            made.inject("skip")
+        for _ in range(2):
+            assert mirror.send(np.zeros(336)).skipped
+        with pytest.raises(DeviceError, match=r"skipped 3 commands in a row .* lower max_slew"):
+            mirror.send(np.zeros(336))
+
+
+def test_a_mirror_that_skips_on_and_on_opens_the_loop() -> None:
+    with emulator() as made, driver(port_of(made), max_skips=1000) as mirror:
+        for _ in range(100):
+            made.inject("skip")
+        for _ in range(100):
+            assert mirror.send(np.zeros(336)).skipped
+        with pytest.raises(DeviceError, match=r"is set and follows no commands"):
+            mirror.send(np.zeros(336))
+
+
+def test_a_mirror_left_set_stays_set_and_is_found_so() -> None:
+    with emulator() as made:
+        with driver(port_of(made)) as mirror:
+            mirror.leave_set = True
+        assert made.body.shell.state is ShellState.SET
+        with driver(port_of(made), lift=False) as again:
+            assert again.state is ShellState.SET
+        assert made.complaints == ()
+
+
+def test_many_may_look_while_one_controls() -> None:
+    with emulator() as made, driver(port_of(made)) as owner:
+        others = [driver(port_of(made)) for _ in range(5)]
+        for other in others:
+            health = other.glance()
+            assert health.state is ShellState.RUNNING
+            assert "pid" in health.owner
+            assert health.contaminated == owner.limits.disabled
+        assert owner.send(np.zeros(336)).guard.untouched
+        assert made.complaints == ()
+
+
+def test_nobody_looks_at_another_mirror_than_configured() -> None:
+    with emulator() as made:
+        with pytest.raises(DeviceError, match=r"is 'SIM336', not 'MMT336'; correct devices.dm.serial"):
+            driver(port_of(made), "devices.dm.serial=MMT336").glance()
+        assert made.complaints == ()
+
+
+def test_a_second_owner_is_refused_and_told_who_has_it() -> None:
+    with emulator() as made, driver(port_of(made)) as owner:
+        with pytest.raises(DeviceError, match=r"not owner.*pid \d+ controls it"):
+            driver(port_of(made)).open()
+        owner.send(np.zeros(336))
+
+
+def test_parameters_are_set_and_read_back() -> None:
+    with emulator() as made, driver(port_of(made)) as mirror:
+        assert mirror.set_parameter("telemetry_hz", 5.0) == mirror.parameter("telemetry_hz") == 5.0
+        with pytest.raises(DeviceError, match=r"telemetry_hz must lie in 0\.1\.\.100"):
+            mirror.set_parameter("telemetry_hz", 1e9)
+        with pytest.raises(DeviceError, match="no parameter 'gain'"):
+            mirror.parameter("gain")
+
+
+# --------------------------------------------------------------------- refusals before anything moves
+@pytest.mark.parametrize(
+    ("override", "error", "words"),
+    [
+        ("devices.dm.serial=OTHER", DeviceError, "is 'SIM336', not 'OTHER'"),
+        ("devices.dm.limits.max_stroke=0.9", SettingRejected, "skips commands beyond 0.8"),
+        ("devices.dm.limits.max_slew=0.6", SettingRejected, "max_slew is 0.6"),
+        ("devices.dm.limits.disabled=[1]", SettingRejected, r"disabled = \[1, 248, 249, 250, 251, 307"),
+        ("devices.dm.layout=rings-672", DeviceError, "has 336 actuators"),
+    ],
+)
+def test_another_mirror_than_configured_is_refused(
+    override: str, error: type[DeviceError], words: str
+) -> None:
+    more = (override, "devices.dm.limits.disabled=[]") if "rings" in override else (override,)
+    with emulator() as made:
+        with pytest.raises(error, match=words):
+            driver(port_of(made), *more).open()
+        assert made.body.shell.state is ShellState.OFF
+        assert not [name for name, _ in made.server.calls if name in ("SET_STATE", "COMMAND")]
+
+
+def test_fresh_dust_is_told_with_the_line_to_configure() -> None:
+    with emulator(dust="17") as made, pytest.raises(SettingRejected, match=r"disabled = \[17, 248"):
+        driver(port_of(made)).open()
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("hots=x", "did you mean 'host'"),
+        ("port=0", "allowed range 1 to 65535"),
+        ("reply_s=-1.0", "reply_s: -1  is out of range"),
+        ("max_skips=0", "max_skips: 0  is out of range"),
+        ("lift=1", "type bool"),
+    ],
+)
+def test_wrong_options_are_refused(word: str, message: str) -> None:
+    config = load_system("maps-nir", overrides=[f"devices.dm.options.{word}"])
+    with pytest.raises(ConfigError, match=message):
+        make_asm("dm", config, {})
+
+
+def test_a_version_that_the_mirror_does_not_speak_is_named() -> None:
+    with emulator(versions="2,3") as made, pytest.raises(DeviceError, match="versions 2 to 3 are spoken"):
+        driver(port_of(made)).open()
+
+
+def test_another_codec_replaces_only_the_codec() -> None:
+    class Counting(AsmCodec):
+        made = 0
+
+        def __init__(self) -> None:
+            super().__init__()
+            type(self).made += 1
+
+    with emulator() as made:
+        section = load_system("maps-nir").devices.dm
+        options = AsmOptions(port=port_of(made))
+        with AsmMirror("dm", section, options, make_codec=Counting) as mirror:
+            mirror.send(np.zeros(336))
+    assert Counting.made >= 1
+
+
+def test_watching_says_nothing_on_a_quiet_link(caplog: pytest.LogCaptureFixture) -> None:
+    with emulator() as made, driver(port_of(made), heartbeat_s=0.02) as mirror:
+        seen = len(made.server.calls)
+        wait_for(lambda: len(made.server.calls) > seen + 3, "signs of life")
+        assert mirror.state is ShellState.RUNNING
+    assert not [r for r in caplog.records if r.levelno >= logging.WARNING]
+
+
+# --------------------------------------------------------------------- observers
+def test_observers_see_what_the_owner_does() -> None:
+    with emulator() as made, driver(port_of(made)) as owner:
+        owner.set_parameter("telemetry_hz", 100.0)
+        shape = 0.02 * _enabled(owner)
+        owner.send(shape)
+        with contextlib.ExitStack() as stack:
+            observers = [
+                stack.enter_context(AsmObserver("watch", "127.0.0.1", port_of(made))) for _ in range(9)
+            ]
+            for observer in observers:
+                sample = observer.sample(30.0)
+                assert sample.state is ShellState.RUNNING
+                assert sample.position.shape == sample.current.shape == sample.flags.shape == (336,)
+                enabled = np.flatnonzero(_enabled(owner))
+                assert sample.command[enabled] == pytest.approx(0.02e-5)
+                assert set(np.flatnonzero(sample.flags & 8)) == set(owner.limits.disabled)
+            made.inject("trip")
+            for observer in observers:
+                while observer.fault is None:
+                    observer.sample(30.0)
+                assert observer.fault.text == "panic, as arranged"
+        owner.recover()
+        assert made.complaints == ()
+
+
+def test_an_observer_that_sleeps_gets_the_newest() -> None:
+    with emulator() as made:
+        owner = driver(port_of(made)).open()
+        owner.set_parameter("telemetry_hz", 100.0)
+        with AsmObserver("watch", "127.0.0.1", port_of(made)) as observer:
+            first = observer.sample(30.0)
+            wait_for(lambda: time.monotonic_ns() - first.time_ns > 0.5e9, "time passes")
+            behind = time.monotonic_ns() - observer.sample(30.0).time_ns
+            assert behind < 0.4e9
+            wait_for(lambda: _told_health(observer), "health every second")
+            made.stop()
+            with pytest.raises(DeviceError, match="link to"):
+                _watch_on(observer)
+        with pytest.raises(DeviceError):
+            owner.close()
+
+
+def _watch_on(observer: AsmObserver) -> None:
+    for _ in range(1000):
+        observer.sample(30.0)
+
+
+def _told_health(observer: AsmObserver) -> bool:
+    observer.sample(30.0)
+    return observer.health is not None
+
+
+def test_silence_is_told_to_an_observer() -> None:
+    with emulator() as made, AsmObserver("watch", "127.0.0.1", port_of(made)) as observer:
+        made.body.parameters["telemetry_hz"] = 1e-9
+        with contextlib.suppress(FrameTimeout):
+            observer.sample(0.3)  # one may have been on its way
+        with pytest.raises(FrameTimeout, match=r"no telemetry within 0\.05 s"):
+            observer.sample(0.05)
