@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.pyramid import PyramidPupils, boxes
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.modes import karhunen_loeve
+from escape_hw.calibration.basis import configured_basis
 from escape_hw.config.sensor_models import PyramidSection
 from escape_sim.air_scatter import air_scatter
 from escape_sim.fourier_filter import good_length
@@ -106,8 +106,7 @@ class PyramidModel:
         self._modulation = modulation or Modulation.circle(pupils.modulation)
         # A surface changes the path by twice as much.
         scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
-        pitches = config.devices.dm.pitches_across_pupil
-        self._pokes = Pokes.of(scale * pupils.pokes, config.basis.n_modes, pitches)
+        self._pokes = self._random_pokes(scale) if pupils.pokes else None
         if turbulence is None:
             turbulence = strength(self.optics(), pupils, _OUTER_SCALE, self._pokes)
         self.turbulence = turbulence if turbulence >= _CALM else 0.0
@@ -133,7 +132,7 @@ class PyramidModel:
     def registration_doubt(self) -> NDArray[np.float64]:
         """Errors of the pupil images' place and of the air's own, see :class:`DoubtfulModel`."""
         shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
-        scaling = _SCALING if self.turbulence or self._pokes.rms_rad else 0.0
+        scaling = _SCALING if self.turbulence or self._pokes else 0.0
         return np.asarray(np.hypot([shift, shift, 0.0, scaling, scaling], self._air_doubt()))
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
@@ -192,12 +191,13 @@ class PyramidModel:
     # ------------------------------------------------------------------ construction
     def _air_doubt(self) -> NDArray[np.float64]:
         """What the states of the air and of the mirror that were seen leave of :func:`air_scatter`."""
-        if not self._pupils.looks or not (self.turbulence or self._pokes.rms_rad):
+        if not self._pupils.looks or not (self.turbulence or self._pokes):
             return np.zeros(5)
         if self._scatter is None:
             x, optics = self._pupil.coordinates_m, self.optics()
             phases = unit_screens(x.size, _OUTER_SCALE) * self.turbulence ** (5 / 6)
-            phases += self._pokes.phases(*phases.shape[:2])
+            if self._pokes:
+                phases += self._pokes.phases(len(phases))
             paths = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
             paths *= 2 * self._config.devices.dm.stroke_m
             self._scatter = air_scatter(
@@ -206,12 +206,23 @@ class PyramidModel:
             )  # fmt: skip
         return np.asarray(self._scatter / np.sqrt(self._pupils.looks))
 
+    def _basis(self) -> NDArray[np.float64]:
+        """The modes of a calibration ``(n_act, n_modes)``."""
+        return configured_basis(
+            self._config, *self.influence_functions(), self._config.devices.dm.limits.disabled
+        )
+
+    def _random_pokes(self, scale: float) -> Pokes:
+        """The pokes that were measured; ``scale`` is the phase of a surface of full stroke in radians."""
+        m2c = self._basis()
+        surfaces, lit, _ = self.influence_functions()
+        most = self._config.calibration.poke_command / np.abs(m2c).max(axis=0)
+        return Pokes.of(self._pupils.pokes, most, scale * np.tensordot(m2c.T, surfaces, 1), lit)
+
     def _random_commands(self, count: int) -> NDArray[np.float64]:
         """Commands ``(count, n_act, k)`` of all modes of a basis at once, as a calibration's pokes are."""
-        surfaces, lit, pixel_m = self.influence_functions()
-        n_modes = min(self._config.basis.n_modes, self.n_act - 1)
-        m2c = karhunen_loeve(surfaces, lit, pixel_m, n_modes, _OUTER_SCALE * self._config.system.pupil_m)
-        return m2c @ np.random.default_rng(2).standard_normal((count, n_modes, _SHAPES))
+        m2c = self._basis()
+        return m2c @ np.random.default_rng(2).standard_normal((count, m2c.shape[1], _SHAPES))
 
     def _by_phase(self) -> NDArray[np.float32]:
         """The slopes' derivatives by the phase at the nodes ``(n_slopes, m * m)``."""
@@ -221,9 +232,9 @@ class PyramidModel:
         grid = good_length(max(shape), samples)
         window = Window(pupils.centres_px, shape, grid, samples)
         structure = None
-        if self.turbulence or self._pokes.rms_rad:
+        if self.turbulence or self._pokes:
             apart = distances(n, pupil.pixel_m) / self._config.system.pupil_m
-            structure = self._pokes.structure(apart)
+            structure = self._pokes.structure() if self._pokes else np.zeros_like(apart)
             if self.turbulence:
                 structure += structure_function(apart, 1 / self.turbulence, _OUTER_SCALE)
         return slope_response(
