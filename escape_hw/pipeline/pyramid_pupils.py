@@ -22,9 +22,10 @@ _REACH = 0.25
 _DIAMETER_RANGE, _DIAMETER_PX = 0.03, 2.0
 #: An image with less than this share of the others' light is not there.
 _FAINT = 0.1
-#: Light that is pressed down to one half before rims are fitted, as a share of the usual one: little enough
-#: that a rim in the shade of a soiled edge is as steep as any other.
-_PRESSED = 0.25
+#: Light that is pressed down to one half before rims are fitted, as a share of the usual one; on a telescope
+#: little enough that a rim in the shade of a soiled edge is as steep as any other. A bench's stop is whole,
+#: and what diffraction puts between the images would count for more the harder light is pressed.
+_PRESSED, _PRESSED_SOILED = 1.0, 0.25
 
 
 def find_pupils(
@@ -122,26 +123,33 @@ def refine_pupils(
         What passes the telescope's obscuration and vanes; ``None``: there are none.
     """
     n_sub = pupils.valid.shape[0]
+    pressed, order = (_PRESSED, 1) if shadow is None else (_PRESSED_SOILED, ROUND)
     image = np.asarray(np.mean(means, axis=0), np.float64)
-    centres, diameter = _places(image, pupils.centres_px, n_sub, ROUND)
-    variance = out_of_round(_evened(image), centres, diameter / 2, n_sub / 2) ** 2
+    centres, diameter = _places(image, pupils.centres_px, n_sub, pressed, order)
+    even = _evened(image, pressed)
+    variance = out_of_round(even, centres, diameter / 2, n_sub / 2) ** 2
     if len(means) > 1:
         parts = [
-            _places(np.asarray(part, np.float64), centres, n_sub, ROUND)[0].mean(axis=0) for part in means
+            _places(np.asarray(part, np.float64), centres, n_sub, pressed, order)[0].mean(axis=0)
+            for part in means
         ]
         variance += float(np.mean(np.var(parts, axis=0, ddof=1))) / len(parts)
     if shadow is not None:
-        offset, sigma = shadow_offset(_evened(image), centres, diameter, shadow)
+        offset, sigma = shadow_offset(even, centres, diameter, shadow)
         share = variance / (variance + sigma**2)
         centres, variance = centres + share * offset, variance * (1 - share)
     return replace(pupils, centres_px=centres, diameter_px=diameter, centre_sigma_px=float(np.sqrt(variance)))
 
 
 def _places(
-    image: NDArray[np.float64], rough: NDArray[np.float64], n_sub: int, order: int = 1
+    image: NDArray[np.float64],
+    rough: NDArray[np.float64],
+    n_sub: int,
+    pressed: float = _PRESSED,
+    order: int = 1,
 ) -> tuple[NDArray[np.float64], float]:
     """Centres ``(4, 2)`` and common diameter of the images, from their rims."""
-    even = _evened(image)
+    even = _evened(image, pressed)
     centres, radius = fit_rims(even, rough, n_sub / 2, n_sub / 2)
     if order > 1:
         centres, radius = fit_rims(even, centres, radius, n_sub / 2, ITERATIONS // 3, order)
@@ -150,10 +158,10 @@ def _places(
     return centres, 2 * radius
 
 
-def _evened(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def _evened(image: NDArray[np.float64], pressed: float) -> NDArray[np.float64]:
     """The image with its bright parts pressed down: a rim is to be as steep in bright light as in dim."""
     lit = image > 0.1 * np.percentile(image, 99)
-    level = _PRESSED * float(np.median(image[lit])) if lit.any() else 1.0
+    level = pressed * float(np.median(image[lit])) if lit.any() else 1.0
     light = np.maximum(image, 0.0)
     return np.asarray(light / (light + level))
 
