@@ -2,36 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
-
-from numpy.typing import NDArray
+from collections.abc import Sequence
+from typing import Protocol
 
 from escape_hw.remote.state import Arguments, Geometry, LogLine, Plan, ProcedureEntry, State
+from escape_hw.streams.sample import Sample
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sample:
-    """One entry of a stream, copied out of its memory.
-
-    Parameters
-    ----------
-    index
-        Number of the entry; of frame streams the frame's index.
-    exposed_ns, arrived_ns
-        When it was taken and when it was written, monotonic nanoseconds.
-    data
-        The entry's own array.
-    meta
-        Short description of the entry: ``{"stage": ..., "frames": ...}``.
-    """
-
-    index: int
-    exposed_ns: int
-    arrived_ns: int
-    data: NDArray[Any]
-    meta: Mapping[str, float | str]
+__all__ = ["STREAMS", "Sample", "Source"]
 
 
 class Source(Protocol):
