@@ -56,9 +56,9 @@ def configured_basis(
         return _spread_over(works, _OF_SURFACES[basis.kind](surfaces[works], pupil, basis.n_modes))
     if basis.kind == "file":
         # Imported here: astropy takes a second to load, and only this needs it.
-        from escape_hw.io.fits import load_matrix
+        from escape_hw.io.basis import load_basis
 
-        m2c = load_matrix(basis.file).matrix.m2c
+        m2c = load_basis(basis.file)
         if m2c.shape[0] != surfaces.shape[0] or m2c.shape[1] < basis.n_modes:
             raise ConfigError(
                 f"basis.file holds {m2c.shape[0]} actuators and {m2c.shape[1]} modes; "
