@@ -31,6 +31,7 @@ from escape_hw.remote.state import (
     Geometry,
     Lease,
     LogLine,
+    Phase,
     Plan,
     ProcedureEntry,
     Product,
@@ -209,9 +210,9 @@ class Connection:
         return Sample(head["index"], head["exposed_ns"], head["arrived_ns"], array, head["meta"])
 
     def geometry(self) -> Geometry:
-        """Where slopes and actuators stand; asked again after every run."""
+        """Where slopes and actuators stand; asked for again when the state says that it changed."""
         state = self._state
-        key = (state.engine_pid, state.phase, None if state.last is None else state.last.id)
+        key = (state.engine_pid, state.phase is Phase.STARTING, state.geometries)
         known = self._geometry
         if known is None or known[0] != key:
             try:

@@ -118,7 +118,7 @@ class Desk:
     def _geometry(self, request: ask.GetGeometry, number: int) -> object:
         if not self._engine.bench.dm.is_open:
             raise RequestRefused("the devices are not open")
-        return geometry_of(self._engine.bench, self._engine.board.grid).model_dump(mode="json")
+        return geometry_of(self._engine.bench, self._engine.publisher.grid).model_dump(mode="json")
 
     def _procedures(self, request: ask.GetProcedures, number: int) -> object:
         return [entry.model_dump(mode="json") for entry in self._engine.offers.entries]

@@ -170,9 +170,10 @@ class Engine:
             if board.fault is None:
                 self.make_safe(str(error), "mend it, then clear the fault to open the devices again")
             return
-        if board.grid is not None:
-            if self._slopes[0] is not board.grid:
-                self._slopes = (board.grid, extractor(bench, board.grid))
+        grid = self.publisher.grid
+        if grid is not None:
+            if self._slopes[0] is not grid:
+                self._slopes = (grid, extractor(bench, grid))
             self._slopes[1](frame.data)
 
     def flatten(self) -> None:

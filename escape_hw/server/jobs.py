@@ -128,7 +128,7 @@ def _learn(engine: Engine, result: object) -> None:
     """Keep what a result tells of the bench: where the slopes are, what an image should look like."""
     grid, psf = getattr(result, "grid", None), getattr(result, "model_psf", None)
     if grid is not None:
-        engine.board.grid = grid
+        engine.publisher.show(grid)
     if psf is not None:
         engine.model_psf = psf
         engine.publisher.arrays({"model_psf": psf})
@@ -221,7 +221,7 @@ def _wanted(engine: Engine, request: CloseLoop | SetLoop) -> LoopChoice:
 def _keep_loop_closed(engine: Engine, orders: LoopOrders) -> None:
     board, bench = engine.board, engine.bench
     bench.wfs.stop()
-    board.grid, board.closed = orders.settings.closing.grid, True
+    board.closed = True
     log.info("loop closed on '%s', gain %g", board.loop.matrix, board.loop.gain)
     try:
         end = run_procedure(

@@ -118,7 +118,8 @@ class Pulse:
                 strehl=board.loop_metrics.get("strehl"), strehl_sigma=board.loop_metrics.get("strehl_sigma"),
             ),
             procedure=board.running, last=board.last, products=self._shelf.products,
-            telemetry=self._telemetry(), disk=self._disk(), streams=publisher.entries, **light,
+            telemetry=self._telemetry(), disk=self._disk(), streams=publisher.entries,
+            geometries=publisher.geometries, **light,
         )  # fmt: skip
 
     def _rates(self, frame: Frame | None) -> Rates:
