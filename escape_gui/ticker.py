@@ -51,19 +51,20 @@ class Ticker(QObject):
     def tick(self, *, everything: bool = False) -> None:
         """One round; ``everything`` pulls each visible panel whether its time has come or not."""
         now = time.monotonic()
+        if not self.frozen:
+            for panel in self._panels:
+                if everything or now >= self._due[panel.name]:
+                    self._look(panel, now)
         if everything or now >= self._chores_due:
             self._chores_due = now + 0.2
             self._chores()
-        if self.frozen:
+
+    def _look(self, panel: Panel, now: float) -> None:
+        if panel.name in self.broken or not can_be_seen(panel):
             return
-        for panel in self._panels:
-            if not everything and now < self._due[panel.name]:
-                continue
-            if panel.name in self.broken or not can_be_seen(panel):
-                continue
-            # Half a tick less, or rates that divide the timer's would lose every second turn.
-            self._due[panel.name] = now + 1 / panel.rate_hz - TICK_MS / 2000
-            self._pull(panel)
+        # Half a tick less, or rates that divide the timer's would lose every second turn.
+        self._due[panel.name] = now + 1 / panel.rate_hz - TICK_MS / 2000
+        self._pull(panel)
 
     def _pull(self, panel: Panel) -> None:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -109,6 +109,24 @@ def dispose(window: MainWindow) -> None:
     """Close a window and all it holds."""
     window.close()
     window.deleteLater()
+
+
+@pytest.fixture
+def make_window(session: Session, tmp_path: Path) -> Iterator[Callable[..., MainWindow]]:
+    """Makes windows of some panels, and closes them."""
+    made: list[MainWindow] = []
+
+    def make(panels: Sequence[type[Panel]] = PANELS, settings: Settings | None = None) -> MainWindow:
+        made.append(shown(session, tmp_path / "gui.json", panels, settings))
+        for dock in made[-1].docks.values() if len(panels) == 1 else ():
+            dock.show()
+        made[-1].ticker.tick(everything=True)
+        return made[-1]
+
+    yield make
+    for window in made:
+        if shiboken6.isValid(window):
+            dispose(window)
 
 
 @pytest.fixture

@@ -34,6 +34,11 @@ class Stage:
         """The server was asked exactly this."""
         self.bot.waitUntil(lambda: self.control.asked == [(verb, arguments)], timeout=5000)
 
+    def refused(self, name: str) -> None:
+        """What was chosen is no recording, and a note says so."""
+        self.bot.waitUntil(lambda: bool(self.window.toasts.notes), timeout=5000)
+        assert name in self.window.toasts.notes[-1].text
+
     def saved(self, ending: str) -> Path:
         """One file was saved."""
         (path,) = self.folder.glob(f"*.{ending}")
@@ -78,6 +83,8 @@ def _reset(stage: Stage) -> None:
 
 #: What each action must have done. An action that is missing here fails.
 CHECKS: dict[str, Callable[[Stage], None]] = {
+    "open_product": lambda s: s.refused("chosen.fits"),
+    "open_run": lambda s: s.refused("saved"),
     "save_png": lambda s: s.saved("png"),
     "save_csv": _saved_csv,
     "save_fits": _saved_fits,
@@ -134,6 +141,8 @@ def test_every_action_does_what_it_says(
     folder.mkdir()
     ending = action.name.removeprefix("save_").replace("window", "png")
     monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_: (str(folder / f"chosen.{ending}"), ""))
+    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_: (str(folder / "chosen.fits"), ""))
+    monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(folder))
     SETTINGS.get(action.name, lambda _: None)(source)
     if action.name == "reset_layout":
         window.docks["log"].close()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import pytest
-from conftest import dispose, shown
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QGuiApplication
 from pytestqt.qtbot import QtBot
@@ -30,6 +30,7 @@ from escape_hw.errors import StorageError
 from escape_hw.remote.state import Health, Light, LoopState, Mirror, Phase, State
 
 P = TypeVar("P", bound=Panel)
+MakeWindow = Callable[..., MainWindow]
 
 
 def panel_of(window: MainWindow, kind: type[P]) -> P:
@@ -40,11 +41,10 @@ def panel_of(window: MainWindow, kind: type[P]) -> P:
 
 @pytest.mark.parametrize("kind", PANELS, ids=lambda kind: kind.name)
 def test_each_panel_lives_through_everything(
-    kind: type[Panel], session: Session, source: ScriptedSource, tmp_path: Path, qtbot: QtBot
+    kind: type[Panel], make_window: MakeWindow, source: ScriptedSource
 ) -> None:
-    window = shown(session, tmp_path / "gui.json", (kind,))
+    window = make_window((kind,))
     dock, panel = window.docks[kind.name], window.panels[kind.name]
-    dock.show()
 
     def look() -> Health:
         window.ticker.tick(everything=True)
@@ -67,7 +67,6 @@ def test_each_panel_lives_through_everything(
     source.state, source.streams, source.lines = State(), {}, []
     look()
     assert panel.is_empty == bool(panel.empty) or kind.stale_after_s is None
-    dispose(window)
 
 
 def test_frames_that_stop_are_called_stale(
@@ -131,11 +130,11 @@ def test_cursor_says_place_and_value(window: MainWindow, source: ScriptedSource,
     assert said[-1].split() == ["x", "201", "y", "200", str(value), "counts"]
 
 
-def test_mirror_of_a_secondary_shows_both(session: Session, tmp_path: Path) -> None:
+def test_mirror_of_a_secondary_shows_both(session: Session, make_window: MakeWindow) -> None:
     source = ScriptedSource(geometry=secondary())
     source.push_all()
     session.use(source, None)
-    window = shown(session, tmp_path / "gui.json", (MirrorPanel,))
+    window = make_window((MirrorPanel,))
     mirror = panel_of(window, MirrorPanel)
     assert mirror.picture.data is not None
     painted = mirror.picture.data[np.isfinite(mirror.picture.data)]
@@ -143,7 +142,6 @@ def test_mirror_of_a_secondary_shows_both(session: Session, tmp_path: Path) -> N
     assert mirror.choice.buttons["measured"].isEnabled()
     mirror.choice.choose("measured")
     assert mirror.picture.unit == "µm"
-    dispose(window)
 
 
 def test_mirror_tells_peak_and_clipping(window: MainWindow, source: ScriptedSource) -> None:
@@ -244,31 +242,23 @@ def test_performance_has_gaps_where_the_loop_was_open(window: MainWindow, source
     assert np.isnan(table.data[1, 1:]).all()
 
 
-def test_profiles_begin_at_the_strehl_ratio(session: Session, source: ScriptedSource, tmp_path: Path) -> None:
+def test_profiles_begin_at_the_strehl_ratio(make_window: MakeWindow, source: ScriptedSource) -> None:
     y, x = np.indices((64, 64)) - 32.0
     narrow = np.exp(-(x**2 + y**2) / 8)
     wide = np.exp(-(x**2 + y**2) / 32) / 4
     source.push("model_psf", 1000 * narrow)
     source.push("psf", (50 + 3000 * wide).astype(np.uint16))
-    window = shown(session, tmp_path / "gui.json", (PsfPanel,))
-    window.docks["psf"].show()
-    window.ticker.tick(everything=True)
+    window = make_window((PsfPanel,))
     profiles = {one.name: one.data for one in panel_of(window, PsfPanel).shown()}
     assert profiles["psf_profile"][0] / profiles["model_psf_profile"][0] == pytest.approx(0.25, rel=0.01)
-    dispose(window)
 
 
-def test_latencies_are_counted_where_they_lie(
-    session: Session, source: ScriptedSource, tmp_path: Path
-) -> None:
-    window = shown(session, tmp_path / "gui.json", (LatencyPanel,))
-    window.docks["latency"].show()
-    window.ticker.tick(everything=True)
+def test_latencies_are_counted_where_they_lie(make_window: MakeWindow, source: ScriptedSource) -> None:
+    window = make_window((LatencyPanel,))
     (table,) = panel_of(window, LatencyPanel).shown()
     assert table.data[:, 1].sum() == 4000
     middle = table.data[:, 0] @ table.data[:, 1] / 4000
     assert middle == pytest.approx(60 * 5.2, rel=0.05)
-    dispose(window)
 
 
 def test_devices_are_listed_with_units(window: MainWindow, source: ScriptedSource) -> None:

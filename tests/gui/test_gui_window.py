@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,8 @@ from escape_gui.widgets.picture import Picture
 from escape_gui.workspaces import WORKSPACES
 from escape_hw.remote.source import Source
 from escape_hw.remote.state import Ended, Finish, Health
+
+MakeWindow = Callable[..., MainWindow]
 
 
 def places(band: Band) -> list[QPoint]:
@@ -163,30 +166,28 @@ def test_frozen_panels_hold_but_the_band_goes_on(small_window: MainWindow, sourc
     assert window.band.readouts["rate"].text == "123.4"
 
 
-def test_layout_and_look_are_remembered(session: Session, tmp_path: Path) -> None:
+def test_layout_and_look_are_remembered(make_window: MakeWindow, tmp_path: Path) -> None:
     store = tmp_path / "gui.json"
-    window = shown(session, store)
+    window = make_window()
     window.docks["log"].close()
     window.show_workspace("align")
     window.toggle_theme()
     window.step_letters(+1)
-    dispose(window)
+    window.close()
     settings, warnings = load_settings(store)
     assert warnings == ()
-    window = shown(session, store, settings=settings)
+    window = make_window(settings=settings)
     assert window.workspace.name == "align"
     assert (window.context.theme.shade, window.context.theme.scale) == ("light", 1.1)
     window.show_workspace("operate")
     assert not window.docks["log"].isVisible()
-    dispose(window)
 
 
-def test_a_layout_of_another_time_is_dropped(session: Session, tmp_path: Path) -> None:
+def test_a_layout_of_another_time_is_dropped(make_window: MakeWindow) -> None:
     settings = Settings(layouts={"operate": "AAAA"}, geometry="%%%", workspace="gone")
-    window = shown(session, tmp_path / "gui.json", settings=settings)
+    window = make_window(settings=settings)
     assert window.workspace.name == "operate"
     assert window.docks["camera"].isVisible()
-    dispose(window)
 
 
 def test_everything_can_be_reached_and_named(window: MainWindow) -> None:
@@ -206,15 +207,14 @@ def test_everything_can_be_reached_and_named(window: MainWindow) -> None:
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.0, 1.4])
-def test_nothing_of_the_band_is_cut_off(session: Session, tmp_path: Path, scale: float) -> None:
-    window = shown(session, tmp_path / "gui.json", (), Settings(font_scale=scale))
+def test_nothing_of_the_band_is_cut_off(make_window: MakeWindow, scale: float) -> None:
+    window = make_window((), Settings(font_scale=scale))
     window.resize(round(1280 * max(scale, 1)), 800)
     QApplication.processEvents()
     band = window.band
     for widget in (*band.readouts.values(), band.phase, band.loop, band.light, band.control):
         assert widget.width() >= widget.sizeHint().width()
         assert widget.geometry().right() < band.open_button.geometry().left()
-    dispose(window)
 
 
 def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
