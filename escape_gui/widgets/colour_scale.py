@@ -37,8 +37,9 @@ class ColourScale(QWidget):
     def __init__(self, theme: Theme, name: str) -> None:
         super().__init__()
         self._theme = theme
-        self._plot = pg.PlotWidget()
-        self._plot.setMenuEnabled(False)
+        self._plot = pg.PlotWidget(enableMenu=False)
+        # Nobody owns it, and it would outlive the window.
+        self._plot.getPlotItem().ctrlMenu.setParent(self._plot)
         self._plot.setMouseEnabled(x=False, y=False)
         self._plot.hideButtons()
         self._plot.showAxis("right")

@@ -37,7 +37,8 @@ def qapp() -> QApplication:
 def segments() -> set[str]:
     """Shared memory of ours."""
     folder = Path("/dev/shm")
-    return {path.name for path in folder.glob("escape-*")} if folder.is_dir() else set()
+    mine = f"escape-*-{os.getpid()}-*"
+    return {path.name for path in folder.glob(mine)} if folder.is_dir() else set()
 
 
 def timers() -> set[int]:

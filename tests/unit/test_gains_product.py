@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from escape_hw.api.gains import OpticalGains
-from escape_hw.api.results import Measured, StrehlEstimate
 from escape_hw.errors import ProductError
 from escape_hw.io.documents import dumps, gains_document
 from escape_hw.io.gains import load_gains, save_gains
