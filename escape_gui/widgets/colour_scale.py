@@ -39,7 +39,8 @@ class ColourScale(QWidget):
         self._theme = theme
         self._plot = pg.PlotWidget(enableMenu=False)
         # Nobody owns it, and it would outlive the window.
-        self._plot.getPlotItem().ctrlMenu.setParent(self._plot)
+        menu = self._plot.getPlotItem().ctrlMenu
+        menu.setParent(self._plot, menu.windowFlags())
         self._plot.setMouseEnabled(x=False, y=False)
         self._plot.hideButtons()
         self._plot.showAxis("right")

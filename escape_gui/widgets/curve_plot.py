@@ -41,7 +41,7 @@ def add_plot(grid: pg.GraphicsLayoutWidget, row: int = 0) -> pg.PlotItem:
     """A plot in a row of a grid, without menus and hands."""
     plot = grid.addPlot(row=row, col=0, enableMenu=False)
     # Nobody owns it, and it would outlive the window.
-    plot.ctrlMenu.setParent(grid)
+    plot.ctrlMenu.setParent(grid, plot.ctrlMenu.windowFlags())
     plot.hideButtons()
     plot.setMouseEnabled(x=False, y=False)
     plot.showGrid(x=True, y=True, alpha=0.18)
