@@ -58,19 +58,14 @@ class Library:
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="escape-library")
         self._known: dict[tuple[str, str, int], Future[RunContent]] = {}
-        self._wanted: tuple[Product, ...] = ()
         self._built: tuple[object, ...] = ()
         self._shelf = Shelf()
         self._lock = threading.Lock()
 
     def want(self, products: Iterable[Product]) -> None:
         """Read these, and forget others; returns at once."""
-        wanted = tuple(one for one in products if one.kind in ("matrix", "gains"))
+        known = {_key(one): one for one in products if one.kind in ("matrix", "gains")}
         with self._lock:
-            if wanted == self._wanted:
-                return
-            self._wanted = wanted
-            known = {_key(one): one for one in wanted}
             for key in [key for key in self._known if key not in known]:
                 del self._known[key]
             for key, one in known.items():

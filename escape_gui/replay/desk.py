@@ -107,6 +107,7 @@ class ReplayDesk(QObject):
         for other in self.others:
             other.close()
             other.context.session.close()
+            other.deleteLater()
         self.others.clear()
 
 

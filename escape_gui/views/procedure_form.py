@@ -110,8 +110,10 @@ def plan_lines(plan: Plan) -> list[str]:
 
 def progress_line(running: Running) -> str:
     """How far a procedure is."""
-    many = "s" if running.total != 1 else ""
-    line = f"{running.stage or running.name}: {running.done} of {running.total} {running.unit}{many}"
+    many = "s" if (running.total or running.done) != 1 else ""
+    # What goes on until it is stopped has no total.
+    whole = f" of {running.total}" if running.total else ""
+    line = f"{running.stage or running.name}: {running.done}{whole} {running.unit}{many}"
     if running.paused:
         return f"{line}, paused"
     if running.remaining_s is not None and math.isfinite(running.remaining_s):

@@ -8,7 +8,7 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from escape_gui.theme import Theme
 from escape_gui.views.convergence import GROUPS, NAMES, Course, short_unit
-from escape_gui.widgets.curve_plot import ErrorCurve, line_at, style_axis, style_plot
+from escape_gui.widgets.curve_plot import ErrorCurve, add_plot, clear, line_at, style_axis
 
 #: Width of the left axes at normal letter size, so that all plots begin at the same place.
 AXIS = 66
@@ -53,7 +53,7 @@ class ConvergencePlot(QWidget):
 
     def _build(self) -> None:
         """Make the plots again: other axes, other colours."""
-        self._grid.clear()
+        clear(self._grid)
         self._grid.setBackground(self._theme.colour("field"))
         self._curves: dict[int, ErrorCurve] = {}
         top = self._plot(0, "Step norm", "", last=False)
@@ -79,9 +79,7 @@ class ConvergencePlot(QWidget):
         self._fill()
 
     def _plot(self, row: int, title: str, unit: str, *, last: bool) -> pg.PlotItem:
-        plot = self._grid.addPlot(row=row, col=0)
-        style_plot(self._theme, plot)
-        plot.setMouseEnabled(x=False, y=False)
+        plot = add_plot(self._grid, row)
         style_axis(self._theme, plot.getAxis("left"), title, unit, stacked=True)
         plot.getAxis("left").setWidth(self._theme.pixels(AXIS))
         style_axis(self._theme, plot.getAxis("bottom"), "Iteration" if last else "")

@@ -13,17 +13,10 @@ from PySide6.QtGui import QColor
 
 from escape_gui.theme import Theme
 from escape_gui.widgets.ownership import own_menu
+from escape_gui.widgets.plot import DASHES
 
 #: Markers and dashes by number of the curve, with the character that stands for each in words.
 MARKERS = (("o", "●"), ("s", "■"), ("t1", "▲"), ("d", "◆"), ("t", "▼"), ("star", "★"))
-_DASHES = (
-    Qt.PenStyle.SolidLine,
-    Qt.PenStyle.DashLine,
-    Qt.PenStyle.SolidLine,
-    Qt.PenStyle.DashDotLine,
-    Qt.PenStyle.DotLine,
-    Qt.PenStyle.DashDotDotLine,
-)
 
 
 def style_axis(
@@ -45,11 +38,22 @@ def style_axis(
     axis.setLabel(words, color=text.name(), **{"font-size": size})
 
 
-def style_plot(theme: Theme, plot: pg.PlotItem) -> None:
-    """The common look of a plot."""
+def add_plot(grid: pg.GraphicsLayoutWidget, row: int = 0) -> pg.PlotItem:
+    """A plot in a row of a grid, without menus and hands."""
+    plot = grid.addPlot(row=row, col=0)
     own_menu(plot)
     plot.hideButtons()
+    plot.setMouseEnabled(x=False, y=False)
     plot.showGrid(x=True, y=True, alpha=0.18)
+    return plot
+
+
+def clear(grid: pg.GraphicsLayoutWidget) -> None:
+    """Take the plots out of a grid, with the menus that they leave behind."""
+    for item in tuple(grid.ci.items):
+        if isinstance(item, pg.PlotItem):
+            item.ctrlMenu.deleteLater()
+    grid.clear()
 
 
 @dataclass(slots=True, eq=False)
@@ -71,7 +75,7 @@ class ErrorCurve:
     def make(cls, theme: Theme, number: int, *, joined: bool = True, size: float = 6.0) -> ErrorCurve:
         """Curve ``number`` of a plot, in its colour, marker and dash."""
         colour = theme.series(number)
-        pen = pg.mkPen(colour, width=1, style=_DASHES[number % len(_DASHES)]) if joined else None
+        pen = pg.mkPen(colour, width=1, style=DASHES[number % len(DASHES)]) if joined else None
         line = pg.PlotDataItem(
             pen=pen, symbol=MARKERS[number % len(MARKERS)][0], symbolSize=size, symbolBrush=colour,
             symbolPen=None, connect="finite",

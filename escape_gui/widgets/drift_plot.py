@@ -9,7 +9,7 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 from escape_gui.theme import Theme
 from escape_gui.views.convergence import GROUPS, Drift, short_unit
 from escape_gui.widgets.convergence_plot import AXIS
-from escape_gui.widgets.curve_plot import Band, line_at, style_axis, style_plot
+from escape_gui.widgets.curve_plot import Band, add_plot, clear, line_at, style_axis
 
 
 class DriftPlot(QWidget):
@@ -42,13 +42,11 @@ class DriftPlot(QWidget):
             self._fill()
 
     def _build(self) -> None:
-        self._grid.clear()
+        clear(self._grid)
         self._grid.setBackground(self._theme.colour("field"))
         self._bands: dict[int, Band] = {}
         for row, (title, unit, members) in enumerate(GROUPS):
-            plot = self._grid.addPlot(row=row, col=0)
-            style_plot(self._theme, plot)
-            plot.setMouseEnabled(x=False, y=False)
+            plot = add_plot(self._grid, row)
             last = row == len(GROUPS) - 1
             style_axis(
                 self._theme, plot.getAxis("left"), f"Δ {title.lower()}", short_unit(unit), stacked=True

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from escape_gui.theme import Theme
 from escape_gui.views.gain_curves import Curve, sides
-from escape_gui.widgets.curve_plot import Band, ErrorCurve, line_at, style_axis, style_plot
+from escape_gui.widgets.curve_plot import Band, ErrorCurve, add_plot, clear, line_at, style_axis
 
 #: Rounds of the bootstrap before the last are drawn so faintly.
 _FAINT = 0.45
@@ -64,11 +64,9 @@ class GainsPlot(QWidget):
 
     def _build(self) -> None:
         self._built = self._structure()
-        self._graphics.clear()
+        clear(self._graphics)
         self._graphics.setBackground(self._theme.colour("field"))
-        self._plot = self._graphics.addPlot()
-        style_plot(self._theme, self._plot)
-        self._plot.setMouseEnabled(x=False, y=False)
+        self._plot = add_plot(self._graphics)
         on = sides(self._curves)
         self._second = self._add_second(on) if "right" in on.values() else None
         style_axis(self._theme, self._plot.getAxis("bottom"), "Mode")

@@ -8,4 +8,4 @@ import pyqtgraph as pg
 def own_menu(plot: pg.PlotItem) -> None:
     """Give a plot's menu, which nobody sees, to the widget that the plot stands in."""
     plot.setMenuEnabled(False)
-    plot.ctrlMenu.setParent(plot.getViewWidget())
+    plot.ctrlMenu.setParent(plot.getViewWidget(), plot.ctrlMenu.windowFlags())
