@@ -23,6 +23,7 @@ from escape_hw.cli import (
     products,
     rehearse,
     reproduce,
+    streams,
     systems,
     track,
     udev,
@@ -59,6 +60,7 @@ app.command("discover")(discover.discover)
 app.add_typer(udev.app, name="udev")
 app.command("emulate")(emulate.emulate)
 app.command("rehearse")(rehearse.rehearse)
+app.command("streams")(streams.streams)
 
 
 def _version(wanted: bool) -> None:
