@@ -17,12 +17,14 @@ from escape_hw.cli import (
     doctor,
     emulate,
     gains,
+    keys,
     loop,
     modulator,
     perf,
     products,
     rehearse,
     reproduce,
+    serve,
     streams,
     systems,
     track,
@@ -46,6 +48,8 @@ app.command("sprint")(calibrate.sprint)
 app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.command("track")(track.track)
+app.command("serve")(serve.serve)
+app.add_typer(keys.app, name="keys")
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
 app.command("compare")(products.compare)
