@@ -17,6 +17,7 @@ from escape_hw.cli import (
     doctor,
     emulate,
     gains,
+    gui,
     keys,
     loop,
     modulator,
@@ -59,6 +60,8 @@ app.add_typer(dm.app, name="dm")
 app.add_typer(camera.app, name="camera")
 app.add_typer(modulator.app, name="modulator")
 app.add_typer(asm.app, name="asm")
+app.command("gui")(gui.gui)
+app.command("replay")(gui.replay)
 app.command("doctor")(doctor.doctor)
 app.command("discover")(discover.discover)
 app.add_typer(udev.app, name="udev")

@@ -70,8 +70,9 @@ def do_task(engine: Engine, task: Task[Any], config: SystemConfig) -> None:
     _shelve(engine, ended)
     board.last, board.running = ended, None
     board.phase = Phase.IDLE if board.fault is None else Phase.FAULT
-    engine.channel.post({"ended": ended.model_dump(mode="json")})
+    # Whoever hears of the end finds its products in the state already.
     engine.pulse.beat()
+    engine.channel.post({"ended": ended.model_dump(mode="json")})
     engine.answer_flat()
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -198,6 +201,19 @@ def test_who_only_watches_writes_nothing_but_may_always_stop(served: Served, ben
             line.text for line in watcher.log_after(-1) if "takes the right to write over from" in line.text
         ]
         assert taken
+
+
+def test_the_page_on_the_server_can_be_followed(served: Served, bench: Connection) -> None:
+    page = Path(__file__).parents[2] / "docs" / "server.md"
+    (block,) = re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
+    bench.release()
+    script = block.replace('"razor-shwfs"', f'"{SYSTEM}"').replace("frames=1000", "frames=300")
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=served.environment, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("idle (200, 200)\n")
+    assert bench.state.mirror.peak == 0.0
 
 
 def test_two_clients_race_for_the_lease_a_thousand_times(served: Served, bench: Connection) -> None:
