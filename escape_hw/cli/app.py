@@ -17,12 +17,14 @@ from escape_hw.cli import (
     doctor,
     emulate,
     gains,
+    interchange,
     loop,
     modulator,
     perf,
     products,
     rehearse,
     reproduce,
+    sprint,
     systems,
     track,
     udev,
@@ -41,11 +43,13 @@ app = typer.Typer(
 app.command("systems")(systems.systems)
 app.add_typer(systems.config_app, name="config")
 app.command("calibrate")(calibrate.calibrate)
-app.command("sprint")(calibrate.sprint)
+app.command("sprint")(sprint.sprint)
 app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.command("track")(track.track)
 app.add_typer(reproduce.app, name="reproduce")
+app.add_typer(interchange.export_app, name="export")
+app.add_typer(interchange.import_app, name="import")
 app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)

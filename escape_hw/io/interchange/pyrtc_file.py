@@ -75,7 +75,8 @@ def read_file(path: Path | str, kind: str | None = None) -> PyrtcFile:
     """
     path = Path(path)
     try:
-        loaded = np.load(path, allow_pickle=False)
+        # From memory: numpy leaves the file of a damaged archive open.
+        loaded = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
         if isinstance(loaded, np.ndarray):
             return PyrtcFile(path, loaded, None)
         with loaded as archive:
