@@ -35,6 +35,14 @@ Injection = Callable[[], NDArray[np.float64]]
 LoopObserver = Callable[[int, NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]], object]
 
 
+#: Residuals that a progress report shows.
+_SHOWN = 500
+
+
+def _newest(residual: array[float]) -> NDArray[np.float32]:
+    return np.array(residual[-_SHOWN:], np.float32)
+
+
 @dataclass(slots=True, eq=False)
 class LoopRecord:
     """What a run gathers on its way.
@@ -113,6 +121,8 @@ class RunningLoop:
         self._shape = np.zeros(m2c.shape[0])
         self._none.flags.writeable = False
         self._saturated = 0
+        self._tap = bench.taps.residual
+        self._residual_nm = np.zeros(m2c.shape[1], np.float32)
 
     def run(
         self,
@@ -161,8 +171,8 @@ class RunningLoop:
                 image = self._science.poll()
                 if image is not None and record.frames > self._closing + 2:
                     record.science.add(image.data)
-            if progress := report.step(residual_nm=record.residual[-1]):
-                yield progress
+            if report.step():
+                yield report.now({"residual": _newest(record.residual)}, residual_nm=record.residual[-1])
         return record
 
     def _answer(self, frame: Frame, poke: NDArray[np.float64], whole: bool) -> None:
@@ -182,7 +192,10 @@ class RunningLoop:
         record.diverged = self._saturated >= _SATURATED_FRAMES
         record.frames, record.last, record.command = record.frames + 1, frame, sent.sent
         residual = self.control.residual
-        record.residual.append(self._nm * float(np.sqrt(residual.dot(residual))))
+        rms = self._nm * float(np.sqrt(residual.dot(residual)))
+        record.residual.append(rms)
+        if self._tap is not None:
+            self._tap(frame.index, np.multiply(residual, self._nm, out=self._residual_nm), rms)
 
     def _sent(self, shape: NDArray[np.float64], whole: bool) -> tuple[SendReport, int | None]:
         """What was sent, and how many actuators were asked beyond the stroke if it was not the shape."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.camera import Camera
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
@@ -95,7 +96,32 @@ def extractor(bench: Bench, grid: SensorGeometry) -> SlopeFunction:
             f"the dark frame has shape {bench.dark.shape}, the camera delivers {shape}; measure it again"
         )
     dark = bench.dark if bench.dark is not None else np.full(shape, grid.background, np.float32)
-    return kind_of(bench).extractor(bench, grid, shape, dark)
+    slopes_of = kind_of(bench).extractor(bench, grid, shape, dark)
+    return slopes_of if bench.taps.slopes is None else _TappedSlopes(slopes_of, bench.wfs, bench.taps.slopes)
+
+
+class _TappedSlopes:
+    """Slopes that somebody looks at as they pass."""
+
+    def __init__(
+        self, slopes_of: SlopeFunction, camera: Camera, tap: Callable[[int, NDArray[np.float32]], object]
+    ) -> None:
+        self._slopes_of, self._camera, self._tap = slopes_of, camera, tap
+        self.grid, self.shape = slopes_of.grid, slopes_of.shape
+
+    @property
+    def flux(self) -> NDArray[np.float32]:
+        return self._slopes_of.flux
+
+    def __call__(
+        self,
+        frame: NDArray[np.uint16],
+        flux: NDArray[np.float32] | None = None,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        slopes = self._slopes_of(frame, flux, out)
+        self._tap(self._camera.last_index, slopes)
+        return slopes
 
 
 def find_sensor(
@@ -215,9 +241,9 @@ def modal_basis(bench: Bench) -> NDArray[np.float64]:
         return _spread_over(works, _OF_SURFACES[basis.kind](surfaces[works], pupil, basis.n_modes))
     if basis.kind == "file":
         # Imported here: astropy takes a second to load, and only this needs it.
-        from escape_hw.io.fits import load_matrix
+        from escape_hw.io.basis import load_basis
 
-        m2c = load_matrix(basis.file).matrix.m2c
+        m2c = load_basis(basis.file)
         if m2c.shape[0] != surfaces.shape[0] or m2c.shape[1] < basis.n_modes:
             raise ConfigError(
                 f"basis.file holds {m2c.shape[0]} actuators and {m2c.shape[1]} modes; "
