@@ -36,6 +36,9 @@ def loop(
     strehl: Annotated[
         bool, typer.Option("--strehl/--no-strehl", help="Measure the model PSF and the Strehl ratios.")
     ] = True,
+    record: Annotated[
+        int, typer.Option("--record", min=0, help="Keep slopes and commands of the newest so many frames.")
+    ] = 0,
     force: options.Force = False,
     out: options.Out = None,
     set: options.Set = None,
@@ -47,6 +50,7 @@ def loop(
     """Close the loop with an interaction matrix."""
     with session("loop", json=json, quiet=quiet) as one:
         from escape_hw.errors import ConfigError
+        from escape_hw.runtime.keep import keep_telemetry
 
         if best and gain is not None:
             raise ConfigError("--gain and --best-gain exclude each other")
@@ -58,12 +62,18 @@ def loop(
         with one.run_folder(config, "loop", out) as folder:
             with one.bench(choice) as bench:
                 from escape_hw.runtime.records import BenchRecord
+                from escape_hw.runtime.telemetry_tape import TelemetryTape
 
                 refuse_simulated(product, bench, force)
-                record = BenchRecord.of(bench)
+                about = BenchRecord.of(bench)
+                tape = TelemetryTape(record, product.grid.n_slopes, bench.dm.info.n_act) if record else None
+                if tape is not None:
+                    bench.taps = tape.taps
                 result, stop = one.attempt(_procedure(bench, product, frames, best, strehl))
             with one.saving(stop):
-                _finish(one, folder, record, product, result)
+                if tape is not None:
+                    keep_telemetry(folder, about, "telemetry", tape.telemetry(), product.path)
+                _finish(one, folder, about, product, result)
             if stop is not None:
                 raise stop
 

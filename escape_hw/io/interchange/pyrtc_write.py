@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,27 +40,6 @@ class FrameFacts:
 
     shape: tuple[int, int]
     threshold: float
-
-    @classmethod
-    def of_config(cls, path: Path, text: str) -> FrameFacts:
-        """From the configuration that a product carries.
-
-        Raises
-        ------
-        IncompatibleProduct
-            It carries none.
-        """
-        try:
-            config = tomllib.loads(text)
-            wfs = config["devices"]["wfs"]
-            width, height = wfs["region"][2:]
-            counts = config["sensor"].get("threshold", 0.0) * (2 ** wfs["bit_depth"] - 1)
-        except (tomllib.TOMLDecodeError, KeyError, ValueError, TypeError) as error:
-            raise IncompatibleProduct(
-                f"{path}: carries no configuration that tells the camera's region ({error!r}); "
-                "calibrate again with this version"
-            ) from error
-        return cls((int(height), int(width)), float(counts))
 
 
 def in_basis(matrix: InteractionMatrix, m2c: NDArray[np.float64]) -> InteractionMatrix:
