@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from escape_hw.io import fits_file
 from escape_hw.io.documents import registration_document
 from escape_hw.io.interchange import aot_geometry
 from escape_hw.io.interchange.optional import library
-from escape_hw.io.storage import make_folder, storage_error
+from escape_hw.io.storage import make_folder, storage_error, write_atomic
 from escape_hw.io.telemetry import LoopTelemetry
 
 #: Names of the parts in the file.
@@ -100,15 +99,14 @@ def write_aot(
     # A header card holds no line breaks.
     system.config = fits_file.plain(config_text)
     make_folder(path.parent)
-    handle, name = tempfile.mkstemp(suffix=".fits", dir=path.parent)
-    os.close(handle)
     try:
-        system.write_to_file(name, overwrite=True)
-        Path(name).replace(path)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".aot.") as folder:
+            made = Path(folder) / "aot.fits"
+            system.write_to_file(made)
+            content = made.read_bytes()
     except OSError as error:
         raise storage_error(path, error) from error
-    finally:
-        Path(name).unlink(missing_ok=True)
+    write_atomic(path, content)
     return path
 
 
