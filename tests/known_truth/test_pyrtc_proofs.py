@@ -30,8 +30,14 @@ pytestmark = [
 SYNTHETIC = Path(__file__).parents[2] / "examples" / "pyrtc-synthetic.toml"
 #: pyRTC's synthetic sensor: counts between the spots, and pixels that they move for a slope of 1.
 BACKGROUND, PIXELS = 120, 1.6
-#: The twin that pyRTC calibrates: a slow screen of D/r0 = 4.5 in the beam.
-TWIN = [*SMALL, "devices.screen.screen=3", "devices.screen.speed_m_s=0.002", "twin.paced=true"]
+#: The twin that pyRTC calibrates: a screen of D/r0 = 4.5 that stands still. So slow that a command has arrived,
+#: and its frame with it, before pyRTC looks, however busy this computer is.
+TWIN = [
+    *SMALL, "devices.screen.screen=3", "devices.screen.speed_m_s=0.0", "twin.paced=true",
+    "devices.wfs.frame_rate_hz=60", "twin.vibration.amplitude_rad=[0.0,0.0]",
+]  # fmt: skip
+#: Small pokes, whose answer is not far above the sensor's noise.
+POKE = 0.002
 
 
 @pytest.fixture
@@ -108,7 +114,7 @@ def measured_by_pyrtc(folder: Path, geometry: CalibrationResult, seed: int) -> P
         wfs.set_dark(np.full((200, 200), round(geometry.grid.background), np.int32))
         slopes = made.slopes(**found["slopes"])
         mirror = made.mirror(EscapeMirror, **found["wfc"], **ours)
-        loop = made.loop(poke_amp=0.01, num_iters_im=5, im_settle_frames=3, im_round_trip_check=False)
+        loop = made.loop(poke_amp=POKE, num_iters_im=4, im_settle_frames=4, im_round_trip_check=False)
         for part in (wfs, slopes, mirror):
             part.start()
         assert within(30, lambda: slopes._stream_object("signal").count > 10)
@@ -117,6 +123,12 @@ def measured_by_pyrtc(folder: Path, geometry: CalibrationResult, seed: int) -> P
     whole = folder / "pyrtc.yaml"
     whole.write_text(paths["settings"].read_text() + "wfs: {width: 200, height: 200}\n")
     return whole
+
+
+def shape_error(found: np.ndarray, truth: np.ndarray) -> float:
+    """Relative error of a matrix, but for a common scale, which a loop's gain takes up."""
+    scale = float(np.vdot(found, truth) / np.vdot(found, found))
+    return float(np.linalg.norm(scale * found - truth) / np.linalg.norm(truth))
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -132,15 +144,13 @@ def test_a_matrix_measured_by_pyrtc_is_improved_by_sprint(
     sets = [word for one in overrides for word in ("--set", one)]
     command("import", "pyrtc", config, "razor-shwfs", "--out", tmp_path / "im.fits", *sets)
     told = command("sprint", "razor-shwfs", "--im", tmp_path / "im.fits", "--out", tmp_path / "run", *sets)
-    truth = calm.matrix.data
     errors = {
-        name: float(np.linalg.norm(load_matrix(path).matrix.data - truth) / np.linalg.norm(truth))
-        for name, path in told["products"].items()
-        if path.endswith(".fits")
+        name: shape_error(load_matrix(told["products"][name]).matrix.data, calm.matrix.data)
+        for name in ("im", "escape")
     }
     found = {name: value["value"] for name, value in told["registration"].items()}
     print(f"pyRTC's push-pull {errors['im']:.3f}, SPRINT's matrix {errors['escape']:.3f}; {found}")
-    assert errors["escape"] < 0.7 * errors["im"]
+    assert errors["escape"] < 0.5 * errors["im"]
     planted = escape_hw.load_system("razor-shwfs").twin.registration
     assert abs(found["shift_x"] - planted.shift_x) < 15
     assert abs(found["shift_y"] - planted.shift_y) < 15
