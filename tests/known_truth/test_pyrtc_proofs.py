@@ -30,8 +30,8 @@ pytestmark = [
 SYNTHETIC = Path(__file__).parents[2] / "examples" / "pyrtc-synthetic.toml"
 #: pyRTC's synthetic sensor: counts between the spots, and pixels that they move for a slope of 1.
 BACKGROUND, PIXELS = 120, 1.6
-#: The twin that pyRTC calibrates: a screen of D/r0 = 4.5 that stands still. So slow that a command has arrived,
-#: and its frame with it, before pyRTC looks, however busy this computer is.
+#: The twin that pyRTC calibrates: a screen of D/r0 = 4.5 that stands still. So slow that a command has
+#: arrived, and its frame with it, before pyRTC looks, however busy this computer is.
 TWIN = [
     *SMALL, "devices.screen.screen=3", "devices.screen.speed_m_s=0.0", "twin.paced=true",
     "devices.wfs.frame_rate_hz=60", "twin.vibration.amplitude_rad=[0.0,0.0]",
