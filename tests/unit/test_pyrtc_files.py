@@ -201,6 +201,40 @@ def test_files_of_1x_are_read_when_somebody_says_how_they_were_made(tmp_path: Pa
     assert back.matrix.metrics["pyrtc_version"] == "1.x"
 
 
+def test_configurations_of_1x_spell_their_keys_in_one_word(tmp_path: Path) -> None:
+    result = lenslets()
+    config = _old_files(tmp_path, result)
+    names = {"im_file": "IMFile", "m2c_file": "m2cFile", "sub_ap_spacing": "subApSpacing",
+             "sub_ap_offset_x": "subApOffsetX", "sub_ap_offset_y": "subApOffsetY",
+             "valid_sub_aps_file": "validSubApsFile", "ref_slopes_file": "refSlopesFile"}  # fmt: skip
+    text = config.path.read_text()
+    for new, old in names.items():
+        text = text.replace(f"{new}:", f"{old}:")
+    config.path.write_text(text)
+    old_config = PyrtcConfig.read(config.path)
+    assert old_config.old
+    assert not config.old
+    assert old_config.slopes == config.slopes
+    back = import_matrix(old_config, target(result), way="xy")
+    np.testing.assert_array_equal(back.matrix.data, result.matrix.data)
+
+
+def test_pupils_of_1x_are_rows_and_columns(tmp_path: Path) -> None:
+    result = pyramid()
+    assert isinstance(result.grid, PyramidPupils)
+    paths = export_matrix(tmp_path, result, FrameFacts((48, 48), 0.0))
+    write_array(paths["im"], read_file(paths["im"]).data)
+    write_array(paths["references"], read_file(paths["references"]).data)
+    found = yaml.safe_load(paths["settings"].read_text())
+    rows = [",".join(reversed(entry.split(","))) for entry in found["slopes"]["pupils"]]
+    found["slopes"] |= {"pupils": rows, "pupilsRadius": found["slopes"].pop("pupils_radius")}
+    whole = tmp_path / "whole.yaml"
+    whole.write_text(yaml.safe_dump({**found, "wfs": {"width": 48, "height": 48}}))
+    back = import_matrix(PyrtcConfig.read(whole), target(result), way="yx")
+    assert isinstance(back.grid, PyramidPupils)
+    np.testing.assert_array_equal(back.grid.corners_px, result.grid.corners_px)
+
+
 def test_even_windows_of_1x_were_half_a_pixel_off() -> None:
     zeros = np.zeros((4, 2))
     assert (LegacyFrame("yx", window=8).references(zeros) == 0.5).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,13 +48,18 @@ class Target:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PyrtcConfig:
-    """The sections of a configuration of pyRTC's that say what its calibration means."""
+    """The sections of a configuration of pyRTC's that say what its calibration means.
+
+    Keys are those of 2.x; pyRTC 1.x wrote the same words in one (``subApSpacing``), and gave the centres of
+    pupils by row and column.
+    """
 
     path: Path
     slopes: dict[str, Any]
     loop: dict[str, Any]
     wfs: dict[str, Any]
     wfc: dict[str, Any]
+    old: bool = False
 
     @classmethod
     def read(cls, path: Path | str) -> PyrtcConfig:
@@ -79,7 +85,10 @@ class PyrtcConfig:
         wrong = [name for name, section in found.items() if not isinstance(section, dict)]
         if wrong or not found["slopes"]:
             raise ProductError(f"{path}: no configuration of pyRTC's; it has no section 'slopes'")
-        return cls(path, **found)
+        keys = [str(key) for section in found.values() for key in section]
+        old = any(key != _spelled(key) for key in keys)
+        new = {name: {_spelled(str(k)): v for k, v in section.items()} for name, section in found.items()}
+        return cls(path, **new, old=old)
 
     def file(self, section: dict[str, Any], key: str) -> Path | None:
         """A file that a section names, relative to the configuration; ``None`` where it names none."""
@@ -240,9 +249,16 @@ def _pyramid(config: PyrtcConfig, target: Target, files: _Files) -> _Sensor:
     radius = min(rows - bottom, columns - right)
     if "pupils" in config.slopes:
         centres = [_point(config, entry) for entry in config.slopes["pupils"]]
+        if config.old and files.frame.way == "yx":
+            centres = [(x, y) for y, x in centres]
         radius = config.need("slopes", "pupils_radius", int)
     images = PyrtcPupils(tuple(centres), radius, float(config.slopes.get("central_obscuration_ratio") or 0.0))
     return _Sensor(*images.pupils(files.references_or((images.n, 2 * images.n)), target.n_sub))
+
+
+def _spelled(key: str) -> str:
+    """A key of pyRTC 1.x as 2.x spells it: ``IMFile`` becomes ``im_file``."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", key).lower()
 
 
 def _point(config: PyrtcConfig, entry: object) -> tuple[int, int]:
