@@ -121,6 +121,8 @@ def test_a_loop_takes_our_files_as_they_are(tmp_path: Path) -> None:
     whole.write_text(paths["settings"].read_text() + "wfs: {width: 400, height: 400}\n")
     back = import_matrix(PyrtcConfig.read(whole), target(result), tmp_path / "again.npy")
     np.testing.assert_array_equal(back.matrix.data, result.matrix.data)
+    assert not back.matrix.sigma.any()
+    assert "no standard errors" in back.notes[-1]
     assert isinstance(back.grid, SubApertureGrid)
     np.testing.assert_array_equal(back.grid.valid, result.grid.valid)
 

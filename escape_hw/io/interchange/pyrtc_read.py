@@ -224,8 +224,10 @@ def import_matrix(
         {"pyrtc_version": str(record.get("pyrtc_version", "1.x" if file.legacy else "2.x"))},
         sensor.grid.slope_unit,
     )  # fmt: skip
-    notes = (f"read from pyRTC's {file.path.name}", *sensor.notes)
-    return CalibrationResult(matrix, sensor.grid, int(record.get("frames") or 0), 0, 0.0, notes=notes)
+    notes = [f"read from pyRTC's {file.path.name}", *sensor.notes]
+    if "sigma" not in file.more:
+        notes.append("it tells no standard errors; errors of a registration found from it rest on equal ones")
+    return CalibrationResult(matrix, sensor.grid, int(record.get("frames") or 0), 0, 0.0, notes=tuple(notes))
 
 
 def _lenslets(config: PyrtcConfig, target: Target, files: _Files) -> _Sensor:
