@@ -181,7 +181,7 @@ class _Tracker:
             curved=len(SCATTER) if bench.config.sensor.kind == "pyramid" else 0,
         )  # fmt: skip
         unit = modal_matrix(self.model, start.registration, matrix.m2c, start.width.value)
-        self.begun = np.square(matrix.data).sum(axis=0) / (unit * matrix.data).sum(axis=0)
+        self.begun = (unit * matrix.data).sum(axis=0) / np.square(unit).sum(axis=0)
         self.used = replace(self.used, gain=float(self.begun.mean()))
 
     def run(self, seconds: float) -> Procedure[TrackResult]:
