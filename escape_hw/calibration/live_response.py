@@ -80,16 +80,9 @@ class ResponseSums:
         scaled = (np.eye(weights.size) - np.outer(weights / total, np.ones(weights.size))) @ bread / total
         sigma = np.sqrt(np.diag(scaled @ self._scores @ scaled.T))
         measured = TemporalResponse(weights / total, sigma)
-        if known is not None and known.sigma.max() < sigma.max() and not self.contradicts(measured, known):
+        if known is not None and known.sigma.max() < sigma.max() and not contradicts(measured, known):
             return known
         return measured
-
-    @staticmethod
-    def contradicts(measured: TemporalResponse, known: TemporalResponse) -> bool:
-        """Whether two responses differ by more than their errors let one expect."""
-        errors = np.hypot(measured.sigma, known.sigma)
-        apart = np.abs(measured.weights - known.weights)
-        return bool((apart > np.maximum(_APART * errors, _LITTLE)).any())
 
     def gain_sigma(self, response: TemporalResponse) -> float:
         """Relative error that the response's errors put on the gain of a matrix."""
@@ -100,3 +93,10 @@ class ResponseSums:
         # The weights' errors sum to zero, so what all lags have in common does not count.
         spread = float(np.sqrt(np.square((seen - here) * response.sigma).sum()))
         return spread / max(abs(here), 1e-300)
+
+
+def contradicts(measured: TemporalResponse, known: TemporalResponse) -> bool:
+    """Whether two responses differ by more than their errors let one expect."""
+    errors = np.hypot(measured.sigma, known.sigma)
+    apart = np.abs(measured.weights - known.weights)
+    return bool((apart > np.maximum(_APART * errors, _LITTLE)).any())

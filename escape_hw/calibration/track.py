@@ -157,7 +157,7 @@ class _Tracker:
         self.response, self.memory = response, memory_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
         self.used = InUse(matrix, inverted(matrix, self.dropped), start, 1.0)
-        self.watch = TrackWatch(start.registration, t.largest_shift)
+        self.watch = TrackWatch(start.registration, t.largest_shift, response)
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
@@ -196,7 +196,7 @@ class _Tracker:
             science.stop()
         slopes_of = extractor(bench, self.grid)
         loop = RunningLoop(bench, self.used.matrix.m2c, slopes_of, self.control, science=science is not None)
-        report = Reporter("tracking", math.ceil(seconds / STEP_S), "s")
+        report = Reporter("tracking", math.ceil(seconds / STEP_S), "second")
         with ThreadPoolExecutor(1, thread_name_prefix="live registration") as pool:
             try:
                 yield from self._track(loop, report, pool)

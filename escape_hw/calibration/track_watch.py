@@ -8,8 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from escape_hw.api.registration import Registration
+from escape_hw.api.results import TemporalResponse
 from escape_hw.api.tracking import Alarm
 from escape_hw.calibration.live_registration import LiveEstimate
+from escape_hw.calibration.live_response import contradicts
 
 #: Standard errors that an update may miss what was expected by.
 JUMP = 8.0
@@ -33,10 +35,14 @@ class TrackWatch:
         Registration that tracking began with.
     largest_shift
         How far the mirror may shift before a new calibration is due, % of a sub-aperture.
+    response
+        The temporal response that the matrix was measured with, where it is known.
     """
 
-    def __init__(self, start: Registration, largest_shift: float) -> None:
-        self._start, self._largest = start.to_array(), largest_shift
+    def __init__(
+        self, start: Registration, largest_shift: float, response: TemporalResponse | None = None
+    ) -> None:
+        self._start, self._largest, self._response = start.to_array(), largest_shift, response
         self._noise: deque[float] = deque(maxlen=_USUAL)
         self._misfit: deque[float] = deque(maxlen=_USUAL)
         self._last: dict[str, int] = {}
@@ -58,6 +64,8 @@ class TrackWatch:
         if not found:
             self._noise.append(live.noise)
             self._misfit.append(live.misfit)
+        # The live registration goes on with the response that it measures: told once.
+        self._response = live.response
         return found
 
     def _findings(self, live: LiveEstimate) -> dict[str, str]:
@@ -79,6 +87,11 @@ class TrackWatch:
             found["noise"] = (
                 f"the slopes move {live.noise / usual:.1f} times as much as usual beyond what the mirror "
                 "explains; is there enough light, or does something vibrate?"
+            )
+        if self._response is not None and contradicts(live.response, self._response):
+            found["delay"] = (
+                f"the mirror answers after {live.response.delay:.2f} frames, not {self._response.delay:.2f}; "
+                "look for another exposure or frame rate, or a computer that is late"
             )
         worst = int(np.argmax(np.abs(live.actuators)))
         if abs(live.actuators[worst]) > STRANGE_ACTUATOR:
