@@ -36,16 +36,16 @@ from escape_sim.local_response import FrozenWavefronts, local_gains, twin_behind
 FROM_S = 4.0
 
 
-def calibrated(bench: System, frames: int) -> tuple[CalibrationResult, CalibrationResult]:
+def calibrated(bench: System, options: argparse.Namespace) -> tuple[CalibrationResult, CalibrationResult]:
     """ESCAPE under turbulence, and the baseline (push-pull without it) on the same geometry."""
-    escape = bench.calibrate("escape", frames=frames)
-    baseline = bench.calibrate("push-pull", frames=5, grid=escape.grid)
+    escape = bench.calibrate("escape", frames=options.calibration)
+    baseline = bench.calibrate("push-pull", frames=options.baseline, grid=escape.grid)
     return escape, baseline
 
 
 def gains(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     """Gains at pokes of 0.2 % of the stroke against push-pull around the frozen wavefronts."""
-    _, baseline = calibrated(bench, options.calibration)
+    _, baseline = calibrated(bench, options)
     pupils, twin = baseline.grid, twin_behind(bench)
     if not isinstance(pupils, PyramidPupils):
         raise SystemExit("optical gains are a pyramid's; choose another system")
@@ -107,7 +107,7 @@ def scaled(result: CalibrationResult, factor: float) -> CalibrationResult:
 
 def loops(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     """Strehl ratios with the baseline, with ESCAPE scaled by its optical gains, with DO-CRIME alone."""
-    escape, baseline = calibrated(bench, options.calibration)
+    escape, baseline = calibrated(bench, options)
     if escape.measured is None:
         raise SystemExit("too few frames for a DO-CRIME matrix")
     psf = bench.take_model_psf(frames=5)
@@ -173,7 +173,7 @@ def paired(lines: list[str]) -> list[str]:
 
 def pokes(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     """Strehl ratio with the budgeted pokes, with those of 0.2 % of the stroke, and with next to none."""
-    _, baseline = calibrated(bench, options.calibration)
+    _, baseline = calibrated(bench, options)
     psf = bench.take_model_psf(frames=5)
     whole = poke_amplitudes(bench, baseline.matrix.m2c, options.poke)
     optics = bench.dm.info.stroke_m, bench.config.system.wavelength_m
@@ -206,6 +206,9 @@ def options_of(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--calibration", type=int, default=1500, help="frames of ESCAPE")
+    parser.add_argument(
+        "--baseline", type=int, default=20, help="frames of the baseline per push and per pull"
+    )
     parser.add_argument("--frames", type=int, default=4000, help="frames of a measurement, at most")
     parser.add_argument("--accuracy", type=float, default=0.02)
     parser.add_argument("--poke", type=float, default=0.002)

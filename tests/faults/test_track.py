@@ -208,6 +208,19 @@ def test_a_lost_star_ends_tracking_and_keeps_the_table(start):
     assert 3 <= len(found.rows["seconds"]) <= 6
 
 
+def test_a_loop_that_runs_away_is_opened_and_told(start):
+    def turn(twin):
+        send = twin.dynamics.command
+        twin.dynamics.command = lambda time_s, shape: send(time_s, -shape)
+
+    with small(QUIET) as bench:
+        found = followed(bench, start, 12, at=5, do=turn)
+    assert not found.stable
+    assert found.alarms[-1].kind == "diverged"
+    assert found.alarms[-1].seconds > 5
+    assert found.latest is not None
+
+
 def test_stopped_it_keeps_what_it_has(start):
     stop = threading.Event()
     with small(QUIET) as bench:
