@@ -35,7 +35,7 @@ from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepa
 from escape_hw.calibration.sprint import sprint
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.track_proposal import InUse, Proposal, inverted, propose, taken
-from escape_hw.calibration.track_watch import TrackWatch
+from escape_hw.calibration.track_watch import RunawayWatch, TrackWatch
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
 from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.standard_error import LEAST
@@ -164,6 +164,7 @@ class _Tracker:
         self.updates, self.residual_at, self.began_ns = 0, 0, 0
         self.pending: Future[_Answer | None] | None = None
         self.metrics: dict[str, float] = {}
+        self.runaway = RunawayWatch()
 
     def prepare(self, motion: Motion) -> None:
         """Build the model for the light that the closed loop leaves, and start on it; in the thread.
@@ -226,9 +227,10 @@ class _Tracker:
             yield from self._passed(loop.run(self.frames), report, 0)
         ready.result()
         for second in range(report.total):
+            frames, shortened = loop.record.frames, loop.record.shortened
             steps = loop.run(self.frames, inject=self._poke, observe=[self.tape])
             yield from self._passed(steps, report, second)
-            if loop.record.diverged:
+            if loop.record.diverged or self.runaway(loop.record, frames, shortened):
                 self._lose()
                 return
             # A twin's clock stands still meanwhile; at a real bench the loop does not wait.

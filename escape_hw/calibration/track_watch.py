@@ -12,6 +12,7 @@ from escape_hw.api.results import TemporalResponse
 from escape_hw.api.tracking import Alarm
 from escape_hw.calibration.live_registration import LiveEstimate
 from escape_hw.calibration.live_response import contradicts
+from escape_hw.calibration.loop_run import LoopRecord
 
 #: Standard errors that an update may miss what was expected by.
 JUMP = 8.0
@@ -24,6 +25,9 @@ STRANGE_ACTUATOR = 0.5
 QUIET = 5
 #: Updates that tell what is usual.
 _USUAL = 30
+#: The loop is lost when its residual is this many times the usual, or that many if the mirror is held at its
+#: limits for this share of the frames; and the seconds that tell what is usual at least.
+LOST, LOST_HELD, _HELD, _FIRST = 4.0, 2.0, 0.9, 3
 
 
 class TrackWatch:
@@ -106,6 +110,28 @@ class TrackWatch:
                 f"tracking.largest_shift ({self._largest:g}); calibrate anew"
             )
         return found
+
+
+class RunawayWatch:
+    """Looks at every second of a loop for one that runs away.
+
+    While pokes are injected a command beyond the limits is shortened as a whole, so a loop that runs away
+    holds a few actuators at their limits, not many; and a pyramid's slopes saturate before the mirror does.
+    """
+
+    def __init__(self) -> None:
+        self._residual: deque[float] = deque(maxlen=_USUAL)
+
+    def __call__(self, record: LoopRecord, frames: int, shortened: int) -> bool:
+        """Whether the loop was lost in the frames after the first ``frames``, ``shortened`` of them cut."""
+        residual = np.array(record.residual[frames:])
+        rms = float(np.sqrt(np.mean(np.square(residual))))
+        usual = float(np.median(self._residual)) if len(self._residual) >= _FIRST else np.inf
+        held = record.shortened - shortened > _HELD * len(residual)
+        if rms > (LOST_HELD if held else LOST) * usual:
+            return True
+        self._residual.append(rms)
+        return False
 
 
 def _usual(values: Sequence[float]) -> float:
