@@ -13,7 +13,6 @@ from escape_hw.cli.session import Session, session
 
 if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult
-    from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
 
 
