@@ -1,4 +1,4 @@
-"""``escape calibrate`` and ``escape sprint``."""
+"""``escape calibrate``."""
 
 from __future__ import annotations
 
