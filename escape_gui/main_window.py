@@ -7,12 +7,12 @@ import logging
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from PySide6.QtCore import QByteArray, Qt
 from PySide6.QtGui import QAction, QCloseEvent, QKeySequence
 from PySide6.QtWidgets import (
     QApplication,
+    QDockWidget,
     QFileDialog,
     QLabel,
     QMainWindow,
@@ -169,9 +169,12 @@ class MainWindow(QMainWindow):
 
     def _show_layout(self) -> None:
         stored = self._settings.layouts.get(self.workspace.name)
-        docks: dict[str, Any] = dict(self.docks)
+        docks: dict[str, QDockWidget] = dict(self.docks)
+        size = self.size()
         if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
             arrange(self, docks, self.workspace)
+        # A layout of a larger window must not make this one larger.
+        self.resize(size)
 
     def show_workspace(self, name: str) -> None:
         """Change to another workspace, each as it was left."""

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QDockWidget, QMainWindow
 
+#: Between docks, as the style sheet says.
+SEPARATOR_PX = 6
+
 
 @dataclass(frozen=True, slots=True)
 class Cell:
@@ -140,7 +143,9 @@ def _resize(
     columns: list[tuple[Column, list[Cell]]],
     heads: list[QDockWidget],
 ) -> None:
-    width = window.width() / sum(column.share for column, _ in columns)
+    # Docks that together want more than the window has make it larger.
+    between = (len(columns) - 1) * SEPARATOR_PX
+    width = (window.width() - between) / sum(column.share for column, _ in columns)
     window.resizeDocks(
         heads, [round(column.share * width) for column, _ in columns], Qt.Orientation.Horizontal
     )

@@ -63,7 +63,6 @@ class CameraPanel(Panel):
         head.addWidget(self.choice)
         head.addWidget(self.keep_button)
         head.addStretch()
-        head.addWidget(self.saturation)
         self.picture = Picture(theme, "Frame of the sensor", COUNTS, unit="counts")
         self.signed = Picture(theme, "Slopes or difference", SIGNED, symmetric=True)
         self.quiver = Quiver(theme)
@@ -77,7 +76,7 @@ class CameraPanel(Panel):
         self.histogram.setFixedHeight(theme.pixels(92))
         self._curve = self.histogram.curve(0, alone=True, stepMode="center")
         self.body.addLayout(head)
-        for widget in (self.picture, self.signed, *self.bars, self.histogram):
+        for widget in (self.saturation, self.picture, self.signed, *self.bars, self.histogram):
             self.body.addWidget(widget)
         self.body.setStretchFactor(self.picture, 1)
         self.body.setStretchFactor(self.signed, 1)

@@ -61,9 +61,10 @@ class MirrorPanel(Panel):
         }
         numbers = QGridLayout()
         numbers.setHorizontalSpacing(24)
+        numbers.setVerticalSpacing(2)
         for k, readout in enumerate(self.readouts.values()):
-            numbers.addWidget(readout, 0, k)
-        numbers.setColumnStretch(len(self.readouts), 1)
+            numbers.addWidget(readout, k // 2, k % 2)
+        numbers.setColumnStretch(2, 1)
         self.body.addLayout(head)
         self.body.addWidget(self.picture, 1)
         self.body.addWidget(PictureBar(theme, self.picture, logarithmic=False))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from escape_gui.theme import Theme
+from escape_gui.widgets.ownership import own_menu
 
 #: Safe for colour-blind eyes: signed values keep their sign, sizes their order, in every simulation.
 SIGNED, SIZE = "CET-D1A", "cividis"
@@ -37,10 +38,8 @@ class ColourScale(QWidget):
     def __init__(self, theme: Theme, name: str) -> None:
         super().__init__()
         self._theme = theme
-        self._plot = pg.PlotWidget(enableMenu=False)
-        # Nobody owns it, and it would outlive the window.
-        menu = self._plot.getPlotItem().ctrlMenu
-        menu.setParent(self._plot, menu.windowFlags())
+        self._plot = pg.PlotWidget()
+        own_menu(self._plot.getPlotItem())
         self._plot.setMouseEnabled(x=False, y=False)
         self._plot.hideButtons()
         self._plot.showAxis("right")

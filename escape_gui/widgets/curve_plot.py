@@ -12,6 +12,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor
 
 from escape_gui.theme import Theme
+from escape_gui.widgets.ownership import own_menu
 from escape_gui.widgets.plot import DASHES
 
 #: Markers and dashes by number of the curve, with the character that stands for each in words.
@@ -40,8 +41,7 @@ def style_axis(
 def add_plot(grid: pg.GraphicsLayoutWidget, row: int = 0) -> pg.PlotItem:
     """A plot in a row of a grid, without menus and hands."""
     plot = grid.addPlot(row=row, col=0, enableMenu=False)
-    # Nobody owns it, and it would outlive the window.
-    plot.ctrlMenu.setParent(grid, plot.ctrlMenu.windowFlags())
+    own_menu(plot)
     plot.hideButtons()
     plot.setMouseEnabled(x=False, y=False)
     plot.showGrid(x=True, y=True, alpha=0.18)

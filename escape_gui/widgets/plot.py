@@ -8,6 +8,7 @@ import pyqtgraph as pg
 from PySide6.QtCore import Qt
 
 from escape_gui.theme import Theme
+from escape_gui.widgets.ownership import own_menu
 
 #: Dashes that go with the colours of curves, so that colour is never the only difference.
 DASHES = (
@@ -37,10 +38,7 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         self._theme, self._labels = theme, {"bottom": x, "left": y}
         self._curves: list[tuple[Any, int, bool]] = []
         self.setAccessibleName(name)
-        self.setMenuEnabled(False)
-        # Nobody owns it, and it would outlive the window.
-        menu = self.getPlotItem().ctrlMenu
-        menu.setParent(self, menu.windowFlags())
+        own_menu(self.getPlotItem())
         self.hideButtons()
         self.setMouseEnabled(x=False, y=False)
         self.setFocusPolicy(Qt.FocusPolicy.NoFocus)

@@ -35,16 +35,20 @@ def qapp() -> QApplication:
 
 
 def segments() -> set[str]:
-    """Shared memory of ours."""
+    """Shared memory of this process."""
     folder = Path("/dev/shm")
-    mine = f"escape-*-{os.getpid()}-*"
-    return {path.name for path in folder.glob(mine)} if folder.is_dir() else set()
+    return {path.name for path in folder.glob(f"escape-*-{os.getpid()}-*")} if folder.is_dir() else set()
 
 
 def timers() -> set[int]:
     """Timers that still run."""
     found = (one for one in gc.get_objects() if isinstance(one, QTimer))
     return {id(one) for one in found if shiboken6.isValid(one) and one.isActive()}
+
+
+def widgets() -> dict[int, str]:
+    """All widgets by the place of their C++ half; wrappers come and go."""
+    return {shiboken6.getCppPointer(one)[0]: repr(one) for one in QApplication.allWidgets()}
 
 
 def settle() -> None:
@@ -59,11 +63,15 @@ def settle() -> None:
 def nothing_left(qapp: QApplication) -> Iterator[None]:
     """Fail a test that leaves a widget, a running timer, a thread or shared memory."""
     settle()
-    before = {id(widget) for widget in QApplication.allWidgets()}
+    before = widgets().keys()
     threads, shared, running = set(threading.enumerate()), segments(), timers()
     yield
-    settle()
-    left = [widget for widget in QApplication.allWidgets() if id(widget) not in before]
+    for _ in range(4):
+        # Some cycles are collected only after the widgets in them are gone.
+        settle()
+        left = [name for place, name in widgets().items() if place not in before]
+        if not left:
+            break
     assert not left, f"widgets left behind: {left}"
     assert timers() <= running, "a timer still runs"
     assert set(threading.enumerate()) <= threads, "a thread still runs"

@@ -195,6 +195,9 @@ def test_everything_can_be_reached_and_named(window: MainWindow) -> None:
     nameless, deaf = [], []
     for kind in kinds:
         for widget in window.findChildren(kind):
+            # Qt's own: the tabs of docks behind each other, arrows of menus.
+            if widget.parent() is window or widget.objectName().startswith("qt_"):
+                continue
             if isinstance(widget.parent(), QAbstractSpinBox | QComboBox | QTabBar | QLineEdit):
                 continue
             text = getattr(widget, "text", lambda: "")()
