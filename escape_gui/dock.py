@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from PySide6.QtCore import Qt, Signal
-from PySide6.QtWidgets import QDockWidget, QHBoxLayout, QLabel, QMenu, QToolButton, QWidget
+from PySide6.QtWidgets import QDockWidget, QHBoxLayout, QLabel, QMainWindow, QMenu, QToolButton, QWidget
 
 from escape_gui.panels.panel import Panel
 from escape_gui.theme import Theme
@@ -28,6 +28,8 @@ class Dock(QDockWidget):
         The content.
     theme
         Colours and fonts.
+    window
+        Where it docks.
     """
 
     #: Panel's name and ``png``, ``csv`` or ``fits``.
@@ -35,8 +37,9 @@ class Dock(QDockWidget):
     #: Panel's name.
     help_wanted = Signal(str)
 
-    def __init__(self, panel: Panel, theme: Theme) -> None:
-        super().__init__(panel.title)
+    def __init__(self, panel: Panel, theme: Theme, window: QMainWindow) -> None:
+        # Without the window Qt would not find it when it restores a layout.
+        super().__init__(panel.title, window)
         self.setObjectName(panel.name)
         self.panel = panel
         self._theme = theme

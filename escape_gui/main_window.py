@@ -132,7 +132,7 @@ class MainWindow(QMainWindow):
         return tabs
 
     def _make_dock(self, panel: Panel) -> Dock:
-        dock = Dock(panel, self.context.theme)
+        dock = Dock(panel, self.context.theme, self)
         dock.save_wanted.connect(lambda name, kind: self.save_panel(kind, self.panels[name]))
         dock.help_wanted.connect(lambda name: self.show_panel_help(self.panels[name]))
         return dock

@@ -21,7 +21,8 @@ from escape_hw.streams.segments import process_start, segments
 
 #: Longest wait for something that takes seconds on an idle machine.
 PATIENCE_S = 120.0
-SYSTEM = "razor-shwfs"
+#: A name of its own, so that what other tests leave in shared memory is not taken for ours.
+SYSTEM = f"small-{os.getpid()}"
 
 
 def wait_for(what: Callable[[], bool], why: str, patience_s: float = PATIENCE_S) -> float:
@@ -67,7 +68,10 @@ class Served:
         """Start it; it is ready some seconds later."""
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
-                [*ESCAPE, "serve", *map(str, self._words)], env=self.environment, stdout=log, stderr=log
+                [*ESCAPE, "serve", *map(str, self._words), "--set", f"system.name={SYSTEM}"],
+                env=self.environment,
+                stdout=log,
+                stderr=log,
             )
 
     def connect(self, **options: bool) -> Connection:
@@ -127,7 +131,7 @@ def serving(*words: object, folder: Path, more: Mapping[str, str] | None = None)
         else:
             os.environ["XDG_RUNTIME_DIR"] = before
     wait_for(lambda: not served.engines(), "engine and guardian end")
-    assert not [one for one in segments() if not one.alive]
+    assert not [one for one in segments(SYSTEM) if not one.alive]
 
 
 def until_idle(bench: Connection) -> None:

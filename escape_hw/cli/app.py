@@ -18,6 +18,7 @@ from escape_hw.cli import (
     emulate,
     gains,
     gui,
+    keys,
     loop,
     modulator,
     perf,
@@ -25,6 +26,7 @@ from escape_hw.cli import (
     rehearse,
     reproduce,
     serve,
+    streams,
     systems,
     track,
     udev,
@@ -48,6 +50,7 @@ app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.command("track")(track.track)
 app.command("serve")(serve.serve)
+app.add_typer(keys.app, name="keys")
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
 app.command("compare")(products.compare)
@@ -64,6 +67,7 @@ app.command("discover")(discover.discover)
 app.add_typer(udev.app, name="udev")
 app.command("emulate")(emulate.emulate)
 app.command("rehearse")(rehearse.rehearse)
+app.command("streams")(streams.streams)
 
 
 def _version(wanted: bool) -> None:

@@ -136,10 +136,11 @@ class Link:
             if self._bell in ready:
                 self._bell.recv()
             self._send_all()
+            # An event that was sent before an answer is known before it.
+            if self._events in ready:
+                self._take_events()
             if self._requests in ready:
                 self._take_answer()
-            if self._events in ready:
-                self._take_event()
             if time.monotonic() - beaten > self._beat_s and (message := self._beat()) is not None:
                 beaten = time.monotonic()
                 self._put(b"0", json.dumps(message).encode())
@@ -174,8 +175,14 @@ class Link:
         except (IndexError, KeyError, ValueError) as error:
             answer.set_exception(ServerGone(f"the server's answer makes no sense: {error!r}"))
 
-    def _take_event(self) -> None:
-        parts = self._events.recv_multipart()
+    def _take_events(self) -> None:
+        while True:
+            try:
+                self._take_event(self._events.recv_multipart(zmq.NOBLOCK))
+            except zmq.Again:
+                return
+
+    def _take_event(self, parts: list[bytes]) -> None:
         self.heard = time.monotonic()
         try:
             self._on_event(parts[0].decode(), json.loads(parts[1]))

@@ -13,7 +13,7 @@ from escape_hw.errors import Aborted, CalibrationError, ServerGone
 from escape_hw.remote.state import Ended, Finish, Running
 
 if TYPE_CHECKING:
-    from escape_hw.remote.client import Connection
+    from escape_hw.remote.viewer import Viewer
 
 #: A server that was not heard of for so long does not come back with a result.
 _PATIENCE_S = 15.0
@@ -32,7 +32,7 @@ class Run:
         The procedure.
     """
 
-    def __init__(self, connection: Connection, id: int, name: str) -> None:
+    def __init__(self, connection: Viewer, id: int, name: str) -> None:
         self._connection, self.id, self.name = connection, id, name
 
     def __repr__(self) -> str:

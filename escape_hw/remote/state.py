@@ -235,6 +235,8 @@ class State(Part):
     telemetry: Telemetry = Telemetry()
     disk: Disk = Disk()
     streams: tuple[StreamEntry, ...] = ()
+    #: Counts up whenever the sensor's geometry changes: time to ask for it again.
+    geometries: int = 0
     clients: int = 0
     #: Messages that were no requests, or none that may be made: malformed, too large, without the lease.
     refused: int = 0

@@ -6,7 +6,6 @@ import threading
 from dataclasses import dataclass, field
 
 from escape_hw.api.flag import Flag
-from escape_hw.api.sensor import SensorGeometry
 from escape_hw.calibration.loop_orders import LoopOrders
 from escape_hw.errors import RequestRefused
 from escape_hw.io.provenance import utc_text
@@ -39,8 +38,6 @@ class Board:
         What a loop that stays closed is asked, and what it tells of itself.
     complaints
         What devices were last heard to complain of, by name.
-    grid
-        The sensor's geometry, once known.
     """
 
     loop: LoopChoice
@@ -55,7 +52,6 @@ class Board:
     loop_metrics: dict[str, float] = field(default_factory=dict)
     needs_loop: bool = False
     complaints: dict[str, str] = field(default_factory=dict)
-    grid: SensorGeometry | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def latch(self, reason: str, way_out: str) -> None:

@@ -57,6 +57,7 @@ class Desk:
             ask.CloseLoop: self._close_loop,
             ask.SetLoop: self._set_loop,
             ask.LoadProduct: self._load_product,
+            ask.Record: self._record,
             ask.ClearFault: self._clear_fault,
             ask.Shutdown: self._shutdown,
         }
@@ -117,7 +118,7 @@ class Desk:
     def _geometry(self, request: ask.GetGeometry, number: int) -> object:
         if not self._engine.bench.dm.is_open:
             raise RequestRefused("the devices are not open")
-        return geometry_of(self._engine.bench, self._engine.board.grid).model_dump(mode="json")
+        return geometry_of(self._engine.bench, self._engine.publisher.grid).model_dump(mode="json")
 
     def _procedures(self, request: ask.GetProcedures, number: int) -> object:
         return [entry.model_dump(mode="json") for entry in self._engine.offers.entries]
@@ -204,6 +205,9 @@ class Desk:
 
     def _load_product(self, request: ask.LoadProduct, number: int) -> object:
         return self._engine.shelf.load(request.path, request.name).model_dump(mode="json")
+
+    def _record(self, request: ask.Record, number: int) -> object:
+        return self._engine.telemetry.turn(request.on).model_dump(mode="json")
 
     def _clear_fault(self, request: ask.ClearFault, number: int) -> object:
         engine = self._engine

@@ -33,6 +33,7 @@ from escape_hw.server.publisher import Publisher
 from escape_hw.server.pulse import Pulse
 from escape_hw.server.setup import Setup
 from escape_hw.server.shelf import Shelf
+from escape_hw.server.telemetry import Switch
 from escape_hw.server.wire_log import WireLog
 
 # Run as a program it would be called otherwise, and nobody would hear it.
@@ -75,7 +76,11 @@ class Engine:
         self._flat_lock = threading.Lock()
         self._ending = threading.Event()
         self._slopes: tuple[object, Any] = (None, None)
-        self.pulse = Pulse(self.bench, self.board, self.publisher, self.shelf, setup.runs, self._tell_state)
+        self.telemetry = Switch(setup.runs, self.publisher)
+        self.pulse = Pulse(
+            self.bench, self.board, self.publisher, self.shelf, setup.runs, self._tell_state,
+            self.telemetry.state,
+        )  # fmt: skip
 
     # ------------------------------------------------------------ for other threads
     def post(self, job: Job) -> None:
@@ -131,6 +136,7 @@ class Engine:
         finally:
             self.board.phase = Phase.STOPPED
             self.answer_flat()
+            self.telemetry.turn(on=False)
             self.pulse.stop()
             self.publisher.close()
 
@@ -164,9 +170,10 @@ class Engine:
             if board.fault is None:
                 self.make_safe(str(error), "mend it, then clear the fault to open the devices again")
             return
-        if board.grid is not None:
-            if self._slopes[0] is not board.grid:
-                self._slopes = (board.grid, extractor(bench, board.grid))
+        grid = self.publisher.grid
+        if grid is not None:
+            if self._slopes[0] is not grid:
+                self._slopes = (grid, extractor(bench, grid))
             self._slopes[1](frame.data)
 
     def flatten(self) -> None:
@@ -209,6 +216,8 @@ class Engine:
         """Tell those who wait for a flat mirror that it is, or why not."""
         with self._flat_lock:
             waiting, self._flat = self._flat, []
+        if waiting:
+            self.pulse.beat()
         fault = self.board.fault
         for reply in waiting:
             self.channel.post({"reply": reply, "answer": {"fault": None if fault is None else fault.reason}})

@@ -93,7 +93,8 @@ class Front:
     def run(self, stop: Stop) -> None:
         """Serve until told to stop; the mirror ends flat."""
         poller = zmq.Poller()
-        poller.register(self._door.socket, zmq.POLLIN)
+        for socket in self._door.sockets:
+            poller.register(socket, zmq.POLLIN)
         try:
             while not self._ending:
                 engine = self._engine
@@ -191,9 +192,7 @@ class Front:
         self._engine = None
         clean = engine.close()
         for pending in self._pending.values():
-            self._door.fail(
-                pending.letter.route, pending.letter.number, RequestRefused("the engine has ended")
-            )
+            self._door.fail(pending.letter.route, RequestRefused("the engine has ended"))
         self._pending.clear()
         if clean:
             self._ending = True
@@ -250,11 +249,11 @@ class Front:
         pending = self._pending.pop(message["reply"], None)
         if pending is None:
             return
-        route, number = pending.letter.route, pending.letter.number
+        route = pending.letter.route
         if "error" in message:
-            self._door.fail(route, number, message["error"])
+            self._door.fail(route, message["error"])
         else:
-            self._door.answer(route, number, message["answer"])
+            self._door.answer(route, message["answer"])
 
     def _tell_line(self, line: LogLine) -> None:
         self._door.publish("log", line)
@@ -264,9 +263,9 @@ class Front:
         request = letter.request
         try:
             if isinstance(request, ask.Hello):
-                self._door.answer(letter.route, letter.number, self._greet(request, letter.route))
+                self._door.answer(letter.route, self._greet(request, letter.route.sender))
                 return
-            client = self._leases.hear(request.client, letter.route)
+            client = self._leases.hear(request.client, letter.route.sender)
             if isinstance(request, ask.WRITING):
                 self._leases.require(client)
             if isinstance(request, _SAFETY):
@@ -275,11 +274,11 @@ class Front:
                 self._send_latest(request, letter)
             elif type(request) in self._answers:
                 answer = self._answers[type(request)](request, letter, client)
-                self._door.answer(letter.route, letter.number, answer)
+                self._door.answer(letter.route, answer)
             else:
                 self._forward(letter)
         except EscapeError as error:
-            self._door.refuse(letter.route, letter.number, error)
+            self._door.refuse(letter.route, error)
 
     def _greet(self, hello: ask.Hello, route: bytes) -> State:
         if hello.schema_version != SCHEMA:
@@ -304,7 +303,7 @@ class Front:
             raise RequestRefused(f"no stream is called '{request.stream}'; there are {', '.join(STREAMS)}")
         segment = {one.name: one.segment for one in self._state.streams}.get(request.stream)
         head, data = self._samples.newest(request.stream, segment, request.after)
-        self._door.answer(letter.route, letter.number, head, data)
+        self._door.answer(letter.route, head, data)
 
     def _forward(self, letter: Letter) -> None:
         """Hand a request to the engine."""
@@ -326,7 +325,7 @@ class Front:
             self._engine = self._start_engine()
         elif not isinstance(letter.request, _SAFETY):
             raise RequestRefused("the engine has died; clear the fault to start it again")
-        self._door.answer(letter.route, letter.number, None)
+        self._door.answer(letter.route, None)
 
     def _number(self) -> int:
         self._next += 1

@@ -94,6 +94,7 @@ def make_safe(watch: Watch) -> Incident:
 
 
 def _flatten(config: SystemConfig) -> tuple[bool | None, str]:
+    from escape_hw.api.adaptive_secondary import AdaptiveSecondary
     from escape_hw.api.mirror import DeformableMirror
     from escape_hw.bench import build_device, mode_of
     from escape_hw.errors import EscapeError
@@ -104,6 +105,9 @@ def _flatten(config: SystemConfig) -> tuple[bool | None, str]:
     while True:
         try:
             mirror = build_device("dm", config, DeformableMirror)  # type: ignore[type-abstract]
+            if isinstance(mirror, AdaptiveSecondary):
+                # A shell that has gone to rest meanwhile is safe; closing flattens and rests one that floats.
+                mirror.lift = False
             with mirror:
                 mirror.flatten()
             return True, "the mirror is flat"

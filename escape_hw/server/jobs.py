@@ -70,8 +70,9 @@ def do_task(engine: Engine, task: Task[Any], config: SystemConfig) -> None:
     _shelve(engine, ended)
     board.last, board.running = ended, None
     board.phase = Phase.IDLE if board.fault is None else Phase.FAULT
-    engine.channel.post({"ended": ended.model_dump(mode="json")})
+    # Whoever hears of the end finds its products in the state already.
     engine.pulse.beat()
+    engine.channel.post({"ended": ended.model_dump(mode="json")})
     engine.answer_flat()
 
 
@@ -128,7 +129,7 @@ def _learn(engine: Engine, result: object) -> None:
     """Keep what a result tells of the bench: where the slopes are, what an image should look like."""
     grid, psf = getattr(result, "grid", None), getattr(result, "model_psf", None)
     if grid is not None:
-        engine.board.grid = grid
+        engine.publisher.show(grid)
     if psf is not None:
         engine.model_psf = psf
         engine.publisher.arrays({"model_psf": psf})
@@ -221,7 +222,7 @@ def _wanted(engine: Engine, request: CloseLoop | SetLoop) -> LoopChoice:
 def _keep_loop_closed(engine: Engine, orders: LoopOrders) -> None:
     board, bench = engine.board, engine.bench
     bench.wfs.stop()
-    board.grid, board.closed = orders.settings.closing.grid, True
+    board.closed = True
     log.info("loop closed on '%s', gain %g", board.loop.matrix, board.loop.gain)
     try:
         end = run_procedure(

@@ -12,17 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.frames import Frame
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.taps import Taps
 from escape_hw.errors import StorageError
 from escape_hw.remote.source import STREAMS
 from escape_hw.remote.state import StreamEntry
-from escape_hw.streams.ring import RingWriter
+from escape_hw.streams.ring import SLOTS, RingWriter
 from escape_hw.streams.segments import segment_name
 
 log = logging.getLogger(__name__)
 
 #: Least room of a ring's entry, so that what grows seldom outgrows it.
 _LEAST_BYTES = 16384
+#: Entries kept of streams that are recorded at full rate: as long as a recorder may be held up.
+_SLOTS = {"frames": 16, "slopes": 64, "modes": 64, "commands": 64}
 
 
 class Publisher:
@@ -39,6 +42,8 @@ class Publisher:
         The newest frame and command, for statistics.
     frames, commands
         How many there were.
+    grid, geometries
+        The sensor's geometry that slopes were last made on, ``None`` before it was found; how many so far.
     residual_nm
         Newest rms residual of a closed loop; 0 before the first.
     """
@@ -51,6 +56,8 @@ class Publisher:
         self.command: NDArray[np.float64] | None = None
         self.frames = self.commands = 0
         self.residual_nm = 0.0
+        self.grid: SensorGeometry | None = None
+        self.geometries = 0
         self._top = b""
 
     @property
@@ -71,6 +78,7 @@ class Publisher:
             slopes=self._slopes,
             command=self._command,
             residual=self._residual,
+            geometry=self.show,
         )
 
     @property
@@ -80,6 +88,12 @@ class Publisher:
             StreamEntry(name=name, segment=ring.name, unit=STREAMS[name])
             for name, ring in tuple(self._rings.items())
         )
+
+    def show(self, grid: SensorGeometry) -> None:
+        """Remember the sensor's geometry, for clients that ask."""
+        if grid is not self.grid:
+            self.grid = grid
+            self.geometries += 1
 
     def arrays(self, arrays: Mapping[str, NDArray[Any]], **meta: float | str) -> None:
         """Publish what a procedure tells on its way; what is no stream is left out."""
@@ -109,7 +123,7 @@ class Publisher:
             del self._rings[name]
             ring.close()
         try:
-            self._rings[name] = RingWriter(segment_name(self._system, name), room)
+            self._rings[name] = RingWriter(segment_name(self._system, name), room, _SLOTS.get(name, SLOTS))
         except StorageError as error:
             log.error("stream '%s' cannot be shown: %s", name, error)
             self._refused.add(name)

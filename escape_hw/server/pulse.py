@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -40,6 +41,10 @@ PERIOD_S = 0.2
 _SECOND = round(1 / PERIOD_S)
 
 
+#: Time over which the camera's rate is taken; longer than a frame may need while nothing runs.
+_RATE_S = 0.5
+
+
 class Pulse:
     """Tells the state, in a thread of its own.
 
@@ -66,7 +71,7 @@ class Pulse:
         self._bench, self._board, self._publisher, self._shelf = bench, board, publisher, shelf
         self._runs, self._tell, self._telemetry = runs, tell, telemetry
         self._ending = threading.Event()
-        self._last: Frame | None = None
+        self._last: tuple[float, Frame | None] = (0.0, None)
         self._rate = 0.0
         self._clipped: deque[tuple[int, int]] = deque(maxlen=_SECOND + 1)
         self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
@@ -113,17 +118,15 @@ class Pulse:
                 strehl=board.loop_metrics.get("strehl"), strehl_sigma=board.loop_metrics.get("strehl_sigma"),
             ),
             procedure=board.running, last=board.last, products=self._shelf.products,
-            telemetry=self._telemetry(), disk=self._disk(), streams=publisher.entries, **light,
+            telemetry=self._telemetry(), disk=self._disk(), streams=publisher.entries,
+            geometries=publisher.geometries, **light,
         )  # fmt: skip
 
     def _rates(self, frame: Frame | None) -> Rates:
-        before, self._last = self._last, frame
-        if frame is not None and before is not None and frame.index > before.index:
-            elapsed = (frame.exposed_ns - before.exposed_ns) * 1e-9
-            if elapsed > 0:
-                self._rate = (frame.index - before.index) / elapsed
-        elif frame is before:
-            self._rate = 0.0
+        now, (at, before) = time.monotonic(), self._last
+        if frame is not None and now - at > _RATE_S:
+            self._last = (now, frame)
+            self._rate = 0.0 if before is None else _rate(before, frame)
         lost = self._bench.wfs.status().lost if self._bench.wfs.is_open else 0
         return Rates(frame_hz=self._rate, frames=self._publisher.frames, lost=lost)
 
@@ -142,6 +145,12 @@ class Pulse:
     def _disk(self) -> Disk:
         folder = next(one for one in (self._runs, *self._runs.parents) if one.exists())
         return Disk(folder=str(self._runs), free_gb=shutil.disk_usage(folder).free / 1e9)
+
+
+def _rate(before: Frame, frame: Frame) -> float:
+    """Frames per second between two of them, by their own clock."""
+    elapsed = (frame.exposed_ns - before.exposed_ns) * 1e-9
+    return (frame.index - before.index) / elapsed if elapsed > 0 and frame.index > before.index else 0.0
 
 
 def _latency(metrics: Mapping[str, float]) -> Latency:

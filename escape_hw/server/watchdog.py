@@ -17,14 +17,10 @@ _NOW, _USUAL = 5, 150
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Why the mirror has to be made safe.
-
-    ``engine`` is true when the engine itself cannot do it.
-    """
+    """Why the mirror has to be made safe, and what the operator can do then."""
 
     reason: str
     way_out: str
-    engine: bool = False
 
 
 class Watchdog:

@@ -179,7 +179,9 @@ def test_layout_and_look_are_remembered(make_window: MakeWindow, tmp_path: Path)
     window = make_window(settings=settings)
     assert window.workspace.name == "align"
     assert (window.context.theme.shade, window.context.theme.scale) == ("light", 1.1)
+    assert window.docks["camera"].isVisible()
     window.show_workspace("operate")
+    assert window.docks["performance"].isVisible()
     assert not window.docks["log"].isVisible()
 
 
