@@ -128,7 +128,8 @@ class ProcedurePanel(Panel):
             for one in found:
                 self.choice.addItem(one.title, one.name)
             self._choose()
-        elif not self._entries:
+        self.form.setVisible(bool(self._entries))
+        if not self._entries:
             _put(self._about, "" if self.context.session.commands else NOTHING)
         self._enable()
 
