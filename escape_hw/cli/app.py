@@ -18,6 +18,7 @@ from escape_hw.cli import (
     emulate,
     gains,
     gui,
+    interchange,
     keys,
     loop,
     modulator,
@@ -26,6 +27,7 @@ from escape_hw.cli import (
     rehearse,
     reproduce,
     serve,
+    sprint,
     streams,
     systems,
     track,
@@ -45,13 +47,15 @@ app = typer.Typer(
 app.command("systems")(systems.systems)
 app.add_typer(systems.config_app, name="config")
 app.command("calibrate")(calibrate.calibrate)
-app.command("sprint")(calibrate.sprint)
+app.command("sprint")(sprint.sprint)
 app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.command("track")(track.track)
 app.command("serve")(serve.serve)
 app.add_typer(keys.app, name="keys")
 app.add_typer(reproduce.app, name="reproduce")
+app.add_typer(interchange.export_app, name="export")
+app.add_typer(interchange.import_app, name="import")
 app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)

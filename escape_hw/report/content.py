@@ -20,6 +20,7 @@ from escape_hw.io.fits import KIND_MATRIX, load_matrix
 from escape_hw.io.gains import KIND_GAINS, load_gains
 from escape_hw.io.psf import KIND_PSF, load_loop
 from escape_hw.io.run_folder import read_result
+from escape_hw.io.telemetry import KIND_TELEMETRY
 
 #: How methods are called in figures and tables.
 METHOD_LABELS = {
@@ -173,8 +174,8 @@ def _add(run: RunContent, name: str, path: Path, label: Mapping[str, str]) -> No
     elif kind == KIND_GAINS:
         found = load_gains(path).result
         run.gains[label.get("label") or METHOD_LABELS.get(found.method, name)] = found
-    else:
-        raise ProductError(f"{path}: its kind is {kind!r}; this version knows IM, PSF and OG")
+    elif kind != KIND_TELEMETRY:
+        raise ProductError(f"{path}: its kind is {kind!r}; this version knows IM, PSF, OG and TELEM")
 
 
 def _free(taken: Mapping[str, object], label: str, name: str) -> str:
