@@ -33,6 +33,12 @@ P = TypeVar("P", bound=Panel)
 MakeWindow = Callable[..., MainWindow]
 
 
+@pytest.fixture
+def window(make_window: MakeWindow) -> MainWindow:
+    """A window of the panels that are looked at here together."""
+    return make_window((DevicesPanel, CameraPanel, MirrorPanel, LoopPanel, PerformancePanel, LogPanel))
+
+
 def panel_of(window: MainWindow, kind: type[P]) -> P:
     panel = window.panels[kind.name]
     assert isinstance(panel, kind)
