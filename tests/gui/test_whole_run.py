@@ -71,7 +71,7 @@ def test_escape_through_the_buttons(small: Path, tmp_path: Path) -> None:
 def test_escape_on_the_shack_hartmann_bench(tmp_path: Path) -> None:
     with operating("razor-shwfs", tmp_path) as operator:
         operator.take_control()
-        calibrated(operator, operator.run("escape", frames="1000"))
+        calibrated(operator, operator.run("escape", frames="4000"))
 
 
 @pytest.mark.slow
