@@ -1,7 +1,8 @@
 """What a window does to the loop beside it: latency with the window alive and with it stopped, in turn.
 
-A server of ``razor-shwfs`` on the twin closes its loop on a short DO-CRIME; a window on it is halted and let go
-every few seconds, so that whatever else the machine does falls on both alike: ``python benchmarks/gui_beside_loop.py``.
+A server of ``razor-shwfs`` on the twin closes its loop on a short DO-CRIME. A window on it is halted and let
+go every few seconds, so that whatever else the machine does falls on both alike:
+``python benchmarks/gui_beside_loop.py``.
 """
 
 from __future__ import annotations
