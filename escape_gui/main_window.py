@@ -125,6 +125,7 @@ class MainWindow(QMainWindow):
         tabs.setAccessibleName("Workspaces")
         tabs.setExpanding(False)
         tabs.setDrawBase(False)
+        tabs.setUsesScrollButtons(False)
         for one in WORKSPACES:
             tabs.setTabToolTip(tabs.addTab(one.title), f"{one.purpose}.")
         tabs.tabBarClicked.connect(lambda k: self.show_workspace(WORKSPACES[k].name) if k >= 0 else None)
