@@ -60,6 +60,7 @@ def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         loop = panels["loop"]
         held = [one.name for one in source.source.state.products if one.name.startswith("escape")]
         loop.matrix.setCurrentText(min(held, key=len))
+        loop.matrix.activated.emit(loop.matrix.currentIndex())
         QTest.mousePress(loop.close_button, Qt.MouseButton.LeftButton)
         operator.settle(1.5)
         QTest.mouseRelease(loop.close_button, Qt.MouseButton.LeftButton)
