@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Progress, Reporter
+from escape_hw.api.registration import PARAMETERS, TO_PLAIN
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate, TemporalResponse
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.tracking import Alarm, TrackResult
@@ -54,6 +55,10 @@ _STREHL_EVERY = 5
 #: What progress reports tell of the last look.
 _SHOWN = ("shift_x", "shift_x_sigma", "shift_y", "shift_y_sigma", "rotation", "rotation_sigma",
           "optical_gain", "optical_gain_sigma", "misfit")  # fmt: skip
+
+
+#: Updates that a picture of the registration's course shows.
+_COURSE = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,6 +169,7 @@ class _Tracker:
         self.updates, self.residual_at, self.began_ns = 0, 0, 0
         self.pending: Future[_Answer | None] | None = None
         self.metrics: dict[str, float] = {}
+        self.arrays: dict[str, NDArray[np.float32]] = {}
         self.runaway = RunawayWatch()
 
     def prepare(self, motion: Motion) -> None:
@@ -243,7 +249,8 @@ class _Tracker:
     def _passed(self, steps: Procedure[object], report: Reporter, done: int) -> Iterator[Progress]:
         """Progress of the whole in place of a stretch's own, with what the last look said."""
         for step in steps:
-            yield report(done, **step.metrics, **self.metrics)
+            arrays, self.arrays = self.arrays, {}
+            yield report(done, {**step.arrays, **arrays}, **step.metrics, **self.metrics)
 
     def _poke(self) -> NDArray[np.float64]:
         return self.amplitude * self.bench.rng.uniform(-1.0, 1.0, self.amplitude.size)
@@ -326,6 +333,7 @@ class _Tracker:
         }  # fmt: skip
         result.add(**row)
         self.metrics = {name: row[name] for name in _SHOWN}
+        self.arrays = _to_show(result)
 
     def _lose(self) -> None:
         """The loop diverged."""
@@ -333,3 +341,16 @@ class _Tracker:
         self.result.alarms.append(
             Alarm(self._now(), "diverged", "the loop diverged and was opened; calibrate anew")
         )
+
+
+def _to_show(result: TrackResult) -> dict[str, NDArray[np.float32]]:
+    """Course of the registration and present gains, in the units of streams."""
+    names = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS))
+    course = np.array([result.rows[name][-_COURSE:] for name in names]).T
+    course[:, 1:] *= np.tile(TO_PLAIN, 2)
+    arrays = {
+        "registration_track": course,
+        "gains": result.optical_gain,
+        "gains_sigma": result.optical_gain_sigma,
+    }
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
