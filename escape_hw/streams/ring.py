@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import math
+import mmap
 import os
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,6 +23,7 @@ from escape_hw.streams import layout, segments
 from escape_hw.streams.histogram import BINS, bin_of
 from escape_hw.streams.sample import Sample
 from escape_hw.streams.segments import StreamGone
+from escape_hw.streams.wakeup import sleep_on, wake
 
 #: Entries that a ring keeps.
 SLOTS = 8
@@ -86,6 +89,7 @@ class RingWriter:
         size = layout.HEADER_BYTES + slots * self._stride
         self._memory = segments.create(name, size, layout.GEOMETRY, slots, capacity_bytes)
         self._words = memoryview(self._memory).cast("Q")
+        self._alarm = _alarm(self._memory)
         self._count, self._last_ns, self._pid = 0, 0, os.getpid()
         self._codes = {dtype: code for code, dtype in enumerate(layout.DTYPES)}
         self._views: list[NDArray[Any] | None] = [None] * slots
@@ -139,6 +143,7 @@ class RingWriter:
             self._memory[start : start + len(meta)] = meta
         words[word + layout.ENDED] = number + 1
         words[layout.WRITTEN] = self._count = number + 1
+        wake(self._alarm)
         if self._last_ns:
             words[layout.INTERVALS + bin_of(now - self._last_ns)] += 1
         self._last_ns = now
@@ -171,6 +176,7 @@ class RingWriter:
         self._open = False
         if os.getpid() == self._pid:
             self._words[layout.CLOSED] = 1
+            wake(self._alarm)
             segments.remove(self.name)
         self._views = [None] * self.slots
         self._words.release()
@@ -183,6 +189,12 @@ class RingWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _alarm(memory: mmap.mmap) -> int:
+    """Address of the half of *written* that changes with every entry."""
+    start = np.frombuffer(memory, np.uint8, 1).ctypes.data
+    return start + 8 * layout.WRITTEN + (0 if sys.byteorder == "little" else 4)
 
 
 class RingReader:
@@ -215,6 +227,7 @@ class RingReader:
             self._memory.close()
             raise StreamGone(f"{name} has not the size that its header tells; restart its server")
         self._words = memoryview(self._memory).cast("Q")
+        self._alarm = _alarm(self._memory)
         self._next = 0
         self.missed = 0
 
@@ -275,9 +288,41 @@ class RingReader:
                 return sample
         return None
 
+    def wait(self, after: int, timeout_s: float) -> bool:
+        """Sleep until an entry is written.
+
+        Parameters
+        ----------
+        after
+            What :attr:`written` was when the caller looked.
+        timeout_s
+            Longest sleep.
+
+        Returns
+        -------
+        bool
+            Whether there is one; false when the time is up or the ring was closed.
+        """
+        until = time.monotonic() + timeout_s
+        while self.written == after and not self.closed:
+            left = until - time.monotonic()
+            if left <= 0:
+                return False
+            sleep_on(self._alarm, after & 0xFFFFFFFF, left)
+        return self.written != after
+
+    @property
+    def position(self) -> int:
+        """Number of the entry that :meth:`next` gives next, counted from 0 over the life of the ring."""
+        return self._next
+
+    def seek(self, number: int) -> None:
+        """Let :meth:`next` go on with an entry by its number."""
+        self._next = number
+
     def seek_newest(self) -> None:
         """Let :meth:`next` begin with what is written from now on."""
-        self._next = self.written
+        self.seek(self.written)
 
     def stats(self) -> RingStats:
         """What the ring tells of itself, without copying an entry."""
