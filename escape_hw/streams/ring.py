@@ -312,6 +312,11 @@ class RingReader:
         return self.written != after
 
     @property
+    def written_at(self) -> int:
+        """Address of the word of 64 bits that counts the entries."""
+        return self._alarm - self._alarm % 8
+
+    @property
     def position(self) -> int:
         """Number of the entry that :meth:`next` gives next, counted from 0 over the life of the ring."""
         return self._next
@@ -327,9 +332,9 @@ class RingReader:
     def stats(self) -> RingStats:
         """What the ring tells of itself, without copying an entry."""
         count = self.written
-        entry = self._entry(count - 1) if count else [0] * 12
+        entry = self._entry(count - 1) if count else (0,) * 12
         index, arrived, code, dimensions = entry[0], entry[2], entry[4], entry[5]
-        shape = tuple(entry[8 : 8 + min(dimensions, layout.MOST_DIMENSIONS)])
+        shape = entry[8 : 8 + min(dimensions, layout.MOST_DIMENSIONS)]
         dtype = layout.DTYPES[code % len(layout.DTYPES)].str[1:] if count else ""
         intervals = np.array(self._words[layout.INTERVALS : layout.INTERVALS + BINS], dtype=np.uint64)
         return RingStats(
@@ -353,8 +358,9 @@ class RingReader:
     def _at(self, number: int) -> int:
         return layout.HEADER_BYTES + (number % self.slots) * self._stride
 
-    def _entry(self, number: int) -> list[int]:
-        return list(layout.ENTRY.unpack_from(self._memory, self._at(number) + layout.ENTRY_AT))
+    def _entry(self, number: int) -> tuple[int, ...]:
+        entry: tuple[int, ...] = layout.ENTRY.unpack_from(self._memory, self._at(number) + layout.ENTRY_AT)
+        return entry
 
     def _index(self, number: int) -> int:
         return int(self._entry(number)[0])

@@ -30,6 +30,8 @@ from escape_hw.streams.ring_camera import RingCamera
 
 #: Every rule of the guard is on.
 LIMITS = MirrorLimits(max_stroke=0.8, max_slew=1.0, max_mean=0.5, max_neighbour=0.9)
+#: Seconds about the time a frame is due in which nobody sleeps.
+SPIN_S = 150e-6
 #: Frames before those that count.
 WARM_UP = 200
 FULL_SCALE_BITS = 16
@@ -125,7 +127,7 @@ def run_loop(case: Case, seconds: float) -> Run:
     settings = CameraSettings(Region(0, 0, columns, rows), 0.5 / case.rate_hz, case.rate_hz)
     mirror = BookingMirror(case.n_act)
     with paced_camera(case) as segment:
-        camera = RingCamera("wfs", segment, info, settings)
+        camera = RingCamera("wfs", segment, info, settings, spin_s=SPIN_S)
         with Bench(load_system("razor-shwfs"), mirror, camera) as bench, prompt() as notes:
             control = LeakyIntegrator(case.control, 0.2, 0.05)
             loop = RunningLoop(
