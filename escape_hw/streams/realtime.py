@@ -45,7 +45,10 @@ def prompt(cpus: Collection[int] | None = None, priority: int = PRIORITY) -> Ite
                 notes, "no real-time priority (allow it with 'rtprio' in /etc/security/limits.d)",
                 lambda: _raise_priority(priority, undo),
             )  # fmt: skip
-            _try(notes, "memory may be swapped out (allow 'memlock' in /etc/security/limits.d)", _lock_memory)
+            _try(
+                notes, "memory may be swapped out (allow 'memlock' in /etc/security/limits.d)",
+                lambda: _lock_memory(undo),
+            )  # fmt: skip
         yield tuple(notes)
 
 
@@ -68,8 +71,10 @@ def _raise_priority(priority: int, undo: contextlib.ExitStack) -> None:
     undo.callback(os.sched_setscheduler, 0, policy, usual)
 
 
-def _lock_memory() -> None:
+def _lock_memory(undo: contextlib.ExitStack) -> None:
     """Keep what is in memory now there; what is mapped later is not held, or large runs would fail."""
-    if ctypes.CDLL(None, use_errno=True).mlockall(_LOCK_PRESENT):
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_LOCK_PRESENT):
         error = ctypes.get_errno()
         raise OSError(error, os.strerror(error))
+    undo.callback(libc.munlockall)

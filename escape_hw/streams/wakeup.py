@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import mmap
 import os
 import platform
 import sys
 import time
 from typing import Final
+
+import numpy as np
 
 #: Number of the system call by machine.
 _NUMBERS: Final = {"x86_64": 202, "aarch64": 98}
@@ -21,6 +24,20 @@ _call = ctypes.CDLL(None, use_errno=True).syscall if _NUMBER is not None else No
 
 class _Timespec(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+def alarm_in(memory: mmap.mmap, word: int) -> int:
+    """Address of the half of a word of 64 bits that changes with every count.
+
+    Parameters
+    ----------
+    memory
+        Shared.
+    word
+        Place of the word, in words.
+    """
+    start = np.frombuffer(memory, np.uint8, 1).ctypes.data
+    return start + 8 * word + (0 if sys.byteorder == "little" else 4)
 
 
 def sleep_on(address: int, value: int, timeout_s: float) -> None:
