@@ -222,7 +222,7 @@ class PokeSession:
             raise RuntimeError("frames were fed before the sensor was set up")
         slopes = self.slopes_of(frame.data)
         self.light(self.slopes_of.flux)
-        self.motion.add(slopes)
+        self.motion.add(slopes, poke)
         if self.focus is not None:
             self.focus.add(slopes)
         if self.long_look:
