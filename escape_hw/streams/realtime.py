@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import os
 import sys
 from collections.abc import Callable, Collection, Iterator
@@ -35,6 +36,9 @@ def prompt(cpus: Collection[int] | None = None, priority: int = PRIORITY) -> Ite
     """
     notes: list[str] = []
     with contextlib.ExitStack() as undo:
+        # What there is now is looked at no more when garbage is collected, or that takes milliseconds.
+        gc.freeze()
+        undo.callback(gc.unfreeze)
         interval = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         undo.callback(sys.setswitchinterval, interval)

@@ -12,7 +12,7 @@ from escape_hw.streams.sample import Sample
 from escape_hw.streams.spin import LOOKS, changes
 
 #: Frames that may wait.
-_BACKLOG = 6
+_BACKLOG = 16
 
 
 class RingCamera(Camera):

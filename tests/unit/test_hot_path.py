@@ -149,7 +149,7 @@ def test_what_is_no_number_never_obeys(bad):
 # ---------------------------------------------------------------- waiting for frames
 @pytest.fixture
 def ring():
-    with RingWriter(segment_name("test.camera", "frames"), 4096, slots=16) as made:
+    with RingWriter(segment_name("test.camera", "frames"), 4096, slots=32) as made:
         yield made
 
 
@@ -189,9 +189,9 @@ def test_a_late_loop_catches_up_and_a_very_late_one_goes_on_with_the_newest(ring
         camera.start()
         show(ring, *range(4))
         assert [camera.next_frame(1.0).index for _ in range(4)] == [0, 1, 2, 3]
-        show(ring, *range(4, 14))
-        assert camera.next_frame(1.0).index == 13
-        assert camera.status().lost == 9
+        show(ring, *range(4, 24))
+        assert camera.next_frame(1.0).index == 23
+        assert camera.status().lost == 19
 
 
 @pytest.mark.parametrize("spin_s", [0.0, 0.002])

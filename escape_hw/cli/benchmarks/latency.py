@@ -14,6 +14,8 @@ from escape_hw.cli.benchmarks.pipeline import spots
 CASES = ((10, 8, 97, 1000.0), (40, 8, 1200, 500.0))
 #: Seconds of ours, long enough for a loss to show, and of the peer's.
 SECONDS, PEER_SECONDS = 20.0, 5.0
+#: Seconds of the loop with and without streams.
+STREAMS_SECONDS = 5.0
 
 
 def run() -> list[BenchmarkRow]:
@@ -24,6 +26,18 @@ def run() -> list[BenchmarkRow]:
         # One after the other: together they would fight for the processors.
         peer = run_peer(case, PEER_SECONDS)
         rows += _rows(case, run_loop(case, SECONDS), peer)
+    return rows + _streams(make_case(*CASES[0]))
+
+
+def _streams(case: Case) -> list[BenchmarkRow]:
+    """What it costs a loop that all it does goes to shared memory."""
+    quiet, told = run_loop(case, STREAMS_SECONDS), run_loop(case, STREAMS_SECONDS, streams=True)
+    rows = []
+    for label, share in (("median", 50.0), ("99th percentile", 99.0)):
+        ours, peer = (float(np.percentile(one.latency_us, share)) for one in (told, quiet))
+        stage = f"latency: {case.n_act} actuators, all streams written, {label}"
+        note = f"{told.lost} lost with, {quiet.lost} without"
+        rows.append(BenchmarkRow(stage, ours, peer, "the same loop without streams", "us", "lower", note))
     return rows
 
 

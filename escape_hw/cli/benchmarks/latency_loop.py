@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.frames import CameraInfo, CameraSettings, Region
+from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.taps import Taps
 from escape_hw.bench import Bench
 from escape_hw.calibration.loop_run import RunningLoop
 from escape_hw.config.load import load_system
@@ -26,7 +27,9 @@ from escape_hw.pipeline.integrator import LeakyIntegrator
 from escape_hw.pipeline.slopes import SlopeExtractor
 from escape_hw.safety.limits import MirrorLimits
 from escape_hw.streams.realtime import prompt
+from escape_hw.streams.ring import RingWriter
 from escape_hw.streams.ring_camera import RingCamera
+from escape_hw.streams.segments import segment_name
 
 #: Every rule of the guard is on.
 LIMITS = MirrorLimits(max_stroke=0.8, max_slew=1.0, max_mean=0.5, max_neighbour=0.9)
@@ -120,21 +123,24 @@ def paced_camera(case: Case) -> Iterator[str]:
                 process.wait(10)
 
 
-def run_loop(case: Case, seconds: float) -> Run:
-    """Close the loop on the case's frames for a while."""
+def run_loop(case: Case, seconds: float, *, streams: bool = False) -> Run:
+    """Close the loop on the case's frames for a while; with ``streams`` all it does goes to rings, too."""
     rows, columns = case.frames.shape[1:]
     info = CameraInfo("paced camera", "0", (rows, columns), FULL_SCALE_BITS, True)
     settings = CameraSettings(Region(0, 0, columns, rows), 0.5 / case.rate_hz, case.rate_hz)
     mirror = BookingMirror(case.n_act)
     with paced_camera(case) as segment:
         camera = RingCamera("wfs", segment, info, settings, spin_s=SPIN_S)
-        with Bench(load_system("razor-shwfs"), mirror, camera) as bench, prompt() as notes:
+        arrived = array("q")
+        with (
+            _taps(case, arrived, streams) as taps,
+            Bench(load_system("razor-shwfs"), mirror, camera) as bench,
+            prompt() as notes,
+        ):
+            bench.taps = taps
             control = LeakyIntegrator(case.control, 0.2, 0.05)
-            loop = RunningLoop(
-                bench, np.eye(case.n_act), SlopeExtractor(_grid(case), (rows, columns)), control
-            )
-            arrived = array("q")
-            bench.wfs.tap = lambda frame: arrived.append(frame.arrived_ns)
+            slopes_of = SlopeExtractor(_grid(case), (rows, columns))
+            loop = RunningLoop(bench, np.eye(case.n_act), slopes_of, control)
             run_procedure(loop.run(WARM_UP))
             lost, first = bench.wfs.status().lost, len(arrived)
             run_procedure(loop.run(round(seconds * case.rate_hz)))
@@ -143,6 +149,29 @@ def run_loop(case: Case, seconds: float) -> Run:
     came = np.array(arrived[first:])
     rate = (len(came) - 1) / float(came[-1] - came[0]) * 1e9
     return Run((sent - came) / 1e3, rate, lost, notes)
+
+
+@contextmanager
+def _taps(case: Case, arrived: array[int], streams: bool) -> Iterator[Taps]:
+    """Taps that book when frames came and, if asked for, write frames, commands and residuals to rings."""
+    if not streams:
+        yield Taps(frame=lambda frame: arrived.append(frame.arrived_ns))
+        return
+    with (
+        RingWriter(segment_name("perf", "seen"), case.frames[0].nbytes) as frames,
+        RingWriter(segment_name("perf", "commands"), 8 * case.n_act) as commands,
+        RingWriter(segment_name("perf", "modes"), 4 * case.n_act) as modes,
+    ):
+
+        def frame(one: Frame) -> None:
+            arrived.append(one.arrived_ns)
+            frames.write(one.data, one.index, one.exposed_ns, one.arrived_ns)
+
+        yield Taps(
+            frame=frame,
+            command=lambda shape: commands.write(shape, commands.written),
+            residual=lambda index, residual, rms: modes.write(residual, index),
+        )
 
 
 def _grid(case: Case) -> SubApertureGrid:

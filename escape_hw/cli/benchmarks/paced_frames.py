@@ -16,7 +16,7 @@ from escape_hw.streams.ring import RingWriter
 from escape_hw.streams.segments import segment_name
 
 #: Frames that the ring keeps.
-SLOTS = 16
+SLOTS = 32
 
 
 def _name() -> str:
