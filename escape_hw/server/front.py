@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import zmq
+from pydantic import ValidationError
 
 from escape_hw.api.procedure import Stop
 from escape_hw.config.models import SystemConfig
@@ -20,7 +21,7 @@ from escape_hw.remote import requests as ask
 from escape_hw.remote.source import STREAMS
 from escape_hw.remote.state import SCHEMA, Ended, Fault, LogLine, Phase, State
 from escape_hw.server.door import Door, Letter
-from escape_hw.server.engine_process import EngineProcess
+from escape_hw.server.engine_process import ENDING_S, EngineProcess
 from escape_hw.server.journal import Journal
 from escape_hw.server.lease import Client, LeaseBook
 from escape_hw.server.log_book import LogBook
@@ -71,7 +72,9 @@ class Front:
         self._samples = Samples()
         self._setup = Setup(config_text=config.to_toml(), runs=runs, reads=reads)
         self._pending: dict[int, Pending] = {}
-        self._next, self._ticked, self._ending, self._asked = 0, 0.0, False, False
+        self._next, self._ticked, self._ending = 0, 0.0, False
+        #: When the server was asked to end, monotonic seconds; 0: it was not.
+        self._asked = 0.0
         self._condemned = ""
         self._state = State(
             at_utc=utc_text(), server_pid=os.getpid(), version=software_version(),
@@ -113,7 +116,7 @@ class Front:
             self._close()
 
     def _shut_down(self) -> None:
-        self._asked = True
+        self._asked = time.monotonic()
         log.info("stopping: mirror flat, devices closed")
         if self._engine is None:
             self._ending = True
@@ -158,6 +161,8 @@ class Front:
         waiting = [one for one in self._pending.values() if isinstance(one.letter.request, _SAFETY)]
         if silent > limit:
             self._condemn(engine, f"the engine was silent for {silent:.1f} s (limit {limit:g} s)")
+        elif self._asked and now - self._asked > ENDING_S:
+            self._condemn(engine, f"the engine did not end within {ENDING_S:g} s")
         elif self._state.mirror.peak > 0 and any(now - one.since > _SAFETY_S for one in waiting):
             self._condemn(engine, f"the engine did not make the mirror flat within {_SAFETY_S:g} s")
 
@@ -211,29 +216,35 @@ class Front:
                 }
             )
         )  # fmt: skip
-        self._ending = self._asked
+        self._ending = bool(self._asked)
 
     # ------------------------------------------------------------ the engine speaks
     def _hear(self, engine: EngineProcess) -> None:
         for message in engine.receive():
-            if "state" in message:
-                self._became(State.model_validate(message["state"]))
-                verdict = self._watchdog.judge(self._state)
-                if verdict is not None:
-                    self._make_safe(engine, verdict.reason, verdict.way_out)
-            elif "reply" in message:
-                self._pass_on(message)
-            elif "log" in message:
-                self._log.add(LogLine.model_validate(message["log"]))
-            elif "progress" in message:
-                self._door.publish("progress", message["progress"])
-            elif "run" in message:
-                self._journal.write(message["run"])
-                self._setup = self._setup.model_copy(update={"first_run": message["run"]["id"] + 1})
-            elif "ended" in message:
-                ended = Ended.model_validate(message["ended"])
-                self._journal.write(None)
-                self._door.publish("ended", ended)
+            try:
+                self._understand(engine, message)
+            except (ValidationError, EscapeError) as error:
+                # A number that makes no sense, or a full disk, is no reason to let go of the engine.
+                log.error("what the engine said could not be dealt with: %s", error)
+
+    def _understand(self, engine: EngineProcess, message: dict[str, Any]) -> None:
+        if "state" in message:
+            self._became(State.model_validate(message["state"]))
+            verdict = self._watchdog.judge(self._state)
+            if verdict is not None:
+                self._make_safe(engine, verdict.reason, verdict.way_out)
+        elif "reply" in message:
+            self._pass_on(message)
+        elif "log" in message:
+            self._log.add(LogLine.model_validate(message["log"]))
+        elif "progress" in message:
+            self._door.publish("progress", message["progress"])
+        elif "run" in message:
+            self._setup = self._setup.model_copy(update={"first_run": message["run"]["id"] + 1})
+            self._journal.write(message["run"])
+        elif "ended" in message:
+            self._door.publish("ended", Ended.model_validate(message["ended"]))
+            self._journal.write(None)
 
     def _became(self, state: State) -> None:
         """Take the engine's state, add what the front knows, and tell everybody."""
@@ -279,6 +290,9 @@ class Front:
                 self._forward(letter)
         except EscapeError as error:
             self._door.refuse(letter.route, error)
+        except Exception as error:
+            log.exception("unexpected, at '%s'", request.verb)
+            self._door.fail(letter.route, error)
 
     def _greet(self, hello: ask.Hello, route: bytes) -> State:
         if hello.schema_version != SCHEMA:
@@ -311,7 +325,7 @@ class Front:
             self._without_engine(letter)
             return
         if isinstance(letter.request, ask.Shutdown):
-            self._asked = True
+            self._asked = time.monotonic()
         number = self._number()
         self._pending[number] = Pending(letter, time.monotonic())
         self._engine.send({"id": number, "request": _plain(letter.request)})

@@ -16,8 +16,9 @@ from small_system import configuration
 
 from escape_hw.errors import CalibrationError, ServerGone
 from escape_hw.io.fits import load_matrix
+from escape_hw.remote.address import Listing, list_server, local_endpoint, unlist_server
 from escape_hw.remote.state import Phase
-from escape_hw.streams.segments import segments
+from escape_hw.streams.segments import process_start, segments
 from escape_sim.devices import shared_bench
 from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build
 from escape_sim.stand_ins.bench_server import BenchServer
@@ -81,6 +82,26 @@ def load_state_frames(path: Path) -> int:
     from escape_hw.io.state_file import load_state
 
     return int(load_state(path).values["fed"])
+
+
+def test_the_command_line_is_told_that_a_server_holds_the_hardware(
+    system, bench, tmp_path, monkeypatch, capsys
+) -> None:
+    from escape_hw.cli import main
+
+    server, _ = bench
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    name, pid = server.config.system.name, os.getpid()
+    sockets = local_endpoint(name, pid)
+    listing = Listing(name, pid, process_start(pid), sockets.requests, sockets.events)
+    list_server(listing)
+    words = ["calibrate", str(system), "--mode", "hardware", "--out", str(tmp_path / "run"), "--json"]
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert f"is served by process {pid}, which holds its devices" in capsys.readouterr().out
+    unlist_server(listing)
 
 
 def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, tmp_path) -> None:
