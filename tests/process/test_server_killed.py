@@ -14,7 +14,7 @@ import pytest
 from serving import Served, Spy, serving, until_idle, wait_for
 from small_system import configuration
 
-from escape_hw.errors import CalibrationError, ServerGone
+from escape_hw.errors import CalibrationError, RequestRefused, ServerGone
 from escape_hw.io.fits import load_matrix
 from escape_hw.remote.address import Listing, list_server, local_endpoint, unlist_server
 from escape_hw.remote.state import Phase
@@ -130,11 +130,12 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
 
 
 @pytest.mark.slow
-def test_fifty_kills_at_random_moments_of_a_calibration(system, bench, tmp_path) -> None:
+@pytest.mark.parametrize("seed", range(5))
+def test_ten_kills_at_random_moments_of_a_calibration(system, bench, tmp_path, seed) -> None:
     server, spy = bench
-    rng, found = np.random.default_rng(50), []
+    rng, found = np.random.default_rng(seed), []
     with on_metal(system, server, tmp_path) as served:
-        for number in range(50):
+        for number in range(10):
             which = "engine" if number % 2 else "front"
             with served.connect(control=True) as client:
                 if client.state.fault is not None:
@@ -155,5 +156,29 @@ def test_fifty_kills_at_random_moments_of_a_calibration(system, bench, tmp_path)
             assert not segments(pid=engine), (number, which)
             whole(tmp_path)
             found.append(which)
-            print(number, which, "flat", flush=True)
-    assert len(found) == 50
+            print(seed, number, which, "flat", flush=True)
+    assert len(found) == 10
+
+
+@pytest.mark.slow
+def test_an_engine_that_hangs_is_ended_and_its_mirror_made_flat(system, bench, tmp_path) -> None:
+    server, spy = bench
+    with (
+        serving(
+            system, "--mode", "hardware", "--set", OPTIONS[0], "--set", "server.silent_s=2",
+            folder=tmp_path, more=server.environment,
+        ) as served,
+        served.connect(control=True) as client,
+    ):  # fmt: skip
+        until_idle(client)
+        client.start("docrime", frames=10_000_000)
+        wait_for(lambda: not spy.flat and spy.last is not None, "the mirror is poked")
+        os.kill(client.state.engine_pid, signal.SIGSTOP)
+        wait_for(lambda: client.state.fault is not None, "the fault is latched")
+        assert "the engine was silent for 2." in client.state.fault.reason
+        assert "the mirror is flat" in client.state.fault.reason
+        assert spy.flat
+        with pytest.raises(RequestRefused, match="the engine has died; clear the fault to start it again"):
+            client.start("docrime")
+        client.clear_fault()
+        until_idle(client)
