@@ -32,6 +32,9 @@ def loop(
     strehl: Annotated[
         bool, typer.Option("--strehl/--no-strehl", help="Measure the model PSF and the Strehl ratios.")
     ] = True,
+    record: Annotated[
+        int, typer.Option("--record", min=0, help="Keep slopes and commands of the newest so many frames.")
+    ] = 0,
     force: options.Force = False,
     out: options.Out = None,
     set: options.Set = None,
@@ -45,8 +48,9 @@ def loop(
         from escape_hw.runtime.loop_task import LoopTask
 
         task = LoopTask(
-            im, frames=frames, gain=gain, leak=leak, dropped_modes=drop, best=best, strehl=strehl, force=force
-        )
+            im, frames=frames, gain=gain, leak=leak, dropped_modes=drop, best=best, strehl=strehl,
+            record=record, force=force,
+        )  # fmt: skip
         one.perform(task, options.Choice.of(system, set, seed, mode), out, partial(_show, one))
 
 

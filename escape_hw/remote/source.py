@@ -66,6 +66,7 @@ STREAMS: dict[str, str] = {
     "measured_positions": "(n_act,), metres; adaptive secondaries only",
     "matrix": "interaction matrix as measured so far (n_slopes, n_modes), slopes per unit mode",
     "matrix_sigma": "its standard errors (n_slopes, n_modes)",
+    "valid": "sub-apertures that the matrix's slopes belong to (rows, columns), 0 or 1",
     "registration": "SPRINT's parameters by iteration (n_iterations, 5): shift x, y [sub-aperture], rotation "
     "[rad], radial, tangential scaling",
     "registration_sigma": "standard errors of the last iteration (5,), same units; NaN: not known yet",

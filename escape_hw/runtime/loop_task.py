@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from escape_hw.io.fits import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
+    from escape_hw.runtime.telemetry_tape import TelemetryTape
 
 
 class LoopTask:
@@ -33,6 +34,8 @@ class LoopTask:
         Look for the best gain first.
     strehl
         Measure the model PSF and the Strehl ratios.
+    record
+        Keep slopes and commands of the newest so many frames.
     force
         Allow a simulated matrix on hardware.
     """
@@ -49,12 +52,15 @@ class LoopTask:
         dropped_modes: int | None = None,
         best: bool = False,
         strehl: bool = True,
+        record: int = 0,
         force: bool = False,
     ) -> None:
         if best and gain is not None:
             raise ConfigError("--gain and --best-gain exclude each other")
         self.overrides = given({"loop.gain": gain, "loop.leak": leak, "loop.dropped_modes": dropped_modes})
         self._im, self._frames, self._best, self._strehl, self._force = im, frames, best, strehl, force
+        self._record = record
+        self._tape: TelemetryTape | None = None
         self._product: MatrixProduct | None = None
 
     @property
@@ -76,6 +82,11 @@ class LoopTask:
 
         refuse_simulated(self.product, bench, self._force)
         matrix, grid = self.product.matrix, self.product.grid
+        if self._record:
+            from escape_hw.runtime.telemetry_tape import TelemetryTape
+
+            self._tape = TelemetryTape(self._record, grid.n_slopes, bench.dm.info.n_act)
+            bench.taps = self._tape.taps
         model = gain = None
         if self._strehl and bench.science is not None:
             model = yield from model_psf(bench)
@@ -91,9 +102,11 @@ class LoopTask:
         from escape_hw.io.documents import loop_document
         from escape_hw.report.content import METHOD_LABELS
         from escape_hw.runtime import criteria
-        from escape_hw.runtime.keep import finish, keep_loop
+        from escape_hw.runtime.keep import finish, keep_loop, keep_telemetry
 
         label = METHOD_LABELS.get(result.method, result.method)
+        if self._tape is not None:
+            keep_telemetry(folder, record, "telemetry", self._tape.telemetry(), self.product.path)
         keep_loop(folder, record, "loop", result, self.product.path)
         document = finish(
             folder,
