@@ -17,6 +17,7 @@ from small_system import configuration
 from escape_hw.errors import CalibrationError, RequestRefused, ServerGone
 from escape_hw.io.fits import load_matrix
 from escape_hw.remote.address import Listing, list_server, local_endpoint, unlist_server
+from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Phase
 from escape_hw.streams.segments import process_start, segments
 from escape_sim.devices import shared_bench
@@ -60,10 +61,9 @@ def test_the_guardian_flattens_the_mirror_of_an_engine_that_was_killed(system, b
         running = client.state.engine_pid
         wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
         os.kill(running, signal.SIGKILL)
-        with pytest.raises(
-            CalibrationError, match=r"ended with its engine: the engine .* died; the mirror is flat"
-        ):
+        with pytest.raises(CalibrationError, match=r"ended with its engine: the engine .* died; "):
             run.wait(60)
+        wait_for(lambda: guarded(client), "the guardian has done its work")
         assert spy.flat
         assert client.state.phase is Phase.FAULT
         assert not segments(pid=running)
@@ -76,6 +76,11 @@ def test_the_guardian_flattens_the_mirror_of_an_engine_that_was_killed(system, b
         result = client.calibrate("docrime", resume=str(state.parent), frames=kept + 500)
         assert result.frames == kept + 500
     assert spy.flat
+
+
+def guarded(client: Connection) -> bool:
+    """Whether the fault says that the guardian has flattened the mirror."""
+    return client.state.fault is not None and "the mirror is flat" in client.state.fault.reason
 
 
 def load_state_frames(path: Path) -> int:
@@ -146,8 +151,7 @@ def test_ten_kills_at_random_moments_of_a_calibration(system, bench, tmp_path, s
                 engine = client.state.engine_pid
                 if which == "engine":
                     os.kill(engine, signal.SIGKILL)
-                    wait_for(lambda: client.state.fault is not None, "the fault is latched")
-                    assert "the mirror is flat" in client.state.fault.reason
+                    wait_for(lambda: guarded(client), "the guardian has done its work")
                 else:
                     served.kill()
                     wait_for(lambda: not served.engines(), "engine and guardian end")
@@ -174,9 +178,8 @@ def test_an_engine_that_hangs_is_ended_and_its_mirror_made_flat(system, bench, t
         client.start("docrime", frames=10_000_000)
         wait_for(lambda: not spy.flat and spy.last is not None, "the mirror is poked")
         os.kill(client.state.engine_pid, signal.SIGSTOP)
-        wait_for(lambda: client.state.fault is not None, "the fault is latched")
+        wait_for(lambda: guarded(client), "the guardian has done its work")
         assert "the engine was silent for 2." in client.state.fault.reason
-        assert "the mirror is flat" in client.state.fault.reason
         assert spy.flat
         with pytest.raises(RequestRefused, match="the engine has died; clear the fault to start it again"):
             client.start("docrime")
