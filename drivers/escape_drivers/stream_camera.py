@@ -156,7 +156,8 @@ class StreamCamera(WaitingCamera):
         region = self._settings.region
         part = data[region.y : region.y + region.height, region.x : region.x + region.width]
         if part.dtype == np.uint16 and self._options.offset == 0:
-            return np.minimum(part.astype(np.uint16, copy=False), self._top)
+            counts = part.astype(np.uint16, copy=False)
+            return counts if counts.max() <= self._top else np.minimum(counts, self._top)
         shifted = np.asarray(part, np.float64) + self._options.offset
         return np.clip(np.rint(shifted), 0, float(self._top)).astype(np.uint16)
 

@@ -61,7 +61,8 @@ def centres_of_gravity(frame, gain, offset, per_pixel, places, weights, zero_poi
     frame's shape; with 0 they hold ``(width,)`` equal numbers, and do not fill the processor's cache. A
     window without light above the threshold yields slope 0 and flux 0. ``places (n, 3)`` holds each
     window's first row, number of rows and first column, ``weights (n, 2, width)`` its mask and its lever
-    along x, ``zero_points (2 n,)`` what to subtract. Fills ``slopes (2 n,)`` (all x, then all y) and ``flux (n,)``.
+    along x, ``zero_points (2 n,)`` what to subtract. Fills ``slopes (2 n,)`` (all x, then all y) and
+    ``flux (n,)``.
 
     Three things make it fast. All windows are read equally wide, a whole number of vectors, and
     their weights are zero where they end. Four rows go through the inner loop together, for its

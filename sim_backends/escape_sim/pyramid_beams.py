@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -82,26 +83,63 @@ class Turbulent:
         Field at ``u`` of a point at ``p``, for ``u - p`` from ``1 - n`` on along y and x.
     mean
         From :func:`coherence`.
+    uneven
+        What to add where the phase moves more than in ``mean``, if anywhere.
     """
 
     def __init__(
-        self, light: NDArray[np.float32], spread: NDArray[np.complex64], mean: NDArray[np.complex128]
+        self,
+        light: NDArray[np.float32],
+        spread: NDArray[np.complex64],
+        mean: NDArray[np.complex128],
+        uneven: Uneven | None = None,
     ) -> None:
-        n = len(light)
-        size = good_length(2 * n - 1)
-        wide = np.zeros((size, size), complex)
-        steps = np.arange(1 - n, n) % size
-        wide[np.ix_(steps, steps)] = mean
-        self._filter = FourierFilter(np.fft.fft2(wide) / size**2, n, n)
-        self._light, self._spread = light, spread
+        self._filter = _convolution(mean, len(light))
+        self._light, self._spread, self._uneven = light, spread, uneven
+        self._more = None if uneven is None else _convolution(uneven.difference, len(light))
 
     def seen(self, places: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
         """See :class:`Beams`."""
-        n = len(self._light)
+        n, filter_, more = len(self._light), self._filter, self._more
         for row, column in places:
-            _view(self._spread, n - 1 + row, n - 1 + column, self._light, self._filter.field)
-            self._filter.run()
-            yield self._filter.result
+            _view(self._spread, n - 1 + row, n - 1 + column, self._light, filter_.field)
+            filter_.run()
+            result = filter_.result[:n, :n]
+            if more is not None and self._uneven is not None:
+                # With s(p, q) = (s(p) + s(q)) / 2 one half belongs to either side of the convolution.
+                half = self._uneven.half
+                more.field[:n, :n] = filter_.field[:n, :n]
+                more.run()
+                result += half * more.result[:n, :n]
+                more.field[:n, :n] *= half
+                more.run()
+                result += more.result[:n, :n]
+            yield filter_.result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uneven:
+    """A coherence that changes from place to place, linearly between two.
+
+    Parameters
+    ----------
+    half
+        Half the share ``(n, n)`` of the way from the first to the second.
+    difference
+        The second less the first ``(2 n - 1, 2 n - 1)``, see :func:`coherence`.
+    """
+
+    half: NDArray[np.float32]
+    difference: NDArray[np.complex128]
+
+
+def _convolution(kernel: NDArray[np.complex128], n: int) -> FourierFilter:
+    """The convolution of fields of ``n`` samples with a kernel ``(2 n - 1, 2 n - 1)``."""
+    size = good_length(2 * n - 1)
+    wide = np.zeros((size, size), complex)
+    steps = np.arange(1 - n, n) % size
+    wide[np.ix_(steps, steps)] = kernel
+    return FourierFilter(np.fft.fft2(wide) / size**2, n, n)
 
 
 def coherence(

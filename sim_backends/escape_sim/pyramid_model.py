@@ -216,7 +216,8 @@ class PyramidModel:
         """The pokes that were measured; ``scale`` is the phase of a surface of full stroke in radians."""
         m2c = self._basis()
         surfaces, lit, _ = self.influence_functions()
-        most = self._config.calibration.poke_command / np.abs(m2c).max(axis=0)
+        # Random pokes are uniform: an rms of so much less than their largest.
+        most = self._config.calibration.poke_command / np.abs(m2c).max(axis=0) / np.sqrt(3)
         return Pokes.of(self._pupils.pokes, most, scale * np.tensordot(m2c.T, surfaces, 1), lit)
 
     def _random_commands(self, count: int) -> NDArray[np.float64]:
@@ -234,12 +235,13 @@ class PyramidModel:
         structure = None
         if self.turbulence or self._pokes:
             apart = distances(n, pupil.pixel_m) / self._config.system.pupil_m
-            structure = self._pokes.structure() if self._pokes else np.zeros_like(apart)
+            structure = np.zeros_like(apart)
             if self.turbulence:
                 structure += structure_function(apart, 1 / self.turbulence, _OUTER_SCALE)
         return slope_response(
             pupil.amplitude, Prism(window.shifts(n), pupil.n_sub * samples), grid * samples,
             pupils.corners_px - window.first, pupils.valid, self._modulation, structure,
+            unsteady=None if self._pokes is None else self._pokes.unsteady(),
             carry=self._carry, samples=samples, local=pupils.normalisation == "local",
         ).by_phase  # fmt: skip
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from escape_hw.api.threads import hold_to_one_thread
 from escape_sim.modulation import Modulation
 from escape_sim.prism import Prism, frequencies
-from escape_sim.pyramid_beams import Beams, Points, Turbulent, coherence
+from escape_sim.pyramid_beams import Beams, Points, Turbulent, Uneven, coherence
 
 #: Threads that share the pixels.
 _WORKERS = 2
@@ -43,6 +43,22 @@ def _respond(spread, row, column, light, seen, spans, weights, sums):  # type: i
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Unsteady:
+    """Gaussian phases that move more in some places of the pupil than in others.
+
+    Parameters
+    ----------
+    structure
+        Their mean structure function ``(2 n - 1, 2 n - 1)`` in square radians.
+    strength
+        How much more than in the mean they move at each sample ``(n, n)``, in squares: 1 on average.
+    """
+
+    structure: NDArray[np.float64]
+    strength: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SlopeResponse:
     """Slopes of a flat wavefront and their derivatives by the phase.
 
@@ -67,6 +83,7 @@ def slope_response(
     modulation: Modulation,
     structure: NDArray[np.float64] | None = None,
     *,
+    unsteady: Unsteady | None = None,
     carry: NDArray[np.float32] | None = None,
     samples: int = 1,
     local: bool = False,
@@ -97,6 +114,8 @@ def slope_response(
     structure
         Structure function ``(2 n - 1, 2 n - 1)`` in square radians of the turbulence to average
         over, at distances from ``-(n - 1)`` to ``n - 1`` samples along y and x; none by default.
+    unsteady
+        What moves beside, and not alike everywhere; ``structure`` must be given then.
     carry
         Matrix ``(n, m)`` from the phase at nodes to the phase at samples, along either axis; by
         default the nodes are the samples.
@@ -126,8 +145,8 @@ def slope_response(
     if structure is None:
         beams = [Points(light, prism, n_grid, modulation)] * _WORKERS
     else:
-        mean = coherence(len(light), prism.diameter, modulation, structure)
-        beams = [Turbulent(light, spread, mean) for _ in range(_WORKERS)]
+        mean, uneven = _coherences(len(light), prism.diameter, modulation, structure, unsteady)
+        beams = [Turbulent(light, spread, mean, uneven) for _ in range(_WORKERS)]
     job = _Job(spread, light, _spans(light), at, samples, carry, sums)
     parts = np.array_split(np.arange(len(places)), _WORKERS)
     # The workers multiply matrices too, each for itself.
@@ -135,6 +154,28 @@ def slope_response(
         for done in [pool.submit(job.run, beams[k], part, k) for k, part in enumerate(parts)]:
             done.result()
     return sums.normalised(local)
+
+
+def _coherences(
+    n: int,
+    diameter: float,
+    modulation: Modulation,
+    structure: NDArray[np.float64],
+    unsteady: Unsteady | None,
+) -> tuple[NDArray[np.complex128], Uneven | None]:
+    """The coherence where phases move little, and what is added where they move more.
+
+    Between two samples the structure function is taken for the mean one by the mean of both strengths,
+    and the coherence for linear in it between the quiet and the restless quarter of the pupil.
+    """
+    if unsteady is None:
+        return coherence(n, diameter, modulation, structure), None
+    low, high = np.percentile(unsteady.strength, (25, 75))
+    quiet, restless = (
+        coherence(n, diameter, modulation, structure + level * unsteady.structure) for level in (low, high)
+    )
+    half = (unsteady.strength - low) / (2 * max(high - low, 1e-6))
+    return quiet, Uneven(half.astype(np.float32), restless - quiet)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.pipeline.pyramid_slopes import slopes_of_image
 from escape_sim.pyramid import PyramidOptics
+from escape_sim.pyramid_response import Unsteady
 
 #: Strengths tried, as pupil diameters over r0; beyond the last the slopes tell them apart no more.
 _STRENGTHS = 2.0 ** np.arange(-1, 5, 0.5)
@@ -82,6 +83,15 @@ class Pokes:
         mean = np.where(pairs > 0.5, np.maximum(total, 0) / np.maximum(pairs, 1), 0.0)
         steps = np.arange(1 - n, n)
         return np.asarray(mean[np.ix_(steps, steps)])
+
+    def unsteady(self) -> Unsteady:
+        """What a mean response needs of them: how they move in the mean, and where more.
+
+        Modes of high order live at the rim of a mirror, so pokes move the rim more than the middle. How
+        much a place moves is told by the mean square slope of the phase there.
+        """
+        squares = np.sum([np.square(np.gradient(mode)).sum(axis=0) for mode in self.modes_rad], axis=0)
+        return Unsteady(self.structure(), np.where(self.lit, squares / squares[self.lit].mean(), 1.0))
 
     def phases(self, count: int) -> NDArray[np.float64]:
         """Random phases ``(count, n, n)`` in radians; always the same."""
