@@ -22,8 +22,8 @@ log = logging.getLogger(__name__)
 
 #: Seconds that an engine has to end in order: a partial result is saved meanwhile.
 ENDING_S = 60.0
-#: Seconds that an engine may take until its first word, on a busy machine.
-STARTING_S = 120.0
+#: Seconds that an engine may be silent while its mirror is flat.
+PATIENCE_S = 120.0
 _ENGINE, _GUARDIAN = "escape_hw.server.engine", "escape_hw.server.guardian"
 
 
@@ -41,8 +41,8 @@ class EngineProcess:
     ----------
     connection
         The front's end of the channel, for a poller.
-    spoke, said_goodbye
-        Whether it has said anything yet, and whether it ended in order.
+    said_goodbye
+        Whether the engine ended in order.
     heard
         When it last said something, monotonic seconds.
     """
@@ -67,7 +67,7 @@ class EngineProcess:
         self._guardian.stdin.close()
         self._lines = Lines()
         self._unsent = b""
-        self.said_goodbye = self.spoke = False
+        self.said_goodbye = False
         self.heard = time.monotonic()
         self.send(setup.model_dump(mode="json"))
         self.connection.setblocking(False)
@@ -105,7 +105,7 @@ class EngineProcess:
                 return
             if not data:
                 return
-            self.heard, self.spoke = time.monotonic(), True
+            self.heard = time.monotonic()
             for message in self._lines.feed(data):
                 self.said_goodbye = self.said_goodbye or "goodbye" in message
                 yield message

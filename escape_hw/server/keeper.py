@@ -16,7 +16,7 @@ from escape_hw.io.provenance import software_version, utc_text
 from escape_hw.remote import requests as ask
 from escape_hw.remote.state import Ended, Fault, LogLine, Phase, State
 from escape_hw.server.door import Door, Letter
-from escape_hw.server.engine_process import ENDING_S, STARTING_S, EngineProcess
+from escape_hw.server.engine_process import ENDING_S, PATIENCE_S, EngineProcess
 from escape_hw.server.journal import Journal
 from escape_hw.server.lease import LeaseBook
 from escape_hw.server.log_book import LogBook
@@ -91,7 +91,9 @@ class Keeper:
             self._bury(engine)
             return
         self._mind_abandoned(engine)
-        silent, limit = now - engine.heard, self._config.server.silent_s if engine.spoke else STARTING_S
+        # On a busy machine a compiler may hold an engine up; that harms nobody while the mirror is flat.
+        moving = self._state.mirror.peak > 0 or self._state.loop.closed
+        silent, limit = now - engine.heard, self._config.server.silent_s if moving else PATIENCE_S
         waiting = [one for one in self._pending.values() if isinstance(one.letter.request, SAFETY)]
         if silent > limit:
             self._condemn(engine, f"the engine was silent for {silent:.1f} s (limit {limit:g} s)")
