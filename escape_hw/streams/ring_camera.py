@@ -11,15 +11,12 @@ from escape_hw.streams.ring import RingReader
 from escape_hw.streams.sample import Sample
 from escape_hw.streams.spin import LOOKS, changes
 
-#: Frames that may wait.
-_BACKLOG = 16
-
 
 class RingCamera(Camera):
     """Delivers the frames of a ring in their order.
 
-    A loop that was held up catches up with the frames it finds; when these are too many, it goes on with
-    the newest, and those in between count as lost.
+    A loop that was held up catches up with the frames that wait, so that telemetry has no gaps; when these
+    fill the ring, it goes on with the newest, and those in between count as lost.
 
     Parameters
     ----------
@@ -103,7 +100,7 @@ class RingCamera(Camera):
 
     def _taken(self, ring: RingReader) -> Sample | None:
         """The next entry, or the newest when too many wait."""
-        if ring.written - self._seen > min(_BACKLOG, ring.slots - 2):
+        if ring.written - self._seen > ring.slots - 2:
             ring.seek(ring.written - 1)
         sample = ring.next()
         self._seen = ring.position

@@ -52,13 +52,16 @@ def _rows(case: Case, ours: Run, peer: Run | None) -> list[BenchmarkRow]:
     note = (
         f"{len(ours.latency_us)} frames at {ours.rate_hz:.0f} Hz, {ours.lost} lost; {'; '.join(ours.notes)}"
     )
-    note = note.rstrip("; ")
-    note += f"; {ABSENT}" if peer is None else f"; the peer answered {peer.rate_hz:.0f} frames per second"
+    note = note.removesuffix("; ")
+    if peer is None:
+        note += f"; {ABSENT}"
+    else:
+        note += f"; {'; '.join(peer.notes) or f'the peer answered {peer.rate_hz:.0f} frames per second'}"
     what = f"latency: {case.n_act} actuators, {case.rate_hz:.0f} Hz"
     shares = {"median": 50.0, "99th percentile": 99.0}
     rows = []
     for k, (label, share) in enumerate(shares.items()):
-        theirs = None if peer is None else float(peer.latency_us[min(k, len(peer.latency_us) - 1)])
+        theirs = None if peer is None or not peer.latency_us.size else float(peer.latency_us[k])
         rows.append(
             BenchmarkRow(
                 f"{what}, {label}", float(np.percentile(ours.latency_us, share)), theirs,

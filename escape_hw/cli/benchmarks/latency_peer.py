@@ -37,13 +37,13 @@ def run_peer(case: Case, seconds: float) -> Run | None:
         rate = (look.count - before) / (time.perf_counter() - began)
         look.close()
     except TimeoutError:
-        return Run(np.array([np.nan]), float("nan"), 0, ("its own measurement timed out",))
+        return Run(np.array([]), 0.0, 0, ("the peer's own measurement timed out",))
     finally:
         for part in reversed(parts):
             part.close()
         streams.clear_shms(list(names.values()))
     s = report.total.statistics
-    # Its report keeps percentiles only; two values carry them.
+    # Its report keeps percentiles only: the median and the 99th stand for all.
     return Run(np.array([s.p50_seconds, s.p99_seconds]) * 1e6, rate, 0)
 
 

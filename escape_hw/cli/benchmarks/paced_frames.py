@@ -15,8 +15,8 @@ from escape_hw.streams.realtime import PRIORITY, prompt
 from escape_hw.streams.ring import RingWriter
 from escape_hw.streams.segments import segment_name
 
-#: Frames that the ring keeps.
-SLOTS = 32
+#: Frames that the ring keeps, as the buffers of a camera's driver would.
+SLOTS = 64
 
 
 def _name() -> str:
