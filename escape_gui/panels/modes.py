@@ -39,8 +39,6 @@ _HOW = "Each pair: x slopes left, y slopes right. Click a mode to see it in ever
 _MOST = 4
 #: Shares of mosaic and detail, and the width from which on they stand beside each other.
 _SHARES, _WIDE = (550, 450), 900
-#: Least width of one pair of maps in the detail.
-_TILE = 150
 
 
 class ModesPanel(Panel):
@@ -247,8 +245,6 @@ class ModesPanel(Panel):
         if self.splitter.orientation() != way:
             self.splitter.setOrientation(way)
             self.splitter.setSizes([_SHARES[0], _SHARES[1]])
-        across = self.width() // (2 if wide else 1) // self.context.theme.pixels(_TILE)
-        self.detail.use_columns(max(2, min(across, _MOST)))
 
     def clear(self) -> None:
         """Forget the matrix of another source."""

@@ -51,6 +51,7 @@ class ProcedurePanel(Panel):
         super().__init__(context)
         self._entries: dict[str, ProcedureEntry] = {}
         self._plan: Plan | None = None
+        self._plan_level = "muted"
         self._checking: Arguments | None = None
         self._state = State()
         self._ended: Ended | None = None
@@ -128,7 +129,8 @@ class ProcedurePanel(Panel):
             for one in found:
                 self.choice.addItem(one.title, one.name)
             self._choose()
-        elif not self._entries:
+        self.form.setVisible(bool(self._entries))
+        if not self._entries:
             _put(self._about, "" if self.context.session.commands else NOTHING)
         self._enable()
 
@@ -202,7 +204,11 @@ class ProcedurePanel(Panel):
 
     def _say_plan(self, text: str, level: str = "muted") -> None:
         _put(self.plan, text)
-        self.plan.setStyleSheet(f"color: {self.context.theme.colour(level).name()};")
+        self._plan_level = level
+        self._colour_plan()
+
+    def _colour_plan(self) -> None:
+        self.plan.setStyleSheet(f"color: {self.context.theme.colour(self._plan_level).name()};")
 
     # ------------------------------------------------------------ requests
     def ask_plan(self) -> None:
@@ -283,6 +289,7 @@ class ProcedurePanel(Panel):
         for label in (self.progress, self._metrics, self.numbers):
             label.setFont(theme.font(0.95, mono=True))
         self._about.setStyleSheet(f"color: {theme.colour('muted').name()};")
+        self._colour_plan()
 
 
 def _put(label: QLabel, text: str) -> None:

@@ -22,6 +22,7 @@ from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.panels.sprint import SprintPanel
 from escape_gui.session import Session
 from escape_gui.settings import Settings
+from escape_gui.widgets.map_tiles import best_columns
 from escape_hw.api.registration import TO_PLAIN
 from escape_hw.io.documents import calibration_document
 from escape_hw.io.fits import save_matrix
@@ -157,6 +158,11 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     assert not panel.detail.isVisible()
     names = [array.name for array in panel.shown()]
     assert names == ["matrix", "sigma"]
+
+
+@pytest.mark.parametrize(("width", "height", "columns"), [(900, 260, 6), (480, 300, 3), (500, 1200, 2)])
+def test_tiles_use_their_room(width, height, columns):
+    assert best_columns(6, width, height, 56) == columns
 
 
 def test_pages_turn(calibrate, source):
