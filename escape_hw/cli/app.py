@@ -23,6 +23,7 @@ from escape_hw.cli import (
     products,
     rehearse,
     reproduce,
+    sweep,
     systems,
     track,
     udev,
@@ -45,6 +46,7 @@ app.command("sprint")(calibrate.sprint)
 app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.command("track")(track.track)
+app.command("sweep")(sweep.sweep)
 app.add_typer(reproduce.app, name="reproduce")
 app.command("show")(products.show)
 app.command("compare")(products.compare)
