@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,7 +20,7 @@ def sweep_section(document: Mapping[str, Any]) -> str:
     if document["best"]:
         caption = (
             f"Every matrix at its own best parameters: mean over {loops['final'] // len(sweep['arms'])} "
-            f"stretches of air, the same for all, of {sweep['frames']} frames, with standard errors over them."
+            f"stretches of air, the same for all, of {sweep['frames']} frames; standard errors over them."
         )
         parts.append(html.table(best_table(document), caption))
     if document["comparisons"]:
@@ -56,18 +57,17 @@ def best_table(document: Mapping[str, Any]) -> tables.Table:
     )  # fmt: skip
     rows = []
     for label, one in best.items():
-        ratios = (
-            tables.percent(Measured(**_known(one["strehl"][way]))) for way in ("peak", "otf", "encircled")
-        )
+        ratios = (tables.percent(_measured(one["strehl"][way])) for way in ("peak", "otf", "encircled"))
         values = (f"{v:.4g}" if isinstance(v, float) else str(v) for v in one["values"].values())
         cells = (ratio.strip(" %") for ratio in ratios)
         rows.append((label, *cells, *values, f"{one['closed']}/{one['loops']}"))
     return tables.Table(headings, tuple(rows))
 
 
-def _known(pair: Mapping[str, float | None]) -> dict[str, float]:
+def _measured(pair: Mapping[str, float | None]) -> Measured:
     """A value and its error; JSON has no NaN."""
-    return {name: float("nan") if value is None else value for name, value in pair.items()}
+    value, sigma = pair["value"], pair["sigma"]
+    return Measured(math.nan if value is None else value, math.nan if sigma is None else sigma)
 
 
 def importance_table(document: Mapping[str, Any]) -> tables.Table:

@@ -66,7 +66,7 @@ def _comparisons(found: Sequence[ArmComparison]) -> list[dict[str, Any]]:
 
 
 def criteria(result: SweepResult) -> list[dict[str, Any]]:
-    """Every arm's best loop stays closed, and ESCAPE is not worse than the baseline by more than the margin."""
+    """Every arm's best loop stays closed; ESCAPE is not below the baseline by more than the margin."""
     checks = [
         check(
             f"{label}: at its best, {best.closed} of {best.airs} loops stayed closed",

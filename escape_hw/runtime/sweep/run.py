@@ -143,8 +143,8 @@ def _candidates(sweep: Sweep, records: Sequence[Record]) -> dict[tuple[str, int]
         chosen = shortlist(records, sweep.space, arm.label, sweep.design.candidates)
         if not chosen:
             raise CalibrationError(
-                f"no loop with the matrix {arm.label} stayed closed; widen the range of the gain or leave the "
-                "matrix out"
+                f"no loop with the matrix {arm.label} stayed closed; widen the range of the gain or leave "
+                "the matrix out"
             )
         found.update({(arm.label, number): values for number, values in enumerate(chosen)})
     return found

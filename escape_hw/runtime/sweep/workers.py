@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import multiprocessing
 import os
@@ -124,10 +125,10 @@ class DaskWorkers:
 
     def __init__(self, address: str, patience_s: float = PATIENCE_S) -> None:
         try:
-            import distributed
+            self._dask: Any = importlib.import_module("distributed")
         except ImportError:
             raise ConfigError("--scheduler needs Dask's distributed: pip install 'escape-hw[dask]'") from None
-        self._dask, self.address, self._patience = distributed, address, patience_s
+        self.address, self._patience = address, patience_s
         self._client: Any = None
         self._executor: Executor | None = None
         self._connect()
@@ -136,7 +137,7 @@ class DaskWorkers:
     def count(self) -> int:
         """Trials that run at a time: one per worker thread, at least one."""
         try:
-            return max(1, sum(self._client.nthreads().values()))
+            return max(1, int(sum(self._client.nthreads().values())))
         except (OSError, ValueError, RuntimeError, CancelledError):
             return 1
 
