@@ -83,7 +83,7 @@ def sweep(
         typer.Option("--gains", metavar="FILE", help="Optical gains: compare with and without them."),
     ] = None,
     trials: Annotated[int, typer.Option("--trials", min=2, help="Loops with drawn parameters.")] = 200,
-    frames: Annotated[int, typer.Option("--frames", min=50, help="Frames of each loop.")] = 500,
+    frames: Annotated[int, typer.Option("--frames", min=50, help="Frames of each loop.")] = 400,
     sampler: Annotated[
         str, typer.Option("--sampler", help="random (the same for every matrix), or tpe.")
     ] = "random",
@@ -109,11 +109,11 @@ def sweep(
     ] = 1.0,
     candidates: Annotated[
         int, typer.Option("--candidates", min=1, help="Parameters of each matrix that run again.")
-    ] = 4,
-    heats: Annotated[int, typer.Option("--heats", min=1, help="Stretches of air they run again on.")] = 6,
+    ] = 3,
+    heats: Annotated[int, typer.Option("--heats", min=1, help="Stretches of air they run again on.")] = 4,
     finals: Annotated[
         int, typer.Option("--finals", min=6, help="Stretches of air for the best of each matrix.")
-    ] = 24,
+    ] = 20,
     calibration_frames: Annotated[
         int | None,
         typer.Option("--calibration-frames", min=1, help="DO-CRIME frames (default: as configured)."),

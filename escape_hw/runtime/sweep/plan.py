@@ -92,9 +92,9 @@ class Design:
     """
 
     trials: int = 200
-    candidates: int = 4
-    heats: int = 6
-    finals: int = 24
+    candidates: int = 3
+    heats: int = 4
+    finals: int = 20
 
     def explored(self, arms: Sequence[Arm]) -> Iterator[Slot]:
         """Slots of the first stage: air by air, every arm on each."""

@@ -16,7 +16,7 @@ import optuna
 from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy import event
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import ArgumentError, DBAPIError
 
 from escape_hw.errors import ConfigError, StorageError
 from escape_hw.runtime.sweep.plan import EXPLORE, Arm, Slot
@@ -272,7 +272,7 @@ def _open(url: str, name: str, sampler: SlotSampler) -> optuna.Study:
         options["connect_args"] = {"timeout": 60}
     try:
         storage = optuna.storages.RDBStorage(url, engine_kwargs=options)
-    except (ImportError, ValueError) as error:
+    except (ImportError, ValueError, ArgumentError) as error:
         raise ConfigError(
             f"--storage {url}: {error}; it is of the form sqlite:////path/study.db or "
             "postgresql+psycopg://user@host/database (pip install 'escape-hw[postgresql]')"
