@@ -18,6 +18,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, next_frame, reachable
 from escape_hw.pipeline.controller import Controller
 from escape_hw.pipeline.frame_stack import FrameStack
+from escape_hw.pipeline.strehl import peak_is_clipped
 
 #: Seconds after closing during which the science frames do not count.
 CLOSING_S = 0.3
@@ -160,7 +161,7 @@ class RunningLoop:
             if self._science is not None and record.frames > self._closing:
                 image = self._science.poll()
                 if image is not None and record.frames > self._closing + 2:
-                    record.science.add(image.data)
+                    record.science.add(image.data, clipped=peak_is_clipped(image))
             if progress := report.step(residual_nm=record.residual[-1]):
                 yield progress
         return record

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from escape_hw.runtime.sweep.kept import KeptSweep
     from escape_hw.runtime.sweep.plan import Arm
     from escape_hw.runtime.sweep.result import SweepResult
-    from escape_hw.runtime.sweep.space import Parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,31 +39,6 @@ class _Request:
     storage: str | None
     study: str
     force: bool
-
-    def space(self, config: SystemConfig) -> tuple[Parameter, ...]:
-        """What is varied; on hardware everything within limits that a human has set."""
-        from escape_hw.errors import ConfigError
-        from escape_hw.runtime.sweep.space import DELAY, LOOP_KEYS, default_space, parse_parameter
-
-        given = [parse_parameter(text) for text in self.vary]
-        for one in given:
-            if "." not in one.key and one.key not in (*LOOP_KEYS, DELAY):
-                known = ", ".join((*LOOP_KEYS, DELAY))
-                raise ConfigError(f"--vary {one.key}: no key of the configuration; without a dot: {known}")
-            if one.key.partition(".")[0] in ("system", "sensor", "basis", "devices"):
-                raise ConfigError(
-                    f"--vary {one.key}: the matrices are made for one {one.key}; compare runs instead"
-                )
-            if not config.simulated and (one.key == DELAY or "." in one.key):
-                raise ConfigError(f"--vary {one.key}: on hardware only {', '.join(LOOP_KEYS)} can be varied")
-        missing = [key for key in LOOP_KEYS if key not in {one.key for one in given}]
-        if not config.simulated and missing:
-            options_ = ", ".join(f"--{'drop' if key == 'dropped_modes' else key}" for key in missing)
-            raise ConfigError(
-                f"on hardware a person sets the limits of every parameter; missing: {options_} "
-                "(LOW:HIGH, or one value that stays)"
-            )
-        return default_space(config.basis.n_modes, given)
 
 
 def sweep(
@@ -141,7 +115,9 @@ def sweep(
 ) -> None:
     """Compare matrices, each at its own best gain, leak and number of modes, on the same air."""
     with session("sweep", json=json, quiet=quiet) as one:
-        _need_optuna()
+        from escape_hw.runtime.sweep.ask import need_optuna, swept_space
+
+        need_optuna()
         loop_ranges = {"gain": gain, "leak": leak, "dropped_modes": drop, "delay": delay}
         asked = tuple(f"{key}={text}" for key, text in loop_ranges.items() if text is not None)
         request = _Request(
@@ -151,7 +127,8 @@ def sweep(
         )  # fmt: skip
         choice = options.Choice.of(_system(system, resume), set, seed, mode)
         config = one.configured(choice)
-        request.space(config)
+        if resume is None:
+            swept_space(config, request.vary)
         with one.run_folder(config, "sweep", out) as folder:
             with one.bench(choice) as bench:
                 from escape_hw.runtime.records import BenchRecord
@@ -166,19 +143,6 @@ def sweep(
                 _finish(one, folder, record, kept, result)
             if stop is not None:
                 raise stop
-
-
-def _need_optuna() -> None:
-    import importlib.util
-
-    from escape_hw.errors import ConfigError
-
-    missing = [name for name in ("optuna", "sklearn") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ConfigError(
-            "escape sweep needs Optuna and scikit-learn, which are not installed: "
-            "pip install 'escape-hw[sweep]' (in a clone: .venv/bin/pip install --editable '.[sweep]')"
-        )
 
 
 def _system(system: str | None, resume: Path | None) -> str:
@@ -207,11 +171,12 @@ def _prepared(
     import numpy as np
 
     from escape_hw.runtime.procedures import model_psf
+    from escape_hw.runtime.sweep.ask import swept_space
     from escape_hw.runtime.sweep.kept import KeptSweep
     from escape_hw.runtime.sweep.plan import Design
     from escape_hw.runtime.sweep.run import Sweep
 
-    space = request.space(config)
+    space = swept_space(config, request.vary)
     arms = tuple(_arms(one, request, config, bench, folder, record))
     psf = None
     if all("." not in parameter.key for parameter in space):

@@ -133,7 +133,7 @@ def test_random_parameters_do_not_depend_on_who_runs_what_when(opened):
 def test_tpe_learns_from_each_arm_alone(opened):
     one = opened(learn=True)
     # Merit rises with the gain on one arm and falls with it on the other.
-    plan = list(Design(trials=60).explored(ARMS))
+    plan = list(Design(trials=40).explored(ARMS))
     while True:
         one.lay_out(plan, {})
         claim = one.claim()
@@ -141,7 +141,7 @@ def test_tpe_learns_from_each_arm_alone(opened):
             break
         gain = claim.values["gain"] / 1.5
         one.finish(claim, OUTCOME, gain if claim.slot.arm == ARMS[0].label else 1 - gain)
-    late = [r for r in one.records() if r.slot.stage == EXPLORE and r.slot.index >= 18]
+    late = [r for r in one.records() if r.slot.stage == EXPLORE and r.slot.index >= 14]
     high = [r.values["gain"] for r in late if r.slot.arm == ARMS[0].label]
     low = [r.values["gain"] for r in late if r.slot.arm == ARMS[1].label]
     assert sum(high) / len(high) > 2 * sum(low) / len(low)
