@@ -15,16 +15,17 @@ from pathlib import Path
 from small_system import configuration
 
 import escape_hw
+from escape_hw.runtime.records import BenchRecord
 from escape_hw.runtime.system import System
 
 ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
 #: Short loops: a few tens of them run in some seconds.
 SHORT = (
-    "--trials", "16", "--candidates", "1", "--heats", "1", "--finals", "6", "--frames", "250", "--quiet",
+    "--trials", "12", "--candidates", "1", "--heats", "1", "--finals", "6", "--frames", "200", "--quiet",
     "--json",
 )  # fmt: skip
-#: 16 drawn, one heat and six finals of two matrices.
-LOOPS = 16 + 2 + 12
+#: 12 drawn, one heat and six finals of two matrices.
+LOOPS = 12 + 2 + 12
 
 
 def matrices(folder: Path) -> tuple[str, ...]:
@@ -34,7 +35,8 @@ def matrices(folder: Path) -> tuple[str, ...]:
     with System.from_config(config) as bench:
         for method, name in (("push-pull", "pp"), ("docrime", "dc")):
             frames = 500 if method == "docrime" else None
-            escape_hw.save_matrix(folder / f"{name}.fits", bench.calibrate(method, frames=frames))
+            found = bench.calibrate(method, frames=frames)
+            escape_hw.save_matrix(folder / f"{name}.fits", found, BenchRecord.of(bench).origin())
     ims = [str(folder / f"{name}.fits") for name in ("pp", "dc")]
     return (str(folder / "small.toml"), "--im", ims[0], "--im", ims[1], *SHORT)
 
@@ -75,10 +77,13 @@ def states(database: Path) -> dict[str, int]:
         return dict(connection.execute("select state, count(*) from trials group by state").fetchall())
 
 
-def until(ready: Callable[[], object], timeout_s: float = 120.0) -> None:
-    """Wait until something is so."""
+def until(
+    ready: Callable[[], object], timeout_s: float = 200.0, process: subprocess.Popen[str] | None = None
+) -> None:
+    """Wait until something is so; a process that ends before it is has failed."""
     deadline = time.monotonic() + timeout_s
     while not ready():
+        assert process is None or process.poll() is None, process.communicate()
         assert time.monotonic() < deadline, "it did not come so far"
         time.sleep(0.05)
 

@@ -24,11 +24,11 @@ def test_killed_workers_and_a_killed_sweep_lose_nothing(arguments, tmp_path):
     run, again = tmp_path / "run", tmp_path / "again"
     database = run / "study.db"
     first = start(*arguments, "--workers", "2", "--out", str(run))
-    until(lambda: len(finished(database)) >= 2)
+    until(lambda: len(finished(database)) >= 2, process=first)
     # A worker dies: its trials run again, and the sweep goes on by itself.
     kill(workers_of(first.pid)[0])
     seen = len(finished(database))
-    until(lambda: len(finished(database)) >= seen + 3)
+    until(lambda: len(finished(database)) >= seen + 3, process=first)
     # The sweep itself dies, and its workers end with it.
     orphans = workers_of(first.pid)
     kill(first.pid)

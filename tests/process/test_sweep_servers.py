@@ -44,11 +44,11 @@ def test_two_runners_share_a_postgresql_that_is_killed(arguments, postgres, tmp_
 
     run = tmp_path / "run"
     first = start(*arguments, "--workers", "1", "--storage", postgres.url, "--out", str(run))
-    until(lambda: done() >= 2)
+    until(lambda: done() >= 2, process=first)
     second = start(
         "--resume", str(run), "--workers", "1", "--out", str(tmp_path / "joined"), "--json", "--quiet"
     )
-    until(lambda: done() >= 6)
+    until(lambda: done() >= 6, process=second)
     before = postgres.ask(OUTCOMES)
     postgres.kill()
     postgres.start()
@@ -69,10 +69,10 @@ def test_a_sweep_outlives_its_dask_workers_and_scheduler(arguments, dask, tmp_pa
     run = tmp_path / "run"
     database = run / "study.db"
     sweep = start(*arguments, "--scheduler", dask.address, "--out", str(run))
-    until(lambda: len(finished(database)) >= 3)
+    until(lambda: len(finished(database)) >= 3, process=sweep)
     dask.workers[0].kill()
     seen = len(finished(database))
-    until(lambda: len(finished(database)) >= seen + 3)
+    until(lambda: len(finished(database)) >= seen + 3, process=sweep)
     before = finished(database)
     dask.kill_scheduler()
     dask.start()
