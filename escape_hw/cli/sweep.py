@@ -134,7 +134,11 @@ def sweep(
                 from escape_hw.runtime.records import BenchRecord
 
                 record = BenchRecord.of(bench)
-                kept = _resumed(resume) if resume else _prepared(one, request, config, bench, folder, record)
+                kept = (
+                    _resumed(resume, storage)
+                    if resume
+                    else _prepared(one, request, config, bench, folder, record)
+                )
                 if not bench.simulated:
                     result, stop = _run(one, kept, bench)
             if kept.sweep.simulated:
@@ -153,10 +157,10 @@ def _system(system: str | None, resume: Path | None) -> str:
     return str(system if resume is None else resume / "config.toml")
 
 
-def _resumed(run: Path) -> KeptSweep:
+def _resumed(run: Path, storage: str | None) -> KeptSweep:
     from escape_hw.runtime.sweep.kept import read_kept
 
-    return read_kept(run)
+    return read_kept(run, storage)
 
 
 def _prepared(

@@ -48,7 +48,7 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
-def ended(process: subprocess.Popen[str], timeout_s: float = 240.0) -> dict:
+def ended(process: subprocess.Popen[str], timeout_s: float = 280.0) -> dict:
     """The document of a command that must succeed, or fail only its own criterion."""
     out, err = process.communicate(timeout=timeout_s)
     assert process.returncode in (0, 1), err

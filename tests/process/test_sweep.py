@@ -19,6 +19,7 @@ def loops(run: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(table))
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("sweep")
 def test_killed_workers_and_a_killed_sweep_lose_nothing(arguments, tmp_path):
     run, again = tmp_path / "run", tmp_path / "again"

@@ -49,6 +49,19 @@ def test_ranges_beyond_the_configurations_are_refused():
             KeptSweep(swept, "sqlite://", "s", "random", 0.01).checked()
 
 
+def test_passwords_are_not_written(tmp_path):
+    (tmp_path / "im.fits").write_bytes(b"")
+    path = tmp_path / "im.fits"
+    arm = Arm("A", False, path, sha256_of(path))
+    space = default_space(30, [parse_parameter("gain=0.1:1")])
+    swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
+    url = "postgresql+psycopg://me:secret@host/sweeps"
+    assert "secret" not in KeptSweep(swept, url, "s", "random", 0.01).keep(tmp_path).read_text()
+    with pytest.raises(ConfigError, match="--storage"):
+        read_kept(tmp_path)
+    assert read_kept(tmp_path, url).storage == url
+
+
 def test_without_optuna_the_way_out_is_named(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"escape-hw\[sweep\]"):

@@ -10,6 +10,7 @@ from escape_hw.runtime.records import BenchRecord
 from escape_hw.runtime.sweep.document import sweep_document, trials_csv
 from escape_hw.runtime.sweep.kept import KeptSweep
 from escape_hw.runtime.sweep.result import SweepResult
+from escape_hw.runtime.sweep.store import shown
 
 TRIALS = "trials.csv"
 
@@ -37,7 +38,7 @@ def keep_sweep(
         **record.head("sweep"),
         "title": f"Matrices compared, each at its best: {record.system}",
         **sweep_document(result),
-        "storage": kept.storage,
+        "storage": shown(kept.storage),
         "study": kept.study,
         "sampler": kept.sampler,
         **record.tail(wall_seconds),

@@ -17,7 +17,7 @@ from escape_hw.runtime.sweep.plan import Arm, Design
 from escape_hw.runtime.sweep.run import METRICS, Sweep
 from escape_hw.runtime.sweep.samplers import SAMPLERS
 from escape_hw.runtime.sweep.space import parse_parameter
-from escape_hw.runtime.sweep.store import PATIENCE_S, SweepStore
+from escape_hw.runtime.sweep.store import PATIENCE_S, SweepStore, shown
 
 KEPT = "sweep.json"
 
@@ -105,7 +105,7 @@ class KeptSweep:
         arms = [{**asdict(arm), "path": str(arm.path)} for arm in sweep.arms]
         document = {
             **self.settings(), "arms": arms, "psf": sweep.psf, "simulated": sweep.simulated,
-            "storage": self.storage, "study": self.study, "margin": self.margin,
+            "storage": shown(self.storage), "study": self.study, "margin": self.margin,
         }  # fmt: skip
         path = folder / KEPT
         write_atomic(path, (dumps(document) + "\n").encode())
@@ -124,11 +124,20 @@ def _check_limits(sweep: Sweep, key: str, limits: tuple[Any, Any]) -> None:
         load_text(sweep.config, "sweep", overrides=[f"{path}={text}"])
 
 
-def read_kept(folder: Path) -> KeptSweep:
+def read_kept(folder: Path, storage: str | None = None) -> KeptSweep:
     """Read what :meth:`KeptSweep.keep` wrote.
+
+    Parameters
+    ----------
+    folder
+        Of the sweep.
+    storage
+        URL of the study, where the kept one will not do: passwords are never written.
 
     Raises
     ------
+    ConfigError
+        The storage has a password, and no URL is given.
     ProductError
         It is not there or damaged, or a matrix has gone or is another.
     """
@@ -140,6 +149,9 @@ def read_kept(folder: Path) -> KeptSweep:
         raise ProductError(f"{path}: cannot be read ({error.strerror}); is {folder} a sweep?") from error
     except (ValueError, KeyError, TypeError) as error:
         raise ProductError(f"{path}: damaged ({error})") from error
+    found = found if storage is None else replace(found, storage=storage)
+    if ":***@" in found.storage:
+        raise ConfigError(f"{path}: passwords are not kept; give the whole URL again with --storage")
     for arm in found.sweep.arms:
         if not arm.path.is_file():
             raise ProductError(f"{arm.path}: not there; the sweep compares this matrix")

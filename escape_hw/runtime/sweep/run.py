@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
@@ -214,6 +215,10 @@ def _with_workers(
     try:
         while left:
             _fill(sweep, store, workers, flight, plan, values, len(left))
+            if not flight.of:
+                # Others are at what is left.
+                time.sleep(_PATIENCE_S)
+                left = _left(store, plan)
             ended, _ = wait(flight.of, timeout=_PATIENCE_S, return_when=FIRST_COMPLETED)
             died = [future for future in ended if workers.lost(future)]
             for future in ended:
@@ -225,8 +230,6 @@ def _with_workers(
             if died:
                 _again(sweep, workers, flight)
             store.beat()
-            if not flight.of and left:
-                left = _left(store, plan)
             if report.due():
                 yield report(before + len(plan) - len(left))
     finally:

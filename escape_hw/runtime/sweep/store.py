@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import optuna
 from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy import event
+from sqlalchemy import event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
 
 from escape_hw.errors import ConfigError, StorageError
@@ -242,7 +242,7 @@ class SweepStore:
         other = [key for key in settings if known.get(key) != settings[key]]
         if other:
             raise ConfigError(
-                f"study '{self.name}' in {self.url} was begun with other settings ({', '.join(other)}); "
+                f"study '{self.name}' in {shown(self.url)} was begun with another {', '.join(other)}; "
                 "take them again, or another --study or --storage"
             )
 
@@ -256,13 +256,21 @@ class SweepStore:
                 cause = error.__cause__ if isinstance(error, StorageInternalError) else error.orig
                 if time.monotonic() + pause > deadline:
                     raise StorageError(
-                        f"the study's storage {self.url} does not answer for {self._patience:.0f} s "
+                        f"the study's storage {shown(self.url)} does not answer for {self._patience:.0f} s "
                         f"({str(cause).strip().splitlines()[0] if str(cause) else error!r}); finished trials "
                         "are kept there: bring it up again and resume"
                     ) from error
                 log.warning("the study's storage does not answer (%s); trying again", cause)
                 time.sleep(pause)
                 pause = min(2 * pause, 5.0)
+
+
+def shown(url: str) -> str:
+    """A storage's URL without its password, for messages and files."""
+    try:
+        return make_url(url).render_as_string(hide_password=True)
+    except ArgumentError:
+        return url
 
 
 def _open(url: str, name: str, sampler: SlotSampler) -> optuna.Study:
@@ -274,7 +282,7 @@ def _open(url: str, name: str, sampler: SlotSampler) -> optuna.Study:
         storage = optuna.storages.RDBStorage(url, engine_kwargs=options)
     except (ImportError, ValueError, ArgumentError) as error:
         raise ConfigError(
-            f"--storage {url}: {error}; it is of the form sqlite:////path/study.db or "
+            f"--storage {shown(url)}: {error}; it is of the form sqlite:////path/study.db or "
             "postgresql+psycopg://user@host/database (pip install 'escape-hw[postgresql]')"
         ) from error
     if url.startswith("sqlite"):

@@ -20,7 +20,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.closed_loop import closed_loop
 from escape_hw.config.load import load_text
 from escape_hw.config.models import SystemConfig
-from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
+from escape_hw.errors import CalibrationError, IncompatibleProduct
 from escape_hw.io.documents import strehl_document
 from escape_hw.runtime.procedures import model_psf
 from escape_hw.runtime.sweep.space import DELAY, overrides_of
@@ -87,26 +87,30 @@ def run_trial(task: Task) -> dict[str, Any]:
     """
     share_cores()
     with _turn, Bench.from_config(task.configured()) as bench:
-        return run(trial(bench, task))
+        try:
+            return run(trial(bench, task))
+        except CalibrationError as error:
+            return {"strehl": None, "stable": False, "diverged": True, "notes": [str(error)]}
 
 
 def trial(bench: Bench, task: Task) -> Procedure[dict[str, Any]]:
-    """The loop on an open bench; see :func:`run_trial`."""
+    """The loop on an open bench.
+
+    Raises
+    ------
+    CalibrationError
+        The matrix cannot be inverted, or the light has gone: on hardware a reason to stop.
+    """
     matrix, grid = _matrix(task.matrix, task.sha256)
     if task.psf is None:
         psf = yield from model_psf(bench)
     else:
         psf = _psf(task.psf)
     values = task.values
-    try:
-        result = yield from closed_loop(
-            bench, matrix, grid, gain=float(values["gain"]), leak=float(values["leak"]),
-            dropped_modes=int(values["dropped_modes"]), frames=task.frames, model_psf=psf, stage="trial",
-        )  # fmt: skip
-    except (IncompatibleProduct, ConfigError):
-        raise
-    except CalibrationError as error:
-        return {"strehl": None, "stable": False, "diverged": True, "notes": [str(error)]}
+    result = yield from closed_loop(
+        bench, matrix, grid, gain=float(values["gain"]), leak=float(values["leak"]),
+        dropped_modes=int(values["dropped_modes"]), frames=task.frames, model_psf=psf, stage="trial",
+    )  # fmt: skip
     return outcome(result)
 
 
