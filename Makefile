@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 # One thread per process: two test processes whose linear algebra also starts threads slow each other down.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: help run test check perf clean
+.PHONY: help run test check docs perf clean
 
 help: ## List the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
@@ -28,6 +28,10 @@ check: $(VENV)/dev.stamp ## Check style, types and layers
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(VENV)/docs.stamp ## Build the documentation into docs/_build
+	$(BIN)/python -m sphinx -W -q -b html docs docs/_build
+	@echo docs/_build/index.html
 
 perf: $(VENV)/bench.stamp ## Measure speed against OOPAO and pyRTC
 	$(BIN)/escape perf $(ARGS)

@@ -2,7 +2,9 @@
 
     python benchmarks/sky_time.py --plants 20 --frames 220 300 500 1000 10000 --out docs/figures
 
-Writes ``sky-time.json`` and ``sky-time.png``. Twenty plants take about ten minutes on two cores.
+Writes ``sky-time.json`` and ``sky-time.png``, with the system's name behind for any but ``razor-shwfs``.
+Twenty plants take about ten minutes on two cores; on a pyramid (``--system razor-pywfs``) the goal is that of
+its own sub-apertures, pixels of the pupil image.
 ``--curves FILE`` draws curves that were measured before, from ``escape reproduce sky-time --json``.
 """
 
@@ -45,8 +47,9 @@ def main() -> None:
     else:
         curves = measure(options.system, options.plants, options.frames, options.workers)
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "sky-time.json").write_text(json.dumps(curves, indent=1) + "\n")
-    error_curves(curves).savefig(options.out / "sky-time.png", dpi=110)
+    name = "sky-time" if options.system == "razor-shwfs" else f"sky-time-{options.system}"
+    (options.out / f"{name}.json").write_text(json.dumps(curves, indent=1) + "\n")
+    error_curves(curves).savefig(options.out / f"{name}.png", dpi=110)
     print(f"\nfewest frames that meet the goal: {curves['fewest_frames']}; curves in {options.out}")
 
 

@@ -17,6 +17,7 @@ from escape_hw.api.model import SyntheticModel
 from escape_hw.api.modulator import TipTiltModulator
 from escape_hw.api.screen import PhaseScreen
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.api.taps import Taps, harmless
 from escape_hw.api.threads import hold_to_one_thread
 from escape_hw.config.device_models import DeviceConfig
 from escape_hw.config.models import SystemConfig
@@ -71,6 +72,7 @@ class Bench:
         self.modulator = modulator
         self.dark: NDArray[np.float32] | None = None
         self.flat: NDArray[np.float32] | None = None
+        self._taps = Taps()
         self._threads: threadpool_limits | None = None
         stream = zlib.crc32(b"escape_hw.bench")
         self.rng = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(stream,)))
@@ -101,6 +103,29 @@ class Bench:
         kind = "simulated" if self.simulated else "hardware"
         state = "open" if self.is_open else "closed"
         return f"<{type(self).__name__} {self.config.system.name}, {kind}, {state}>"
+
+    @property
+    def taps(self) -> Taps:
+        """Who is told of frames, slopes and commands; nobody unless set.
+
+        One that raises is dropped, and the log says so. Set them before anything runs: slopes and loops
+        look for theirs when they are made.
+        """
+        return self._taps
+
+    @taps.setter
+    def taps(self, taps: Taps) -> None:
+        self._taps = Taps(
+            harmless("frames", taps.frame),
+            harmless("science frames", taps.science),
+            harmless("slopes", taps.slopes),
+            harmless("commands", taps.command),
+            harmless("residuals", taps.residual),
+            harmless("geometries", taps.geometry),
+        )
+        self.wfs.tap, self.dm.tap = self._taps.frame, self._taps.command
+        if self.science is not None:
+            self.science.tap = self._taps.science
 
     @property
     def devices(self) -> tuple[Device, ...]:

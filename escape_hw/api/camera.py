@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
+from collections.abc import Callable
 from dataclasses import astuple
 from typing import final
 
@@ -19,10 +20,16 @@ class Camera(Device):
 
     Drivers fill in ``_open``, ``_close``, ``_check``, ``_configure``, ``_start``, ``_stop`` and
     ``_next_frame``.
+
+    Attributes
+    ----------
+    tap
+        Told of every frame, see :class:`~escape_hw.api.taps.Taps`.
     """
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
+        self.tap: Callable[[Frame], object] | None = None
         self._running = False
         self._delivered = self._lost = self._timeouts = 0
         self._last_index: int | None = None
@@ -176,7 +183,14 @@ class Camera(Device):
             self._lost += frame.index - self._last_index - 1
         self._last_index = frame.index
         self._delivered += 1
+        if self.tap is not None:
+            self.tap(frame)
         return frame
+
+    @property
+    def last_index(self) -> int:
+        """Index of the newest frame since ``start``; -1 before the first."""
+        return -1 if self._last_index is None else self._last_index
 
     def status(self) -> FrameStatus:
         """Counters since ``start``."""

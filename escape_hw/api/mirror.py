@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -69,6 +70,11 @@ class DeformableMirror(Device):
     ``send`` is final: every command passes the :class:`~escape_hw.safety.guard.CommandGuard`.
     Drivers fill in ``_open``, ``_close``, ``_send`` and set ``info`` in ``_open``. Closing ramps
     to the flat shape first. The counters count from ``open``.
+
+    Attributes
+    ----------
+    tap
+        Told of every shape that was sent, see :class:`~escape_hw.api.taps.Taps`.
     """
 
     #: Largest step of the ramp that ``flatten`` uses, fraction of full stroke.
@@ -80,6 +86,7 @@ class DeformableMirror(Device):
         self.sent_count = 0
         self.clipped_count = 0
         self.rejected_count = 0
+        self.tap: Callable[[NDArray[np.float64]], object] | None = None
         self._flat: NDArray[np.float64] | None = None
         self._guard: CommandGuard | None = None
         self._shape_known = False
@@ -151,6 +158,8 @@ class DeformableMirror(Device):
             self._shape_known = True
             self.sent_count += 1
             self.clipped_count += report.clipped
+            if self.tap is not None:
+                self.tap(shape)
             return SendReport(shape, self.now_ns(), report, kept is not None)
 
     @final

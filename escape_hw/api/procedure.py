@@ -41,7 +41,10 @@ class Progress:
     metrics
         Scalars worth watching.
     arrays
-        Small arrays worth plotting (decimated).
+        Arrays worth plotting that change a few times a second at most: ``matrix``, ``matrix_sigma``,
+        ``valid``, ``registration``, ``registration_sigma``, ``step_norm``, ``registration_track``, ``gains``,
+        ``gains_sigma``, ``gains_smooth``, ``gains_rounds``, ``residual``. In a matrix, modes that were
+        not measured yet are NaN.
     """
 
     stage: str
@@ -99,11 +102,18 @@ class Reporter:
         """True when the next progress may be yielded."""
         return time.monotonic() >= self._next
 
-    def __call__(self, done: int, **metrics: float) -> Progress:
+    def now(self, arrays: Mapping[str, NDArray[np.float32]], **metrics: float) -> Progress:
+        """The progress after the steps counted so far, with arrays to show."""
+        return self(self._done, arrays, **metrics)
+
+    def __call__(
+        self, done: int, arrays: Mapping[str, NDArray[np.float32]] | None = None, /, **metrics: float
+    ) -> Progress:
         """The progress to yield now."""
         now = time.monotonic()
         self._next = now + self.PERIOD_S
-        return Progress(self.stage, done, self.total, self.unit, now - self._start, metrics)
+        elapsed = now - self._start
+        return Progress(self.stage, done, self.total, self.unit, elapsed, metrics, arrays or {})
 
 
 def run(

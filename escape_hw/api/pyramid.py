@@ -58,6 +58,13 @@ class PyramidPupils(SensorGeometry):
     centre_sigma_px
         Standard error of the mean of the four centres along an axis; 0 if unknown. A mirror's shift
         counts from there.
+    pokes
+        Rms surface over the pupil of the random pokes during the measurement, all modes together, as
+        fraction of full stroke: what the sensor answers depends on them as it does on the turbulence.
+    looks
+        Independent states of the air that the measurement saw; 0 if unknown.
+    steady
+        Share of the slopes' variance that is still there two frames later: the air's, not the pokes'.
     """
 
     kind: ClassVar[str] = "pyramid"
@@ -80,14 +87,19 @@ class PyramidPupils(SensorGeometry):
     normalisation: str = "global"
     modulation: float = 0.0
     centre_sigma_px: float = 0.0
+    pokes: float = 0.0
+    looks: float = 0.0
+    steady: float = 0.0
 
     def with_background(self, counts: float) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_background`."""
         return replace(self, background=counts)
 
-    def with_motion(self, rms: float) -> PyramidPupils:
+    def with_motion(
+        self, rms: float, pokes: float = 0.0, looks: float = 0.0, steady: float = 0.0
+    ) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_motion`."""
-        return replace(self, motion=rms)
+        return replace(self, motion=rms, pokes=pokes, looks=looks, steady=steady)
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_mean_slopes`; of the mean only what is not smooth counts."""

@@ -17,6 +17,8 @@ UNITS = {
     "radial_scaling": "% of the diameter",
     "tangential_scaling": "% of the diameter",
 }
+#: From these units to sub-apertures, radians and shares of the diameter, ``(5,)``: the units of streams.
+TO_PLAIN = np.array([0.01, 0.01, np.pi / 180, 0.01, 0.01])
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,13 +69,19 @@ class SensorGeometry(abc.ABC):
         """The geometry with the background level that was subtracted."""
 
     @abc.abstractmethod
-    def with_motion(self, rms: float) -> Self:
+    def with_motion(self, rms: float, pokes: float = 0.0, looks: float = 0.0, steady: float = 0.0) -> Self:
         """The geometry with the motion that a measurement saw.
 
         Parameters
         ----------
         rms
             Rms over time of the slopes, in their unit.
+        pokes
+            Rms surface of the mirror's random pokes, all modes together, as fraction of full stroke.
+        looks
+            Independent states of the slopes that were seen; 0 if unknown.
+        steady
+            Share of the slopes' variance that is still there two frames later; 0 if unknown.
         """
 
     @abc.abstractmethod
@@ -178,7 +184,9 @@ class SubApertureGrid(SensorGeometry):
         """See :meth:`SensorGeometry.with_background`."""
         return replace(self, background=counts)
 
-    def with_motion(self, rms: float) -> SubApertureGrid:
+    def with_motion(
+        self, rms: float, pokes: float = 0.0, looks: float = 0.0, steady: float = 0.0
+    ) -> SubApertureGrid:
         """See :meth:`SensorGeometry.with_motion`; the spots move more than the slopes say."""
         return replace(self, motion_px=MOTION_FACTOR * rms)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,10 @@ from escape_hw.errors import CalibrationError, ConfigError
 DARK_FRAMES = 25
 #: ... and dark is a sub-aperture with less than this share of its usual light.
 DARK_SHARE = 0.02
+#: Frames after which a poke is gone from the slopes, and the air is not.
+_LATER = 2
+#: Blocks of a run at most whose means tell how fast slopes forget; half as many at least.
+_BLOCKS = 8
 
 
 def some_frames(frames: int, name: str = "frames") -> int:
@@ -67,19 +73,35 @@ class LightWatch:
 
 
 class Motion:
-    """Running mean and rms of the slopes."""
+    """Running mean, rms and correlation over time of the slopes, and the rms of the pokes beside them."""
 
     def __init__(self, n_slopes: int) -> None:
         self.n_slopes = n_slopes
         self._n = 0
         self._sum = np.zeros(n_slopes)
         self._squares = np.zeros(n_slopes)
+        self._pokes = self._later = 0.0
+        self._pairs = 0
+        self._past: deque[NDArray[np.float32]] = deque(maxlen=_LATER)
+        self._blocks, self._length = [np.zeros(n_slopes)], 1
 
-    def add(self, slopes: NDArray[np.float32]) -> None:
-        """Take the slopes of one frame ``(n_slopes,)``."""
+    def add(self, slopes: NDArray[np.float32], poke: NDArray[np.float64] | None = None) -> None:
+        """Take the slopes of one frame ``(n_slopes,)``, and the poke in modes of unit rms surface."""
+        if self._n == self._length * len(self._blocks):
+            if len(self._blocks) == _BLOCKS:
+                self._blocks = [a + b for a, b in zip(self._blocks[::2], self._blocks[1::2], strict=True)]
+                self._length *= 2
+            self._blocks.append(np.zeros(self.n_slopes))
+        self._blocks[-1] += slopes
+        if len(self._past) == _LATER:
+            self._later += float(self._past[0] @ slopes)
+            self._pairs += 1
+        self._past.append(slopes.copy())
         self._n += 1
         self._sum += slopes
         self._squares += np.square(slopes, dtype=np.float64)
+        if poke is not None:
+            self._pokes += float(poke @ poke)
 
     def extend(self, slopes: NDArray[np.float32]) -> None:
         """Take the slopes of many frames ``(n, n_slopes)``."""
@@ -88,19 +110,49 @@ class Motion:
         self._squares += np.einsum("ts,ts->s", slopes, slopes, dtype=np.float64)
 
     def state(self) -> NDArray[np.float64]:
-        """Sums and sums of squares with the number of frames behind them ``(3, n_slopes)``."""
-        return np.stack([self._sum, self._squares, np.full(self.n_slopes, float(self._n))])
+        """All sums with the number of frames behind them ``(7 + blocks, n_slopes)``."""
+        numbers = (float(self._n), self._pokes, self._later, float(self._pairs), float(self._length))
+        rows = (np.full(self.n_slopes, number) for number in numbers)
+        return np.stack([self._sum, self._squares, *rows, *self._blocks])
 
     def restore(self, state: NDArray[np.float64]) -> None:
         """Go on from what :meth:`state` gave."""
         self._sum, self._squares, self._n = state[0].copy(), state[1].copy(), int(state[2, 0])
+        self._pokes, self._later = float(state[3, 0]), float(state[4, 0])
+        self._pairs, self._length = int(state[5, 0]), int(state[6, 0])
+        self._blocks = [row.copy() for row in state[7:]]
+        self._past.clear()
 
     def of(self, grid: SensorGeometry) -> SensorGeometry:
         """The geometry with the motion filled in."""
         if self._n < 2:
             return grid
-        variance = np.maximum(self._squares / self._n - np.square(self._sum / self._n), 0).mean()
-        return grid.with_motion(float(np.sqrt(variance)))
+        variance = float(np.maximum(self._squares / self._n - np.square(self._sum / self._n), 0).mean())
+        return grid.with_motion(
+            float(np.sqrt(variance)),
+            float(np.sqrt(self._pokes / self._n)),
+            self._looks(variance),
+            self._steady(variance),
+        )
+
+    def _steady(self, variance: float) -> float:
+        """Correlation of the slopes with those :data:`_LATER` frames later, between 0 and 1."""
+        if not self._pairs or not variance > 0:
+            return 0.0
+        mean = float(np.square(self._sum / self._n).sum())
+        return float(np.clip((self._later / self._pairs - mean) / (variance * self.n_slopes), 0.0, 1.0))
+
+    def _looks(self, variance: float) -> float:
+        """Independent states of the slopes seen so far: by how much means over blocks vary less.
+
+        The variance of a mean over ``L`` frames is ``variance * tau / L`` with the integral of the
+        correlation ``tau``, once ``L`` exceeds it.
+        """
+        whole = self._blocks[: self._n // self._length]
+        if len(whole) < _BLOCKS // 2 or not variance > 0:
+            return 0.0
+        between = float(np.var(np.stack(whole) / self._length, axis=0, ddof=1).mean())
+        return self._n / max(self._length * between / variance, 1.0)
 
     def references(self, grid: SensorGeometry, focus: MeanFocus | None = None) -> SensorGeometry:
         """The geometry with the references that all frames of a run give, instead of its first ones.

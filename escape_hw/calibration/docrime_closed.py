@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.procedure import Procedure, Progress, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
@@ -27,6 +29,7 @@ from escape_hw.calibration.docrime import (
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
 from escape_hw.calibration.loop_run import CLOSING_S, LoopRecord, RunningLoop
 from escape_hw.calibration.poke_patterns import Pattern, RandomPokes, random_pattern
+from escape_hw.calibration.preview import Preview
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, random_amplitudes
 from escape_hw.calibration.stopping import Judge, Looks, Target
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
@@ -63,6 +66,8 @@ class ClosedLoopPokes:
         control = integrator_for(bench, matrix, grid)
         self._loop = RunningLoop(bench, matrix.m2c, extractor(bench, grid), control)
         self._enough = self._stopped = False
+        self._preview = Preview(matrix.n_modes, lambda: grid)
+        self._picture: Mapping[str, NDArray[np.float32]] = {}
         self._beside = BackgroundEstimator(estimator, patient=bench.simulated, look=self._look)
 
     @property
@@ -110,7 +115,9 @@ class ClosedLoopPokes:
                     done, report = self._estimator.taken, Reporter(stage, frames)
                     while done < frames and not self._enough and not loop.record.diverged:
                         stretch = min(_STRETCH, frames - done)
-                        yield from loop.run(stretch, inject=pokes, observe=(beside,), report=report)
+                        yield from self._shown(
+                            loop.run(stretch, inject=pokes, observe=(beside,), report=report)
+                        )
                         done += stretch
                         beside.catch_up()
                 except Aborted:
@@ -125,8 +132,16 @@ class ClosedLoopPokes:
             self._kept_and_judged(always=True)
         return partial
 
+    def _shown(self, steps: Procedure[LoopRecord]) -> Iterator[Progress]:
+        """Progress of the loop with the newest picture of the matrix."""
+        for step in steps:
+            picture, self._picture = self._picture, {}
+            yield replace(step, arrays={**step.arrays, **picture}) if picture else step
+
     def _look(self, estimator: DocrimeEstimator) -> None:
-        """Keep the state and judge the estimate, as far as either is due; in the estimator's thread."""
+        """Show, keep and judge the estimate, as far as it is due; in the estimator's thread."""
+        if self._preview.due():
+            self._picture = self._preview(estimator.preview)
         if not self._enough and not self._stopped and self._looks.due(estimator.taken):
             self._enough = self._kept_and_judged()
 

@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.results import TemporalResponse
-from escape_hw.calibration.docrime_fit import MIN_FREEDOM, empty_sums, first_fit, require_excitation
+from escape_hw.calibration.docrime_fit import (
+    MIN_FREEDOM,
+    empty_sums,
+    first_fit,
+    quick_look,
+    require_excitation,
+)
 from escape_hw.calibration.docrime_solution import DocrimeSolution
 from escape_hw.calibration.response import ResponseTracker, covariances, filtered
 from escape_hw.calibration.significance import require_response
@@ -307,6 +313,15 @@ class DocrimeEstimator:
             self.lost_frames,
             self._tracker.gain_sigma(),
         )
+
+    def preview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Matrix and standard errors by the frames summed so far, for those who watch; ``None``: too few.
+
+        It changes nothing: a run ends with the same numbers whether it is watched or not.
+        """
+        if self._tracker is None:
+            return None
+        return quick_look(self._sums, self._tracker.scale(), self.lags, self._spread)
 
     def _absorb(self) -> None:
         """Move the gathered frames into the sums; fit the filter first if there is none yet."""

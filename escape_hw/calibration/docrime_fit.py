@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,3 +136,35 @@ def require_excitation(gram: NDArray[np.floating]) -> None:
         raise CalibrationError(
             "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
         )
+
+
+def quick_look(
+    sums: RegressionSums, scale: NDArray[np.float64], lags: int, spread: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Matrix and standard errors ``(n_slopes, n_modes)`` without tests, correlations or a change of the sums.
+
+    Parameters
+    ----------
+    sums
+        Of a run that goes on.
+    scale
+        Factors on the columns ``(n_modes,)``.
+    lags, spread
+        Frames of the temporal response, and factor on the variance.
+
+    Returns
+    -------
+    tuple or None
+        ``None``: too few frames, or pokes that do not span the modes yet.
+    """
+    if sums.count < scale.size + lags + MIN_FREEDOM:
+        return None
+    power = sums.power if sums.power.ndim == 1 else np.diag(sums.power).copy()
+    about = replace(sums, power=power).centred()
+    try:
+        matrix, unit = about.solve(), about.inverse_diagonal()
+    except np.linalg.LinAlgError:
+        return None
+    variance = np.maximum(about.residual_power(matrix) / max(about.freedom() - lags, 1.0), 0.0)
+    sigma = np.outer(np.sqrt(variance * spread), np.sqrt(np.maximum(unit, 0.0)) * np.abs(scale))
+    return matrix * scale, sigma

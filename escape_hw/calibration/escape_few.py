@@ -67,8 +67,9 @@ def escape_from_few(
     record = session.record()
     if record is None or session.grid is None or session.motion is None:
         raise RuntimeError("no frame was taken")
-    # The geometry was found on these very frames, so its lattice is where their mean spots stand.
-    found = session.motion.of(session.grid)
+    # The geometry was found on these very frames, so its lattice is where their mean spots stand. Images of
+    # the pupil have places of their own, which all frames tell best.
+    found = session.finished_grid() if session.long_look else session.motion.of(session.grid)
     shape = (found.n_slopes, m2c.shape[1])
     frame = measured_matrix(bench, found, m2c, np.zeros(shape), np.zeros(shape), "telemetry")
     fit = yield from telemetry_sprint(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.gains import ClosureStep, GainRound, GainsResult, OpticalGains
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.procedure import Procedure
+from escape_hw.api.procedure import Procedure, Progress
 from escape_hw.api.results import CalibrationResult, StrehlEstimate
 from escape_hw.bench import Bench
 from escape_hw.calibration.first_closure import close_first
@@ -161,6 +161,7 @@ def _closed(loop: GainLoop, wanted: float, poke: float, state: _State) -> Proced
     state.applied = _smooth(closure.gains, 0)
     state.gain = wanted
     _apply(loop, state)
+    yield _shown(state)
 
 
 def _apply(loop: GainLoop, state: _State) -> None:
@@ -210,9 +211,23 @@ def _rounds(
             continue
         state.beside = {name: _smooth(stretch.gains, k + 1) for k, name in enumerate(others)}
         _book(loop, stretch, stretch.gains, amplitude, asked, model_psf, state)
+        yield _shown(state)
         state.converged = last and _agrees(state.rounds[-1])
         repeats += last
         size = max(poke, size * _LESS)
+
+
+def _shown(state: _State) -> Progress:
+    """The gains so far, round by round."""
+    gains, rounds = state.applied, state.rounds
+    if gains is None:
+        raise RuntimeError("no gains were measured yet")
+    arrays = {"gains": gains.value, "gains_sigma": gains.sigma, "gains_smooth": gains.trend}
+    if rounds:
+        arrays["gains_rounds"] = np.stack([one.gains.best for one in rounds])
+    count = len(rounds)
+    shown = {name: array.astype(np.float32) for name, array in arrays.items()}
+    return Progress("optical gains", count, max(count, 1), "round", arrays=shown)
 
 
 def _accurate(measured: MeasuredGains, asked: float) -> bool:

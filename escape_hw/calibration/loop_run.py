@@ -19,6 +19,7 @@ from escape_hw.calibration.acquire import LightWatch, next_frame, reachable
 from escape_hw.pipeline.controller import Controller
 from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.strehl import peak_is_clipped
+from escape_hw.streams.loop_timing import LoopTiming
 
 #: Seconds after closing during which the science frames do not count.
 CLOSING_S = 0.3
@@ -34,6 +35,14 @@ Injection = Callable[[], NDArray[np.float64]]
 #: the poke in it ``(n_modes,)``, float64, zeros without one. Both were sent after that frame had arrived.
 #: The arrays are used again; what is to be kept must be copied.
 LoopObserver = Callable[[int, NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]], object]
+
+
+#: Residuals that a progress report shows.
+_SHOWN = 500
+
+
+def _newest(residual: array[float]) -> NDArray[np.float32]:
+    return np.array(residual[-_SHOWN:], np.float32)
 
 
 @dataclass(slots=True, eq=False)
@@ -91,6 +100,8 @@ class RunningLoop:
     ----------
     record
         What all stretches gathered so far, also when one of them was aborted.
+    timing
+        Latencies and the spacing of frames since the loop was made.
     """
 
     def __init__(
@@ -103,6 +114,7 @@ class RunningLoop:
         science: bool = False,
     ) -> None:
         self.bench, self.control, self.slopes_of, self.record = bench, control, slopes_of, LoopRecord()
+        self.timing = LoopTiming()
         self._m2c, self._to_modes = np.ascontiguousarray(m2c), np.linalg.pinv(m2c)
         self._light = LightWatch(bench.wfs.name, slopes_of.grid)
         self._science = bench.science if science else None
@@ -114,6 +126,8 @@ class RunningLoop:
         self._shape = np.zeros(m2c.shape[0])
         self._none.flags.writeable = False
         self._saturated = 0
+        self._tap = bench.taps.residual
+        self._residual_nm = np.zeros(m2c.shape[1], np.float32)
 
     def run(
         self,
@@ -162,8 +176,8 @@ class RunningLoop:
                 image = self._science.poll()
                 if image is not None and record.frames > self._closing + 2:
                     record.science.add(image.data, clipped=peak_is_clipped(image))
-            if progress := report.step(residual_nm=record.residual[-1]):
-                yield progress
+            if report.step():
+                yield report.now({"residual": _newest(record.residual)}, residual_nm=record.residual[-1])
         return record
 
     def _answer(self, frame: Frame, poke: NDArray[np.float64], whole: bool) -> None:
@@ -173,7 +187,9 @@ class RunningLoop:
         np.add(self.control(self._slopes), poke, out=self._total)
         shape = np.dot(self._m2c, self._total, out=self._shape)
         sent, over = self._sent(shape, whole)
-        record.latency.append(time.perf_counter_ns() - began)
+        ended = time.perf_counter_ns()
+        record.latency.append(ended - began)
+        self.timing.add(began, ended)
         self._light(self.slopes_of.flux)
         if over is not None:
             record.shortened += 1
@@ -183,7 +199,10 @@ class RunningLoop:
         record.diverged = self._saturated >= _SATURATED_FRAMES
         record.frames, record.last, record.command = record.frames + 1, frame, sent.sent
         residual = self.control.residual
-        record.residual.append(self._nm * float(np.sqrt(residual.dot(residual))))
+        rms = self._nm * float(np.sqrt(residual.dot(residual)))
+        record.residual.append(rms)
+        if self._tap is not None:
+            self._tap(frame.index, np.multiply(residual, self._nm, out=self._residual_nm), rms)
 
     def _sent(self, shape: NDArray[np.float64], whole: bool) -> tuple[SendReport, int | None]:
         """What was sent, and how many actuators were asked beyond the stroke if it was not the shape."""

@@ -15,6 +15,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix, next_frame, some_frames
 from escape_hw.calibration.checkpoint import Checkpoint
 from escape_hw.calibration.demodulation import Lines, find_delay, find_lines, line_frequencies, matrix_from
+from escape_hw.calibration.preview import Preview
 from escape_hw.calibration.sensor_setup import extractor, modal_basis, poke_amplitudes, ready_sensor
 from escape_hw.calibration.stepwise import ROUNDS, StepwiseRun
 from escape_hw.calibration.stopping import Target, no_accuracy
@@ -94,10 +95,12 @@ def modulated(
         run = _Run(bench, extractor(bench, grid), report, mean_frame, keep, frames=n_frames)
         if state is not None:
             run.restore(state)
-        partial = False
+        partial, preview = False, Preview(n_modes, lambda: grid)
         try:
             for modes in batches[len(run.found) :]:
                 yield from run.measure(m2c[:, modes], amplitude[modes], until)
+                if preview.due():
+                    yield report.now(preview(lambda: run.so_far(c.lags)))
         except Aborted:
             run.kept(always=True)
             if not run.found:
@@ -105,8 +108,7 @@ def modulated(
             partial = True
     finally:
         bench.dm.flatten()
-    found = run.found
-    lines = _joined(found)
+    lines = _joined(run.found)
     delay, error = find_delay(lines, c.lags - 1)
     data, sigma = matrix_from(lines, delay)
     if np.mean(np.square(data / np.maximum(sigma, 1e-300))) < _LEAST_POWER:
@@ -114,7 +116,7 @@ def modulated(
     delivered, lost = run.counts()
     matrix = measured_matrix(
         bench, grid, m2c[:, : data.shape[1]], data, sigma, "modulated",
-        frames=delivered, lost_frames=lost, poke=float(amplitude.max()), batches=len(found),
+        frames=delivered, lost_frames=lost, poke=float(amplitude.max()), batches=len(run.found),
         delay_frames=delay, delay_sigma=error,
     )  # fmt: skip
     return CalibrationResult(
@@ -155,6 +157,11 @@ class _Run(StepwiseRun):
                 break
         self.found.append(lines)
         self.kept()
+
+    def so_far(self, lags: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Matrix and standard errors of the batches driven ``(n_slopes, n)``."""
+        lines = _joined(self.found)
+        return matrix_from(lines, find_delay(lines, lags - 1)[0])
 
     def kept(self, *, always: bool = False) -> None:
         """Keep the state if it is time."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +17,7 @@ from escape_hw.calibration.acquire import LightWatch, Motion, next_frame, reacha
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
 from escape_hw.calibration.loop_run import Injection
 from escape_hw.calibration.mean_focus import MeanFocus
+from escape_hw.calibration.preview import Preview
 from escape_hw.calibration.sensor_kinds import kind_of
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, refined, setup_from_frames
 from escape_hw.calibration.stopping import Looks
@@ -95,7 +96,7 @@ class PokeSession:
         """
         bench, to_modes = self.bench, np.linalg.pinv(self.m2c)
         self.planned = frames
-        report = Reporter(stage, frames)
+        report, preview = Reporter(stage, frames), Preview(self.m2c.shape[1], lambda: self.grid)
         try:
             bench.dm.flatten()
             prepare_sensor(bench)
@@ -110,13 +111,19 @@ class PokeSession:
                     if self.looks is not None and self.looks.due(self.fed) and (yield from self._look_at()):
                         return False
                     if report.due():
-                        yield report(done + 1, shortened=float(self.shortened))
+                        yield report(done + 1, self._picture(preview), shortened=float(self.shortened))
             except Aborted:
                 yield from self._look_at(last=True)
                 return True
         finally:
             bench.dm.flatten()
         return False
+
+    def _picture(self, preview: Preview) -> Mapping[str, NDArray[np.float32]] | None:
+        """The matrix so far, when it is time to show it."""
+        if self.estimator is None or not preview.due():
+            return None
+        return preview(self.estimator.preview)
 
     def _look_at(self, last: bool = False) -> Procedure[bool]:
         """Keep the state and judge the estimate, as far as either is due."""
@@ -215,7 +222,7 @@ class PokeSession:
             raise RuntimeError("frames were fed before the sensor was set up")
         slopes = self.slopes_of(frame.data)
         self.light(self.slopes_of.flux)
-        self.motion.add(slopes)
+        self.motion.add(slopes, poke)
         if self.focus is not None:
             self.focus.add(slopes)
         if self.long_look:

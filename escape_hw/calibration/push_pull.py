@@ -14,6 +14,7 @@ from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, go_to, measured_matrix, next_frame, some_frames
 from escape_hw.calibration.checkpoint import Checkpoint
+from escape_hw.calibration.preview import Preview
 from escape_hw.calibration.sensor_kinds import kind_of
 from escape_hw.calibration.sensor_setup import extractor, modal_basis, poke_amplitudes, ready_sensor
 from escape_hw.calibration.stepwise import ROUNDS, StepwiseRun
@@ -119,10 +120,12 @@ def push_pull(
         run = _Run(bench, slopes_of, report, mean_frame, keep, skip=skip, frames=n_frames)
         if state is not None:
             run.restore(state)
-        partial = False
+        partial, preview = False, Preview(m2c.shape[1], lambda: grid)
         try:
             for mode in range(len(run.columns), m2c.shape[1]):
                 yield from run.measure(m2c[:, mode], amplitude[mode], until)
+                if preview.due():
+                    yield report.now(preview(run.so_far))
         except Aborted:
             run.kept(always=True)
             if not run.columns:
@@ -131,9 +134,10 @@ def push_pull(
     finally:
         bench.dm.flatten()
     delivered, lost = run.counts()
+    data, sigma = run.so_far()
     matrix = measured_matrix(
-        bench, grid, m2c[:, : len(run.columns)], np.stack(run.columns, 1), np.stack(run.errors, 1),
-        "push-pull", frames=delivered, lost_frames=lost, poke=float(poke), settling_frames=skip,
+        bench, grid, m2c[:, : data.shape[1]], data, sigma, "push-pull",
+        frames=delivered, lost_frames=lost, poke=float(poke), settling_frames=skip,
     )  # fmt: skip
     return CalibrationResult(
         matrix, run.motion.of(grid), delivered, lost,
@@ -169,6 +173,10 @@ class _Run(StepwiseRun):
         self.columns.append(column)
         self.errors.append(error)
         self.kept()
+
+    def so_far(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Columns and their standard errors ``(n_slopes, n)``."""
+        return np.stack(self.columns, 1), np.stack(self.errors, 1)
 
     def kept(self, *, always: bool = False) -> None:
         """Keep the state if it is time."""

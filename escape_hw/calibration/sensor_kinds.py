@@ -18,6 +18,7 @@ from escape_hw.bench import Bench
 from escape_hw.config.sensor_models import PyramidSection, ShackHartmannSection
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.pipeline.grid import find_grid
+from escape_hw.pipeline.obscuration import shadow_of
 from escape_hw.pipeline.pyramid_pupils import find_pupils, refine_pupils
 from escape_hw.pipeline.pyramid_slopes import PyramidSlopes
 from escape_hw.pipeline.slopes import SlopeExtractor
@@ -55,7 +56,9 @@ class SensorKind(Protocol):
         """The geometry on a calibrated mean frame; ``references`` is ``"design"`` or ``"mean"``."""
         ...
 
-    def refined(self, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]) -> SensorGeometry:
+    def refined(
+        self, bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]
+    ) -> SensorGeometry:
         """The geometry, better known by calibrated mean frames of a run's parts; its slopes stay the same."""
         ...
 
@@ -94,7 +97,9 @@ class _ShackHartmann:
             references="lattice" if references == "design" else references,
         )
 
-    def refined(self, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]) -> SensorGeometry:
+    def refined(
+        self, bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]
+    ) -> SensorGeometry:
         """As it is: the mean slopes of the run already tell all that its mean frame does."""
         return grid
 
@@ -151,9 +156,11 @@ class _Pyramid:
             references=references,
         )
 
-    def refined(self, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]) -> PyramidPupils:
-        """Rims on the mean of the whole run: turbulence averages out."""
-        return refine_pupils(means, of_kind(grid, PyramidPupils))
+    def refined(
+        self, bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]
+    ) -> PyramidPupils:
+        """Rims and shadow on the mean of the whole run: turbulence averages out."""
+        return refine_pupils(means, of_kind(grid, PyramidPupils), shadow_of(bench.config.telescope))
 
     def extractor(
         self, bench: Bench, grid: SensorGeometry, shape: tuple[int, int], dark: NDArray[np.float32]

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.camera import Camera
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import some_frames
+from escape_hw.calibration.basis import configured_basis
 from escape_hw.calibration.derivatives import modal_matrix
-from escape_hw.calibration.mode_shapes import fourier, zernike
-from escape_hw.calibration.modes import karhunen_loeve, unit_rms, zonal
 from escape_hw.calibration.pokes import equal_snr
 from escape_hw.calibration.sensor_kinds import kind_of
 from escape_hw.errors import CalibrationError, ConfigError
 
 #: Frames whose mean the grid is found on.
 SETUP_FRAMES = 200
-#: Outer scale of the turbulence assumed for the modal basis, in pupil diameters.
-_OUTER_SCALE = 4.0
-#: Bases that need nothing but the influence functions.
-_OF_SURFACES = {"zonal": zonal, "zernike": zernike, "fourier": fourier}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +65,7 @@ def setup_from_frames(
 
 def refined(bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]) -> SensorGeometry:
     """A geometry, better known by the mean raw frames of a run's parts."""
-    return kind_of(bench).refined(grid, [_calibrated(bench, mean, grid.background) for mean in means])
+    return kind_of(bench).refined(bench, grid, [_calibrated(bench, mean, grid.background) for mean in means])
 
 
 def _calibrated(bench: Bench, frame: NDArray[np.float32], background: float) -> NDArray[np.float32]:
@@ -95,7 +91,34 @@ def extractor(bench: Bench, grid: SensorGeometry) -> SlopeFunction:
             f"the dark frame has shape {bench.dark.shape}, the camera delivers {shape}; measure it again"
         )
     dark = bench.dark if bench.dark is not None else np.full(shape, grid.background, np.float32)
-    return kind_of(bench).extractor(bench, grid, shape, dark)
+    slopes_of = kind_of(bench).extractor(bench, grid, shape, dark)
+    if bench.taps.geometry is not None:
+        bench.taps.geometry(grid)
+    return slopes_of if bench.taps.slopes is None else _TappedSlopes(slopes_of, bench.wfs, bench.taps.slopes)
+
+
+class _TappedSlopes:
+    """Slopes that somebody looks at as they pass."""
+
+    def __init__(
+        self, slopes_of: SlopeFunction, camera: Camera, tap: Callable[[int, NDArray[np.float32]], object]
+    ) -> None:
+        self._slopes_of, self._camera, self._tap = slopes_of, camera, tap
+        self.grid, self.shape = slopes_of.grid, slopes_of.shape
+
+    @property
+    def flux(self) -> NDArray[np.float32]:
+        return self._slopes_of.flux
+
+    def __call__(
+        self,
+        frame: NDArray[np.uint16],
+        flux: NDArray[np.float32] | None = None,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        slopes = self._slopes_of(frame, flux, out)
+        self._tap(self._camera.last_index, slopes)
+        return slopes
 
 
 def find_sensor(
@@ -196,8 +219,6 @@ def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.flo
 def modal_basis(bench: Bench) -> NDArray[np.float64]:
     """Mode-to-command matrix ``(n_act, n_modes)`` that the configuration asks for.
 
-    Disabled actuators take no part: the modes are those of the others.
-
     Raises
     ------
     ConfigError
@@ -205,38 +226,10 @@ def modal_basis(bench: Bench) -> NDArray[np.float64]:
     CalibrationError
         More modes than the actuators that work can make.
     """
-    basis, model = bench.config.basis, bench.model()
-    surfaces, pupil, pixel = model.influence_functions()
+    surfaces, pupil, pixel = bench.model().influence_functions()
     if surfaces.shape[0] != bench.dm.info.n_act:
         raise ConfigError(f"the model has {surfaces.shape[0]} actuators, the mirror {bench.dm.info.n_act}")
-    works = np.ones(surfaces.shape[0], dtype=bool)
-    works[list(bench.dm.limits.disabled)] = False
-    if basis.kind in _OF_SURFACES:
-        return _spread_over(works, _OF_SURFACES[basis.kind](surfaces[works], pupil, basis.n_modes))
-    if basis.kind == "file":
-        # Imported here: astropy takes a second to load, and only this needs it.
-        from escape_hw.io.fits import load_matrix
-
-        m2c = load_matrix(basis.file).matrix.m2c
-        if m2c.shape[0] != surfaces.shape[0] or m2c.shape[1] < basis.n_modes:
-            raise ConfigError(
-                f"basis.file holds {m2c.shape[0]} actuators and {m2c.shape[1]} modes; "
-                f"{surfaces.shape[0]} and at least {basis.n_modes} are needed"
-            )
-        if m2c[~works, : basis.n_modes].any():
-            raise ConfigError(
-                "the modes of basis.file move actuators that devices.dm.limits.disabled keeps at zero"
-            )
-        return unit_rms(m2c[:, : basis.n_modes], surfaces, pupil)
-    outer_scale_m = _OUTER_SCALE * bench.config.system.pupil_m
-    return _spread_over(works, karhunen_loeve(surfaces[works], pupil, pixel, basis.n_modes, outer_scale_m))
-
-
-def _spread_over(works: NDArray[np.bool_], m2c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Modes of the actuators that work as modes of the whole mirror."""
-    whole = np.zeros((works.size, m2c.shape[1]))
-    whole[works] = m2c
-    return whole
+    return configured_basis(bench.config, surfaces, pupil, pixel, bench.dm.limits.disabled)
 
 
 def poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDArray[np.float64]:

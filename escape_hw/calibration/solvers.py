@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
-from escape_hw.api.procedure import Procedure, Reporter
-from escape_hw.api.registration import Registration
+from escape_hw.api.procedure import Procedure, Progress, Reporter
+from escape_hw.api.registration import TO_PLAIN, Registration
 from escape_hw.api.results import SprintIteration
 from escape_hw.calibration.batches import BatchProblem
 from escape_hw.calibration.capture import capture, low_modes
@@ -56,6 +56,17 @@ class Descent:
 
     def __post_init__(self) -> None:
         self.report = Reporter("SPRINT", self.max_iterations, "iteration")
+
+    def progress(self, sigma: NDArray[np.float64] | None = None) -> Progress:
+        """The iterations so far; with the standard errors of the last ``(5,)`` once they are known."""
+        rows = np.array([step.registration.to_array() for step in self.history]).reshape(-1, 5)
+        errors = np.full(5, np.nan) if sigma is None else sigma
+        arrays = {
+            "registration": (rows * TO_PLAIN).astype(np.float32),
+            "registration_sigma": (errors * TO_PLAIN).astype(np.float32),
+            "step_norm": np.array([step.step_norm for step in self.history], np.float32),
+        }
+        return self.report.now(arrays)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,8 +147,8 @@ def _watched(steps: Generator[LightFit, None, T], descent: Descent) -> Procedure
             return last
         norm = float(np.linalg.norm(fit.step / LARGEST))
         descent.history.append(_record(fit.alpha, fit.gain, fit.residual, norm))
-        if progress := descent.report.step():
-            yield progress
+        if descent.report.step():
+            yield descent.progress()
 
 
 def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Procedure[Solution]:
@@ -145,8 +156,8 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
     state, settled = problem.start(start), False
     system = problem.linearise(state)
     for _ in range(descent.max_iterations):
-        if progress := descent.report.step():
-            yield progress
+        if descent.report.step():
+            yield descent.progress()
         step = system.solve()
         if not np.isfinite(step).all():
             break

@@ -155,6 +155,7 @@ def fit_steps(
             weighted = whole.trusting(shares)
             found = yield from solve(descent, weighted, found.alpha, False)
         estimate = _estimate(descent, weighted, found, covariance)
+    yield descent.progress(estimate.sigma)
     return SprintFit(estimate, found.zonal, found.learned)
 
 

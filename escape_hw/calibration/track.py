@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Progress, Reporter
+from escape_hw.api.registration import PARAMETERS, TO_PLAIN
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate, TemporalResponse
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.tracking import Alarm, TrackResult
@@ -35,7 +36,7 @@ from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepa
 from escape_hw.calibration.sprint import sprint
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.track_proposal import InUse, Proposal, inverted, propose, taken
-from escape_hw.calibration.track_watch import TrackWatch
+from escape_hw.calibration.track_watch import RunawayWatch, TrackWatch
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
 from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.standard_error import LEAST
@@ -54,6 +55,10 @@ _STREHL_EVERY = 5
 #: What progress reports tell of the last look.
 _SHOWN = ("shift_x", "shift_x_sigma", "shift_y", "shift_y_sigma", "rotation", "rotation_sigma",
           "optical_gain", "optical_gain_sigma", "misfit")  # fmt: skip
+
+
+#: Updates that a picture of the registration's course shows.
+_COURSE = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,13 +162,15 @@ class _Tracker:
         self.response, self.memory = response, memory_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
         self.used = InUse(matrix, inverted(matrix, self.dropped), start, 1.0)
-        self.watch = TrackWatch(start.registration, t.largest_shift)
+        self.watch = TrackWatch(start.registration, t.largest_shift, response)
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
         self.updates, self.residual_at, self.began_ns = 0, 0, 0
         self.pending: Future[_Answer | None] | None = None
         self.metrics: dict[str, float] = {}
+        self.arrays: dict[str, NDArray[np.float32]] = {}
+        self.runaway = RunawayWatch()
 
     def prepare(self, motion: Motion) -> None:
         """Build the model for the light that the closed loop leaves, and start on it; in the thread.
@@ -181,7 +188,7 @@ class _Tracker:
             curved=len(SCATTER) if bench.config.sensor.kind == "pyramid" else 0,
         )  # fmt: skip
         unit = modal_matrix(self.model, start.registration, matrix.m2c, start.width.value)
-        self.begun = np.square(matrix.data).sum(axis=0) / (unit * matrix.data).sum(axis=0)
+        self.begun = (unit * matrix.data).sum(axis=0) / np.square(unit).sum(axis=0)
         self.used = replace(self.used, gain=float(self.begun.mean()))
 
     def run(self, seconds: float) -> Procedure[TrackResult]:
@@ -196,7 +203,7 @@ class _Tracker:
             science.stop()
         slopes_of = extractor(bench, self.grid)
         loop = RunningLoop(bench, self.used.matrix.m2c, slopes_of, self.control, science=science is not None)
-        report = Reporter("tracking", math.ceil(seconds / STEP_S), "s")
+        report = Reporter("tracking", math.ceil(seconds / STEP_S), "second")
         with ThreadPoolExecutor(1, thread_name_prefix="live registration") as pool:
             try:
                 yield from self._track(loop, report, pool)
@@ -226,9 +233,10 @@ class _Tracker:
             yield from self._passed(loop.run(self.frames), report, 0)
         ready.result()
         for second in range(report.total):
+            frames, shortened = loop.record.frames, loop.record.shortened
             steps = loop.run(self.frames, inject=self._poke, observe=[self.tape])
             yield from self._passed(steps, report, second)
-            if loop.record.diverged:
+            if loop.record.diverged or self.runaway(loop.record, frames, shortened):
                 self._lose()
                 return
             # A twin's clock stands still meanwhile; at a real bench the loop does not wait.
@@ -241,7 +249,8 @@ class _Tracker:
     def _passed(self, steps: Procedure[object], report: Reporter, done: int) -> Iterator[Progress]:
         """Progress of the whole in place of a stretch's own, with what the last look said."""
         for step in steps:
-            yield report(done, **step.metrics, **self.metrics)
+            arrays, self.arrays = self.arrays, {}
+            yield report(done, {**step.arrays, **arrays}, **step.metrics, **self.metrics)
 
     def _poke(self) -> NDArray[np.float64]:
         return self.amplitude * self.bench.rng.uniform(-1.0, 1.0, self.amplitude.size)
@@ -324,6 +333,7 @@ class _Tracker:
         }  # fmt: skip
         result.add(**row)
         self.metrics = {name: row[name] for name in _SHOWN}
+        self.arrays = _to_show(result)
 
     def _lose(self) -> None:
         """The loop diverged."""
@@ -331,3 +341,16 @@ class _Tracker:
         self.result.alarms.append(
             Alarm(self._now(), "diverged", "the loop diverged and was opened; calibrate anew")
         )
+
+
+def _to_show(result: TrackResult) -> dict[str, NDArray[np.float32]]:
+    """Course of the registration and present gains, in the units of streams."""
+    names = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS))
+    course = np.array([result.rows[name][-_COURSE:] for name in names]).T
+    course[:, 1:] *= np.tile(TO_PLAIN, 2)
+    arrays = {
+        "registration_track": course,
+        "gains": result.optical_gain,
+        "gains_sigma": result.optical_gain_sigma,
+    }
+    return {name: array.astype(np.float32) for name, array in arrays.items()}

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.loop import fitting_matrix, refuse_simulated
 from escape_hw.cli.session import Session, session
 
 if TYPE_CHECKING:
@@ -207,6 +206,7 @@ def _arms(
     from escape_hw.errors import ConfigError
     from escape_hw.io.gains import load_gains
     from escape_hw.runtime.sweep.arms import keep_arms, make_arms, read_arms
+    from escape_hw.runtime.task import fitting_matrix, refuse_simulated
 
     if request.im:
         products = [fitting_matrix(path, config, request.force) for path in request.im]

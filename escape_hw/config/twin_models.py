@@ -18,8 +18,8 @@ from escape_hw.config.twin_sky import TwinAtmosphere, TwinContamination, TwinSta
 class TwinRegistration(Section):
     """Hidden registration of mirror and sensor (paper, Table 1)."""
 
-    shift_x: float = Field(0.0, ge=-500, le=500, description="shift along columns, % of a sub-aperture")
-    shift_y: float = Field(0.0, ge=-500, le=500, description="shift along rows, % of a sub-aperture")
+    shift_x: float = Field(0.0, ge=-5000, le=5000, description="shift along columns, % of a sub-aperture")
+    shift_y: float = Field(0.0, ge=-5000, le=5000, description="shift along rows, % of a sub-aperture")
     rotation: float = Field(0.0, ge=-180, le=180, description="rotation from +x towards +y, degrees")
     radial_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along x, % of the diameter")
     tangential_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along y, % of the diameter")

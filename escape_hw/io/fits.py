@@ -46,7 +46,7 @@ def partial_path(path: Path) -> Path:
     return path if path.name.endswith(".partial.fits") else path.with_suffix(".partial.fits")
 
 
-def save_matrix(path: Path, result: CalibrationResult, origin: Provenance | None = None) -> Path:
+def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance | None = None) -> Path:
     """Write a calibration's matrix with grid, errors, basis, registration and configuration.
 
     Parameters
@@ -70,7 +70,7 @@ def save_matrix(path: Path, result: CalibrationResult, origin: Provenance | None
     ValueError
         Matrix and grid do not belong together.
     """
-    origin = origin or Provenance()
+    path, origin = Path(path), origin or Provenance()
     matrix = result.matrix
     if not np.array_equal(matrix.valid, result.grid.valid):
         raise ValueError(f"the matrix and the geometry mark different {result.grid.elements} as valid")

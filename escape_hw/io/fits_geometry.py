@@ -93,6 +93,9 @@ def _pack_pupils(geometry: SensorGeometry) -> _Packed:
         "DIAMETER": float(pupils.diameter_px),
         "MOTION": float(pupils.motion),
         "CENTRESD": float(pupils.centre_sigma_px),
+        "POKES": float(pupils.pokes),
+        "LOOKS": float(pupils.looks),
+        "STEADY": float(pupils.steady),
         "NORMAL": fits_file.plain(pupils.normalisation),
         "MODULAT": float(pupils.modulation),
     }
@@ -118,6 +121,10 @@ def _unpack_pupils(
         references=references,
         motion=float(header["MOTION"]),
         centre_sigma_px=float(header["CENTRESD"]),
+        # Products written before these were recorded do without.
+        pokes=float(header.get("POKES", 0.0)),
+        looks=float(header.get("LOOKS", 0.0)),
+        steady=float(header.get("STEADY", 0.0)),
         normalisation=str(header["NORMAL"]),
         modulation=float(header["MODULAT"]),
         **common,

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal, special
+from scipy import signal
 
 from escape_hw.api.pyramid import IMAGES, PyramidPupils, boxes, without_low_orders
 from escape_hw.errors import CalibrationError
+from escape_hw.pipeline.obscuration import Shadow, shadow_offset
 from escape_hw.pipeline.pyramid_slopes import slopes_of_image
+from escape_hw.pipeline.rims import ITERATIONS, ROUND, fit_rims, out_of_round
 
 #: How far an image may lie from its nominal place, as a share of its diameter.
 _REACH = 0.25
@@ -20,15 +22,10 @@ _REACH = 0.25
 _DIAMETER_RANGE, _DIAMETER_PX = 0.03, 2.0
 #: An image with less than this share of the others' light is not there.
 _FAINT = 0.1
-#: Softness of a rim in pixels (rms): a pixel's own width and a little diffraction.
-_SOFT = 0.45
-#: Half width in pixels of the ring in which a rim is fitted, and harmonics of its brightness.
-_RING, _HARMONICS = 4.0, 6
-_ITERATIONS, _NARROW = 12, 8
-#: Light that is pressed down to one half before rims are fitted, as a share of the usual one.
-_PRESSED = 1.0
-#: Pixels that come so near to another image (in pixels from its rim) are left out.
-_NEIGHBOUR = 2.0
+#: Light that is pressed down to one half before rims are fitted, as a share of the usual one; on a telescope
+#: little enough that a rim in the shade of a soiled edge is as steep as any other. A bench's stop is whole,
+#: and what diffraction puts between the images would count for more the harder light is pressed.
+_PRESSED, _PRESSED_SOILED = 1.0, 0.25
 
 
 def find_pupils(
@@ -105,11 +102,15 @@ def find_pupils(
     return replace(pupils, references=mean.astype(np.float32))
 
 
-def refine_pupils(means: Sequence[NDArray[np.float32]], pupils: PyramidPupils) -> PyramidPupils:
+def refine_pupils(
+    means: Sequence[NDArray[np.float32]], pupils: PyramidPupils, shadow: Shadow | None = None
+) -> PyramidPupils:
     """The pupils with centres and diameter from a longer look, and with the error of their mean place.
 
     Under turbulence the rims fitted on a second of frames may be some tenths of a pixel off. Boxes
-    and mask stay as they are, so slopes keep their meaning; a model wants the centres.
+    and mask stay as they are, so slopes keep their meaning; a model wants the centres. A soiled edge
+    eats into the rim of all four images alike; the shadow of what stands in the pupil knows nothing
+    of it, and counts by its error against the rim's.
 
     Parameters
     ----------
@@ -118,31 +119,49 @@ def refine_pupils(means: Sequence[NDArray[np.float32]], pupils: PyramidPupils) -
         the other in time; the scatter from one to the next tells the error.
     pupils
         As found before.
+    shadow
+        What passes the telescope's obscuration and vanes; ``None``: there are none.
     """
     n_sub = pupils.valid.shape[0]
+    pressed, order = (_PRESSED, 1) if shadow is None else (_PRESSED_SOILED, ROUND)
     image = np.asarray(np.mean(means, axis=0), np.float64)
-    centres, diameter = _places(image, pupils.centres_px, n_sub)
-    sigma = 0.0
+    centres, diameter = _places(image, pupils.centres_px, n_sub, pressed, order)
+    even = _evened(image, pressed)
+    variance = out_of_round(even, centres, diameter / 2, n_sub / 2) ** 2
     if len(means) > 1:
-        parts = [_places(np.asarray(part, np.float64), centres, n_sub)[0].mean(axis=0) for part in means]
-        sigma = float(np.sqrt(np.mean(np.var(parts, axis=0, ddof=1)) / len(parts)))
-    return replace(pupils, centres_px=centres, diameter_px=diameter, centre_sigma_px=sigma)
+        parts = [
+            _places(np.asarray(part, np.float64), centres, n_sub, pressed, order)[0].mean(axis=0)
+            for part in means
+        ]
+        variance += float(np.mean(np.var(parts, axis=0, ddof=1))) / len(parts)
+    if shadow is not None:
+        offset, sigma = shadow_offset(even, centres, diameter, shadow)
+        share = variance / (variance + sigma**2)
+        centres, variance = centres + share * offset, variance * (1 - share)
+    return replace(pupils, centres_px=centres, diameter_px=diameter, centre_sigma_px=float(np.sqrt(variance)))
 
 
 def _places(
-    image: NDArray[np.float64], rough: NDArray[np.float64], n_sub: int
+    image: NDArray[np.float64],
+    rough: NDArray[np.float64],
+    n_sub: int,
+    pressed: float = _PRESSED,
+    order: int = 1,
 ) -> tuple[NDArray[np.float64], float]:
     """Centres ``(4, 2)`` and common diameter of the images, from their rims."""
-    centres, radius = _fit_rims(_evened(image), rough, n_sub / 2, n_sub / 2)
+    even = _evened(image, pressed)
+    centres, radius = fit_rims(even, rough, n_sub / 2, n_sub / 2)
+    if order > 1:
+        centres, radius = fit_rims(even, centres, radius, n_sub / 2, ITERATIONS // 3, order)
     # Pressed light ends a little late; where it really ends on average, the light itself tells.
-    _, radius = _fit_rims(image, centres, radius, n_sub / 2, _ITERATIONS // 3)
+    _, radius = fit_rims(image, centres, radius, n_sub / 2, ITERATIONS // 3)
     return centres, 2 * radius
 
 
-def _evened(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def _evened(image: NDArray[np.float64], pressed: float) -> NDArray[np.float64]:
     """The image with its bright parts pressed down: a rim is to be as steep in bright light as in dim."""
     lit = image > 0.1 * np.percentile(image, 99)
-    level = _PRESSED * float(np.median(image[lit])) if lit.any() else 1.0
+    level = pressed * float(np.median(image[lit])) if lit.any() else 1.0
     light = np.maximum(image, 0.0)
     return np.asarray(light / (light + level))
 
@@ -195,91 +214,6 @@ def _check_light(
             f"only {4 - int(missing.sum())} of four pupil images on the wavefront sensor; missing: {names}; "
             "check the beam on the pyramid's tip, the camera region and sensor.pupils_px"
         )
-
-
-def _fit_rims(
-    image: NDArray[np.float64],
-    rough: NDArray[np.float64],
-    radius: float,
-    nominal: float,
-    iterations: int = _ITERATIONS,
-) -> tuple[NDArray[np.float64], float]:
-    """Centres ``(4, 2)`` and the common radius of the images, from their rims alone."""
-    centres = rough.copy()
-    for left in reversed(range(iterations)):
-        # A wide ring captures, a narrow one is precise.
-        width = min(_RING * (1 if left < _NARROW else 2), nominal / 2)
-        moves = np.array(
-            [_rim_step(image, centres, k, radius, width, nominal + _NEIGHBOUR) for k in range(4)]
-        )
-        limited = np.clip(moves, -1.5, 1.5)
-        centres += limited[:, :2]
-        radius = max(radius + float(np.median(limited[:, 2])), nominal / 2)
-    return centres, radius
-
-
-def _rim_step(
-    image: NDArray[np.float64],
-    centres: NDArray[np.float64],
-    number: int,
-    radius: float,
-    width: float,
-    apart: float,
-) -> NDArray[np.float64]:
-    """Gauss-Newton step ``(3,)`` of one image's centre (x, y) and radius.
-
-    In a ring around the rim the light is taken for ``outside(angle) + inside(angle, depth) * edge``,
-    all of which is linear but for the edge's place. Pixels ``apart`` or less from another image's
-    centre are left out.
-    """
-    x, y = centres[number]
-    pixels, light = _ring(image, x, y, radius, width)
-    others = np.delete(centres, number, axis=0)
-    alone = np.hypot(*(pixels[:, None] - others.T[:, :, None])).min(axis=0) > apart
-    (dx, dy), light = pixels[:, alone] - centres[number][:, None], light[alone]
-    r = np.hypot(dx, dy)
-    # A rim of few pixels tells few harmonics.
-    waves = _harmonics(np.arctan2(dy, dx), min(_HARMONICS, int(radius // 3)))
-    depth = (radius - r) / _SOFT
-    edge = special.ndtr(depth)
-    steepness = np.exp(-(depth**2) / 2) / (np.sqrt(2 * np.pi) * _SOFT)
-    slant = (depth * edge)[:, None] * waves[:, :5]
-    known = np.concatenate([waves, waves * edge[:, None], slant], axis=1)
-    shares = _fit(known, light)
-    n = waves.shape[1]
-    bright = (waves @ shares[n : 2 * n]) * steepness
-    moving = np.stack([bright * dx / r, bright * dy / r, bright], axis=1)
-    return _fit(np.concatenate([known, moving], axis=1), light)[-3:]
-
-
-def _fit(terms: NDArray[np.float64], light: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares of the terms in the light, by the normal equations: few terms, many pixels."""
-    scale = np.sqrt(np.maximum(np.square(terms).sum(axis=0), 1e-30))
-    unit = terms / scale
-    return np.asarray(np.linalg.lstsq(unit.T @ unit, unit.T @ light, rcond=1e-12)[0] / scale)
-
-
-def _harmonics(angle: NDArray[np.float64], order: int) -> NDArray[np.float64]:
-    """1, cos a, sin a, cos 2a, ... as columns."""
-    turns = angle[:, None] * np.arange(1, order + 1)
-    both = np.stack([np.cos(turns), np.sin(turns)], axis=2).reshape(angle.size, -1)
-    return np.concatenate([np.ones((angle.size, 1)), both], axis=1)
-
-
-def _ring(
-    image: NDArray[np.float64], x: float, y: float, radius: float, width: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places ``(2, n)`` as (x, y) and light ``(n,)`` of the pixels around a rim; outside it is dark."""
-    reach = int(np.ceil(radius + width)) + 1
-    columns, rows = np.meshgrid(
-        round(x) + np.arange(-reach, reach + 1), round(y) + np.arange(-reach, reach + 1)
-    )
-    near = np.abs(np.hypot(columns - x, rows - y) - radius) <= width
-    columns, rows = columns[near], rows[near]
-    seen = (columns >= 0) & (columns < image.shape[1]) & (rows >= 0) & (rows < image.shape[0])
-    light = np.zeros(columns.size)
-    light[seen] = image[rows[seen], columns[seen]]
-    return np.stack([columns, rows]).astype(float), light
 
 
 def _check_fit(

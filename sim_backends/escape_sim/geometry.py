@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.errors import CalibrationError
-from escape_sim.telescope_pupil import passed_share, soiled_share
+from escape_hw.pipeline.obscuration import passed_share
+from escape_sim.telescope_pupil import soiled_share
 
 if TYPE_CHECKING:
     from escape_hw.api.pyramid import PyramidPupils

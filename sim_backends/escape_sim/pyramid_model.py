@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from escape_hw.api.pyramid import PyramidPupils, boxes
 from escape_hw.api.registration import Registration
+from escape_hw.calibration.basis import configured_basis
 from escape_hw.config.sensor_models import PyramidSection
+from escape_sim.air_scatter import air_scatter
 from escape_sim.fourier_filter import good_length
 from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry, pupil_of_images
 from escape_sim.influence import InfluenceFunctions
@@ -25,7 +27,7 @@ from escape_sim.modulation import Modulation
 from escape_sim.prism import Prism
 from escape_sim.pyramid import PyramidOptics, Window
 from escape_sim.pyramid_response import slope_response
-from escape_sim.pyramid_turbulence import distances, strength
+from escape_sim.pyramid_turbulence import Pokes, distances, strength, unit_screens
 from escape_sim.surface_nodes import surface_nodes
 from escape_sim.turbulence_statistics import structure_function
 
@@ -36,6 +38,11 @@ if TYPE_CHECKING:
 _OUTER_SCALE = 4.0
 #: Turbulence weaker than this many r0 across the pupil leaves the response what it is at rest.
 _CALM = 0.5
+#: What scalings err by in common on a pyramid under turbulence and pokes, in % of the diameter: the mean
+#: over sixteen twins with the images at their true centres (docs/decisions/0018-pyramids-in-truth.md).
+_SCALING = 0.12
+#: Shapes of the mirror that are looked at under each state of the air.
+_SHAPES = 10
 #: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
 _STRENGTH_DOUBT, _ELLIPSE = 0.4, 0.05
 
@@ -97,17 +104,19 @@ class PyramidModel:
         self._pitch = pitch_on_pupil(config)
         self._coupling = config.devices.dm.coupling
         self._modulation = modulation or Modulation.circle(pupils.modulation)
+        # A surface changes the path by twice as much.
+        scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
+        self._pokes = self._random_pokes(scale) if pupils.pokes else None
         if turbulence is None:
-            turbulence = strength(self.optics(), pupils, _OUTER_SCALE)
+            turbulence = strength(self.optics(), pupils, _OUTER_SCALE, self._pokes)
         self.turbulence = turbulence if turbulence >= _CALM else 0.0
         sigma = self._pitch / np.sqrt(2 * np.log(1 / self._coupling))
         self._nodes, self._carry = surface_nodes(pupil.coordinates_m, sigma)
-        # A surface changes the path by twice as much.
-        scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
         self._response = self._by_phase()
         self._response *= np.float32(scale)
         self._helper = ThreadPoolExecutor(1, "pyramid-model")
         self._variants: list[PyramidModel] | None = None
+        self._scatter: NDArray[np.float64] | None = None
 
     @property
     def n_act(self) -> int:
@@ -121,9 +130,10 @@ class PyramidModel:
 
     @property
     def registration_doubt(self) -> NDArray[np.float64]:
-        """The error of the pupil images' mean place, see :class:`DoubtfulModel`."""
+        """Errors of the pupil images' place and of the air's own, see :class:`DoubtfulModel`."""
         shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
-        return np.array([shift, shift, 0.0, 0.0, 0.0])
+        scaling = _SCALING if self.turbulence or self._pokes else 0.0
+        return np.asarray(np.hypot([shift, shift, 0.0, scaling, scaling], self._air_doubt()))
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
@@ -179,6 +189,41 @@ class PyramidModel:
         return list(self._variants)
 
     # ------------------------------------------------------------------ construction
+    def _air_doubt(self) -> NDArray[np.float64]:
+        """What the states of the air and of the mirror that were seen leave of :func:`air_scatter`."""
+        if not self._pupils.looks or not (self.turbulence or self._pokes):
+            return np.zeros(5)
+        if self._scatter is None:
+            x, optics = self._pupil.coordinates_m, self.optics()
+            phases = unit_screens(x.size, _OUTER_SCALE) * self.turbulence ** (5 / 6)
+            if self._pokes:
+                phases += self._pokes.phases(len(phases))
+            paths = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
+            paths *= 2 * self._config.devices.dm.stroke_m
+            self._scatter = air_scatter(
+                optics, self._pupils, phases, self._random_commands(len(phases)), paths,
+                lambda m2c: self.modal_jacobian(Registration(), m2c),
+            )  # fmt: skip
+        return np.asarray(self._scatter / np.sqrt(self._pupils.looks))
+
+    def _basis(self) -> NDArray[np.float64]:
+        """The modes of a calibration ``(n_act, n_modes)``."""
+        return configured_basis(
+            self._config, *self.influence_functions(), self._config.devices.dm.limits.disabled
+        )
+
+    def _random_pokes(self, scale: float) -> Pokes:
+        """The pokes that were measured; ``scale`` is the phase of a surface of full stroke in radians."""
+        m2c = self._basis()
+        surfaces, lit, _ = self.influence_functions()
+        most = self._config.calibration.poke_command / np.abs(m2c).max(axis=0)
+        return Pokes.of(self._pupils.pokes, most, scale * np.tensordot(m2c.T, surfaces, 1), lit)
+
+    def _random_commands(self, count: int) -> NDArray[np.float64]:
+        """Commands ``(count, n_act, k)`` of all modes of a basis at once, as a calibration's pokes are."""
+        m2c = self._basis()
+        return m2c @ np.random.default_rng(2).standard_normal((count, m2c.shape[1], _SHAPES))
+
     def _by_phase(self) -> NDArray[np.float32]:
         """The slopes' derivatives by the phase at the nodes ``(n_slopes, m * m)``."""
         pupils, pupil = self._pupils, self._pupil
@@ -187,9 +232,11 @@ class PyramidModel:
         grid = good_length(max(shape), samples)
         window = Window(pupils.centres_px, shape, grid, samples)
         structure = None
-        if self.turbulence:
+        if self.turbulence or self._pokes:
             apart = distances(n, pupil.pixel_m) / self._config.system.pupil_m
-            structure = structure_function(apart, 1 / self.turbulence, _OUTER_SCALE)
+            structure = self._pokes.structure() if self._pokes else np.zeros_like(apart)
+            if self.turbulence:
+                structure += structure_function(apart, 1 / self.turbulence, _OUTER_SCALE)
         return slope_response(
             pupil.amplitude, Prism(window.shifts(n), pupil.n_sub * samples), grid * samples,
             pupils.corners_px - window.first, pupils.valid, self._modulation, structure,

@@ -1,4 +1,4 @@
-"""What stands in the light before the pupil, and what lies on it."""
+"""What lies on the pupil."""
 
 from __future__ import annotations
 
@@ -8,39 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from escape_hw.config.telescope_models import TelescopeSection
     from escape_hw.config.twin_sky import TwinContamination
 
-#: Points along each side of a sample at which it is asked whether light passes.
-_POINTS = 8
 #: Highest order of the smooth unevenness: waves across the pupil, or around its edge.
 _WAVES = 5
-
-
-def passed_share(
-    telescope: TelescopeSection, diameter_m: float, coordinates_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Share of each sample that neither the central obscuration nor a vane covers ``(n, n)``.
-
-    Parameters
-    ----------
-    telescope
-        Obscuration and vanes.
-    diameter_m
-        Diameter of the pupil in metres.
-    coordinates_m
-        Coordinates of the samples along either axis ``(n,)`` in metres.
-    """
-    n = coordinates_m.size
-    step = coordinates_m[1] - coordinates_m[0] if n > 1 else diameter_m
-    inside = ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5) * step
-    fine = (coordinates_m[:, None] + inside).ravel()
-    x, y = fine[None, :], fine[:, None]
-    passed = np.hypot(x, y) >= telescope.obscuration * diameter_m / 2
-    for angle in np.deg2rad(telescope.spiders_deg):
-        along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
-        passed &= (along < 0) | (np.abs(across) > telescope.spider_m / 2)
-    return np.asarray(passed.reshape(n, _POINTS, n, _POINTS).mean(axis=(1, 3)))
 
 
 def soiled_share(
@@ -60,7 +31,7 @@ def soiled_share(
     dirt
         What lies on the pupil.
     diameter_m, coordinates_m
-        As for :func:`passed_share`.
+        Diameter of the pupil, and coordinates of the samples along either axis ``(n,)``, in metres.
     rng
         Of the unevenness.
     """

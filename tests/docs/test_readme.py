@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import pytest
+from pages import ROOT, call, escape, spelled_right
 
-ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 #: Minutes each; that their words are right is checked all the same.
 LONG = (
@@ -33,18 +30,6 @@ def shell_lines() -> list[str]:
 
 def escape_lines() -> list[str]:
     return [line for line in shell_lines() if line.startswith("escape ")]
-
-
-def call(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONIOENCODING": "utf-8", "XDG_DATA_HOME": str(folder / "data")}
-    return subprocess.run(
-        words, cwd=folder, capture_output=True, text=True, timeout=240, check=False, env=environment
-    )
-
-
-def escape(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    program = [sys.executable, "-c", "from escape_hw.cli import main; main()"]
-    return call([*program, *line.split()[1:]], folder)
 
 
 @pytest.mark.parametrize("number", range(len(blocks("python"))))
@@ -69,19 +54,10 @@ def test_commands_run_in_the_order_they_stand(tmp_path: Path) -> None:
 
 
 def test_long_commands_are_spelled_right() -> None:
-    from typer.main import get_command
-
-    from escape_hw.cli.app import app
-
     long = [line for line in escape_lines() if line.startswith(LONG)]
     assert {line for line in LONG if any(found.startswith(line) for found in long)} == set(LONG)
     for line in long:
-        command: Any = get_command(app)
-        words, context = line.split()[1:], None
-        while hasattr(command, "resolve_command"):
-            context = command.make_context(command.name, list(words), parent=context)
-            _, command, words = command.resolve_command(context, words)
-        command.make_context(command.name, list(words), parent=context)
+        spelled_right(line)
 
 
 def test_make_targets_exist() -> None:

@@ -10,7 +10,7 @@ from escape_hw.calibration.docrime import docrime_run
 from escape_hw.calibration.push_pull import push_pull
 from escape_hw.calibration.sensor_setup import modal_basis
 from escape_hw.calibration.sprint import sprint
-from escape_hw.errors import CalibrationError, ConfigError
+from escape_hw.errors import CalibrationError, ConfigError, ProductError
 
 LIMITS = {
     "stroke": "devices.dm.limits.max_stroke=0.05",
@@ -101,5 +101,37 @@ def test_a_stored_basis_that_moves_a_disabled_actuator(good, tmp_path):
     with (
         small(*basis, "devices.dm.limits.disabled=[3]") as bench,
         pytest.raises(ConfigError, match="disabled"),
+    ):
+        modal_basis(bench)
+
+
+def test_a_basis_in_a_plain_fits_file(good, tmp_path):
+    from astropy.io import fits
+
+    # Any scale will do: columns are brought to unit rms surface.
+    fits.writeto(tmp_path / "plain.fits", 3.0 * good.matrix.m2c)
+    with small("basis.kind=file", f"basis.file={tmp_path / 'plain.fits'}") as bench:
+        np.testing.assert_allclose(modal_basis(bench), good.matrix.m2c, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [(np.zeros(7), "no image with two axes"), (np.full((37, 30), np.nan), "not finite"), (None, "no image")],
+)
+def test_a_fits_file_that_is_no_basis(tmp_path, data, message):
+    from astropy.io import fits
+
+    fits.PrimaryHDU(data).writeto(tmp_path / "odd.fits")
+    with (
+        small("basis.kind=file", f"basis.file={tmp_path / 'odd.fits'}") as bench,
+        pytest.raises(ProductError, match=message),
+    ):
+        modal_basis(bench)
+
+
+def test_a_basis_file_that_is_not_there(tmp_path):
+    with (
+        small("basis.kind=file", f"basis.file={tmp_path / 'none.fits'}") as bench,
+        pytest.raises(ProductError, match=r"none\.fits"),
     ):
         modal_basis(bench)

@@ -93,8 +93,9 @@ def test_the_pyramid_has_gains_by_mode():
     with small_pyramid("twin.loss_probability=0") as bench:
         truth = bench.dm.twin.flexure.at(0.0)
         found, _ = looked(bench, 4, 303, curved=3, start_frames=900)
-    errors, _ = errors_and_pulls(found, truth)
-    assert (np.abs(errors[:3]) < [4.0, 4.0, 0.2]).all()
+    errors, pulls = errors_and_pulls(found, truth)
+    assert (np.abs(errors[:3]) < [8.0, 8.0, 0.2]).all()
+    assert (np.abs(pulls[:3]) < 3.5).all()
     assert found.gains.shape == found.gains_sigma.shape == (20,)
     assert (found.gains_sigma < 0.15 * found.gains).all()
     assert np.ptp(found.gains) > 0

@@ -99,7 +99,8 @@ def test_parts_of_a_run_tell_the_error_of_the_images_place() -> None:
         found = refine_pupils(parts, find(parts[0]))
         assert 0 < found.centre_sigma_px < 0.1
         pulls.append((found.centres_px - centres).mean(axis=0) / found.centre_sigma_px)
-    assert 0.2 < np.mean(np.square(pulls)) < 6
+    # On the safe side: what noise makes of a rim that is round passes for dirt.
+    assert 0.1 < np.mean(np.square(pulls)) < 6
 
 
 def test_references_are_the_mean_slopes_or_what_is_not_smooth_in_them() -> None:

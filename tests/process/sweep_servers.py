@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -22,7 +23,7 @@ def postgres_binaries() -> Path | None:
     """Folder of ``initdb`` and ``postgres``, wherever the system keeps them."""
     found = shutil.which("initdb")
     if found:
-        return Path(found).parent
+        return Path(found).resolve().parent
     versions = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
     return versions[-1].parent if versions else None
 
@@ -30,17 +31,14 @@ def postgres_binaries() -> Path | None:
 class Postgres:
     """A PostgreSQL server of its own, in a folder of its own."""
 
-    def __init__(self, binaries: Path, folder: Path) -> None:
-        self._binaries, self.folder, self.port = binaries, folder, free_port()
-        folder.mkdir()
+    def __init__(self, binaries: Path) -> None:
+        # Below a folder that the server's user may pass, with a name short enough for a socket.
+        self._binaries, self.folder, self.port = binaries, Path(tempfile.mkdtemp(prefix="pg")), free_port()
         # The server refuses to run as root.
         self._user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
         if self._user:
-            shutil.chown(folder, "postgres")
-            for parent in folder.parents:
-                if parent.stat().st_mode & 0o011 == 0:
-                    parent.chmod(parent.stat().st_mode | 0o011)
-        self._call("initdb", "-D", str(folder / "data"), "-U", "escape", "-A", "trust", "-E", "UTF8")
+            shutil.chown(self.folder, "postgres")
+        self._call("initdb", "-D", str(self.folder / "data"), "-U", "escape", "-A", "trust", "-E", "UTF8")
         self._server: subprocess.Popen[bytes] | None = None
         self.start()
         self._call("createdb", "-h", "127.0.0.1", "-p", str(self.port), "-U", "escape", "sweeps")
@@ -84,6 +82,7 @@ class Postgres:
     def close(self) -> None:
         if self._server is not None and self._server.poll() is None:
             self.kill()
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def ask(self, query: str) -> list[str]:
         """Rows of a query, as text."""

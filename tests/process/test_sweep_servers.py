@@ -22,8 +22,8 @@ def arguments(tmp_path_factory) -> tuple[str, ...]:
 
 
 @pytest.fixture
-def postgres(tmp_path):
-    server = Postgres(BINARIES, tmp_path / "postgres")
+def postgres():
+    server = Postgres(BINARIES)
     yield server
     server.close()
 

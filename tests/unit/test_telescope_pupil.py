@@ -11,8 +11,9 @@ from pydantic import ValidationError
 from escape_hw.config.load import load_system
 from escape_hw.config.telescope_models import TelescopeSection
 from escape_hw.config.twin_sky import TwinAtmosphere, TwinContamination, TwinStar
+from escape_hw.pipeline.obscuration import passed_share
 from escape_sim.geometry import pupil_geometry, soiled_pupil
-from escape_sim.telescope_pupil import passed_share, soiled_share
+from escape_sim.telescope_pupil import soiled_share
 
 D, N = 6.5, 60
 X = (np.arange(N) - (N - 1) / 2) * D / N

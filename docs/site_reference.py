@@ -1,0 +1,128 @@
+"""Pages of the documentation that are written from the code itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer.cli
+import typer.main
+
+from escape_hw.cli.app import app
+from escape_hw.config.schema import json_schema
+
+#: Where the pages go, inside the documentation's folder; made anew with every build.
+FOLDER = "reference/_generated"
+#: What a schema's types are called here.
+_WORDS = {
+    "number": "number",
+    "integer": "whole number",
+    "string": "text",
+    "boolean": "true, false",
+    "array": "list",
+}
+
+
+def write_pages(docs: Path) -> None:
+    """Write every page; one whose text has not changed is left alone, so that builds stay quick."""
+    folder = docs / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in (
+        ("configuration.md", "\n".join(configuration_page())),
+        ("command-line.md", command_line_page()),
+    ):
+        page = folder / name
+        if not page.exists() or page.read_text(encoding="utf-8") != text:
+            page.write_text(text, encoding="utf-8")
+
+
+def command_line_page() -> str:
+    """Every command with its arguments and options, as their help gives them."""
+    command = typer.main.get_command(app)
+    context = command.make_context("escape", [], resilient_parsing=True)
+    return typer.cli.get_docs_for_click(obj=command, ctx=context, name="escape", title="Command line")
+
+
+def configuration_page() -> Iterator[str]:
+    """Every key of a system's file, from the schema that checks it."""
+    schema = json_schema()
+    yield "# Configuration keys"
+    yield ""
+    yield "Written from the schema that checks the files (`escape config schema` prints it for editors)."
+    yield "A key without a default has to be given. `--set SECTION.KEY=VALUE` overrides any of them."
+    for key, section in schema["properties"].items():
+        yield from _section(key, section, schema["$defs"])
+
+
+def _section(path: str, entry: dict[str, Any], known: dict[str, Any]) -> Iterator[str]:
+    for name, section in _objects(entry, known):
+        plain, nested = [], []
+        for key, value in section.get("properties", {}).items():
+            (nested if any(True for _ in _objects(value, known)) else plain).append((key, value))
+        yield from ("", f"## `[{path}]`" + (f' with `kind = "{name}"`' if name else ""), "")
+        yield section.get("description", "")
+        if plain:
+            yield from ("", "| key | default | allowed | meaning |", "|---|---|---|---|")
+            required = section.get("required", ())
+            for key, value in plain:
+                default = "" if key in required or "default" not in value else f"`{_toml(value['default'])}`"
+                text = str(value.get("description", "")).replace("|", "\\|").replace("*", "\\*")
+                yield f"| `{key}` | {default} | {_allowed(value)} | {text} |"
+        for key, value in nested:
+            yield from _section(f"{path}.{key}", value, known)
+
+
+def _objects(entry: dict[str, Any], known: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The sections that a key may hold; with their kind where there is a choice."""
+    choices = entry.get("oneOf") or entry.get("anyOf") or entry.get("allOf") or [entry]
+    for choice in choices:
+        target = known.get(choice["$ref"].rsplit("/", 1)[-1], {}) if "$ref" in choice else choice
+        if target.get("type") == "object" and "properties" in target:
+            yield (
+                (str(target["properties"].get("kind", {}).get("const", "")) if len(choices) > 1 else ""),
+                target,
+            )
+
+
+def _allowed(value: dict[str, Any]) -> str:
+    options = value.get("anyOf", [value])
+    parts = []
+    for one in options:
+        if "enum" in one:
+            parts.append(", ".join(f"`{_toml(word)}`" for word in one["enum"]))
+        elif "const" in one:
+            parts.append(f"`{_toml(one['const'])}`")
+        elif one.get("type") == "null":
+            parts.append("absent")
+        else:
+            parts.append(_range(one))
+    return " or ".join(part for part in parts if part)
+
+
+def _range(one: dict[str, Any]) -> str:
+    words = {
+        "number": "number",
+        "integer": "whole number",
+        "string": "text",
+        "boolean": "true, false",
+        "array": "list",
+    }
+    text = words.get(str(one.get("type")), "")
+    low, high = (
+        one.get("exclusiveMinimum", one.get("minimum")),
+        one.get("exclusiveMaximum", one.get("maximum")),
+    )
+    if low is not None:
+        text += f", {'>' if 'exclusiveMinimum' in one else '≥'} {low}"
+    if high is not None:
+        text += f", {'<' if 'exclusiveMaximum' in one else '≤'} {high}"
+    return text
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if value is None:
+        return "absent"
+    return f'"{value}"' if isinstance(value, str) else str(value)

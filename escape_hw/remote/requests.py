@@ -1,0 +1,201 @@
+"""What a client may ask of a server: a closed list, each request checked before anybody acts on it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+from escape_hw.remote.state import Arguments
+
+#: Names that come from a client: products, procedures, people.
+Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w .+@:-]+$")]
+ClientId = Annotated[str, Field(min_length=8, max_length=64, pattern=r"^[0-9a-f-]+$")]
+#: A loop's gain.
+Positive = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+class Request(BaseModel):
+    """A request; ``client`` says whose."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    client: ClientId
+
+
+# ---------------------------------------------------------------- to look
+class Hello(Request):
+    """The first word: who speaks, and in which version. Answered with the state."""
+
+    verb: Literal["hello"] = "hello"
+    schema_version: int
+    name: Name
+    host: Name
+    pid: int
+
+
+class GetState(Request):
+    """Answered with :class:`~escape_hw.remote.state.State`."""
+
+    verb: Literal["state"] = "state"
+
+
+class GetGeometry(Request):
+    """Answered with :class:`~escape_hw.remote.state.Geometry`."""
+
+    verb: Literal["geometry"] = "geometry"
+
+
+class GetProcedures(Request):
+    """Answered with a list of :class:`~escape_hw.remote.state.ProcedureEntry`."""
+
+    verb: Literal["procedures"] = "procedures"
+
+
+class GetLog(Request):
+    """Answered with the :class:`~escape_hw.remote.state.LogLine` after a number, at most ``count``."""
+
+    verb: Literal["log"] = "log"
+    after: int = -1
+    count: Annotated[int, Field(ge=1, le=1000)] = 200
+
+
+class GetLatest(Request):
+    """The newest sample of a stream, for clients on another host; answered with its bytes."""
+
+    verb: Literal["latest"] = "latest"
+    stream: Name
+    #: Nothing is sent again that the client has.
+    after: int = -1
+
+
+class Check(Request):
+    """What a procedure would do; answered with :class:`~escape_hw.remote.state.Plan`. Nothing moves."""
+
+    verb: Literal["check"] = "check"
+    procedure: Name
+    arguments: Arguments = Field(default_factory=dict)
+
+
+# ---------------------------------------------------------------- the lease
+class Acquire(Request):
+    """Ask for the right to write; refused while somebody else holds it."""
+
+    verb: Literal["acquire"] = "acquire"
+    #: Take it from the holder; logged.
+    take_over: bool = False
+
+
+class Heartbeat(Request):
+    """The holder lives."""
+
+    verb: Literal["heartbeat"] = "heartbeat"
+
+
+class Release(Request):
+    """Give the right to write back."""
+
+    verb: Literal["release"] = "release"
+
+
+# ---------------------------------------------------------------- safety: anybody, at any time
+class OpenLoop(Request):
+    """Open the loop and flatten the mirror; ends a procedure that needs the loop."""
+
+    verb: Literal["open_loop"] = "open_loop"
+
+
+class Flatten(Request):
+    """Abort whatever goes on, open the loop, ramp the mirror flat."""
+
+    verb: Literal["flatten"] = "flatten"
+
+
+class Abort(Request):
+    """Stop the running procedure; what was measured is kept."""
+
+    verb: Literal["abort"] = "abort"
+
+
+# ---------------------------------------------------------------- to write: the lease's holder only
+class Start(Request):
+    """Start a procedure; answered with its number."""
+
+    verb: Literal["start"] = "start"
+    procedure: Name
+    arguments: Arguments = Field(default_factory=dict)
+
+
+class Pause(Request):
+    """Halt the running procedure between two steps, mirror flat or loop closed as before."""
+
+    verb: Literal["pause"] = "pause"
+
+
+class Resume(Request):
+    """Go on with a halted procedure."""
+
+    verb: Literal["resume"] = "resume"
+
+
+class CloseLoop(Request):
+    """Close the loop on a matrix until it is opened."""
+
+    verb: Literal["close_loop"] = "close_loop"
+    matrix: Name
+    gain: Positive | None = None
+    leak: Share | None = None
+    dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
+
+
+class SetLoop(Request):
+    """Other parameters for the loop, closed or not; what is absent stays. Changes without a bump."""
+
+    verb: Literal["set_loop"] = "set_loop"
+    matrix: Name | None = None
+    gain: Positive | None = None
+    leak: Share | None = None
+    dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
+
+
+class LoadProduct(Request):
+    """Load a FITS product into the engine; the path must lie where the server may read."""
+
+    verb: Literal["load_product"] = "load_product"
+    path: Annotated[str, Field(min_length=1, max_length=4096)]
+    name: Name | None = None
+
+
+class Record(Request):
+    """Begin or end recording telemetry at full rate."""
+
+    verb: Literal["record"] = "record"
+    on: bool
+
+
+class ClearFault(Request):
+    """The operator has looked: end the fault's latch, and open the devices again if they were closed."""
+
+    verb: Literal["clear_fault"] = "clear_fault"
+
+
+class Shutdown(Request):
+    """Make the mirror safe and end the server."""
+
+    verb: Literal["shutdown"] = "shutdown"
+
+
+AnyRequest = Annotated[
+    Hello | GetState | GetGeometry | GetProcedures | GetLog | GetLatest | Check
+    | Acquire | Heartbeat | Release | OpenLoop | Flatten | Abort | Start
+    | Pause | Resume | CloseLoop | SetLoop | LoadProduct | Record | ClearFault
+    | Shutdown,
+    Field(discriminator="verb"),
+]  # fmt: skip
+
+#: Checks bytes from the wire; raises :class:`pydantic.ValidationError`.
+REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)
+
+#: Requests that need the lease.
+WRITING = (Start, Pause, Resume, CloseLoop, SetLoop, LoadProduct, Record, ClearFault, Shutdown)

@@ -1,0 +1,308 @@
+"""What a server tells of itself: one document, the same for every screen."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+#: Version of the documents below; a client of another version is refused.
+SCHEMA = 1
+
+
+class Part(BaseModel):
+    """A part of the state: immutable, and nothing unknown in it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Phase(StrEnum):
+    """What the engine, the process that owns the devices, is doing."""
+
+    STARTING = "starting"
+    #: Devices open, mirror flat, frames watched.
+    IDLE = "idle"
+    #: The loop is closed and nothing else goes on.
+    LOOP = "loop"
+    #: A procedure runs, in open or closed loop.
+    PROCEDURE = "procedure"
+    #: Mirror made safe after a fault; latched until somebody clears it.
+    FAULT = "fault"
+    STOPPED = "stopped"
+
+
+class Health(StrEnum):
+    """A device's condition."""
+
+    OK = "ok"
+    #: Nothing heard for longer than its period.
+    STALE = "stale"
+    LOST = "lost"
+    FAULT = "fault"
+    CLOSED = "closed"
+
+
+class Fault(Part):
+    """Why the mirror was made safe."""
+
+    reason: str
+    at_utc: str
+    #: What the operator can do.
+    way_out: str = ""
+
+
+class Lease(Part):
+    """Who may write."""
+
+    client: str
+    name: str
+    host: str
+    pid: int
+    since_utc: str
+
+
+class DeviceState(Part):
+    """One device."""
+
+    #: Its key in ``[devices]``: ``dm``, ``wfs``, ``science``, ``screen``, ``modulator``.
+    name: str
+    kind: str
+    model: str
+    serial: str
+    simulated: bool
+    health: Health
+    #: Worth showing, units in the key: ``{"temperature_c": 31.2, "frame_rate_hz": 500.0}``.
+    facts: dict[str, float | str] = Field(default_factory=dict)
+    message: str = ""
+
+
+class Rates(Part):
+    """Frames, counted."""
+
+    frame_hz: float = 0.0
+    frames: int = 0
+    #: Frames the camera made and nobody got.
+    lost: int = 0
+
+
+class Light(Part):
+    """What the sensor's camera sees."""
+
+    #: Share of pixels at the top of their range, 0 to 1.
+    saturated: float = 0.0
+    #: Brightest pixel as share of the range.
+    peak: float = 0.0
+
+
+class Mirror(Part):
+    """Commands as fraction of full stroke."""
+
+    rms: float = 0.0
+    peak: float = 0.0
+    #: Share of the actuators held at a limit, mean over the last second.
+    clipped: float = 0.0
+
+
+class Latency(Part):
+    """Microseconds from a frame in hand to its command sent, and between frames, last second."""
+
+    p50: float = 0.0
+    p99: float = 0.0
+    largest: float = 0.0
+    #: 99th percentile of the deviation of the frames' spacing from its median.
+    jitter_p99: float = 0.0
+
+
+class LoopState(Part):
+    """The loop and its parameters."""
+
+    closed: bool = False
+    #: Name of the matrix in use, as in ``State.products``.
+    matrix: str = ""
+    gain: float = 0.0
+    leak: float = 0.0
+    dropped_modes: int = 0
+    modes: int = 0
+    residual_nm: float = 0.0
+    #: Running Strehl ratio of the science camera by its peak, where there is one and a model PSF.
+    strehl: float | None = None
+    strehl_sigma: float | None = None
+
+
+class Finish(StrEnum):
+    """How a procedure ended."""
+
+    DONE = "done"
+    ABORTED = "aborted"
+    FAILED = "failed"
+
+
+class Running(Part):
+    """The procedure that runs."""
+
+    id: int
+    name: str
+    arguments: dict[str, Any]
+    stage: str = ""
+    done: int = 0
+    total: int = 0
+    unit: str = "frame"
+    elapsed_s: float = 0.0
+    #: Seconds left in this stage; ``None``: not known yet.
+    remaining_s: float | None = None
+    metrics: dict[str, float] = Field(default_factory=dict)
+    paused: bool = False
+    started_utc: str = ""
+
+
+class Ended(Part):
+    """A procedure that ended."""
+
+    id: int
+    name: str
+    finish: Finish
+    message: str = ""
+    #: Run folder.
+    folder: str = ""
+    #: Name -> path.
+    products: dict[str, str] = Field(default_factory=dict)
+    #: The run's ``result.json``.
+    document: dict[str, Any] = Field(default_factory=dict)
+
+
+class Product(Part):
+    """A matrix or PSF that the engine holds, by name."""
+
+    name: str
+    #: ``matrix``, ``gains``, ``psf``.
+    kind: str
+    path: str
+    #: One line for a list: method, frames, modes.
+    summary: str = ""
+
+
+class Telemetry(Part):
+    """Recording at full rate."""
+
+    recording: bool = False
+    path: str = ""
+    written: int = 0
+    #: Frames that were not written because the disk was behind.
+    dropped: int = 0
+
+
+class Disk(Part):
+    """Where runs go."""
+
+    folder: str = ""
+    free_gb: float = 0.0
+
+
+class StreamEntry(Part):
+    """A stream and the shared memory it lies in."""
+
+    name: str
+    segment: str
+    unit: str = ""
+
+
+class State(Part):
+    """Everything a screen shows, but for the pictures."""
+
+    schema_version: int = SCHEMA
+    #: Counts up with every change.
+    serial: int = 0
+    at_utc: str = ""
+    server_pid: int = 0
+    engine_pid: int = 0
+    version: str = ""
+    system: str = ""
+    simulated: bool = True
+    seed: int = 0
+    phase: Phase = Phase.STARTING
+    fault: Fault | None = None
+    lease: Lease | None = None
+    devices: tuple[DeviceState, ...] = ()
+    rates: Rates = Rates()
+    light: Light = Light()
+    mirror: Mirror = Mirror()
+    latency: Latency = Latency()
+    loop: LoopState = LoopState()
+    procedure: Running | None = None
+    last: Ended | None = None
+    products: tuple[Product, ...] = ()
+    telemetry: Telemetry = Telemetry()
+    disk: Disk = Disk()
+    streams: tuple[StreamEntry, ...] = ()
+    #: Counts up whenever the sensor's geometry changes: time to ask for it again.
+    geometries: int = 0
+    clients: int = 0
+    #: Messages that were no requests, or none that may be made: malformed, too large, without the lease.
+    refused: int = 0
+    #: What the server found when it started: a crash before, a calibration that can be resumed.
+    notes: tuple[str, ...] = ()
+
+
+class LogLine(Part):
+    """One line of the log."""
+
+    number: int
+    at_utc: str
+    level: str
+    logger: str
+    text: str
+
+
+class Geometry(Part):
+    """Where slopes and actuators stand, for maps."""
+
+    #: Valid sub-apertures, rows of 0 and 1; slopes run through them row by row, all x and then all y.
+    valid: tuple[str, ...] = ()
+    #: Actuators on their grid, rows of 0 and 1; empty when they stand on none.
+    layout: tuple[str, ...] = ()
+    #: Places (x, y) in metres of actuators without a grid.
+    places_m: tuple[tuple[float, float], ...] = ()
+    #: Sub-aperture or pupil outlines on the camera: (x, y, half width) in pixels each.
+    outlines_px: tuple[tuple[float, float, float], ...] = ()
+    n_modes: int = 0
+
+
+#: Arguments of a procedure by name.
+Arguments = dict[str, float | int | bool | str | None]
+
+
+class Plan(Part):
+    """What a procedure would do, found out before anything moves."""
+
+    name: str
+    arguments: dict[str, Any]
+    #: Frames it will take, and seconds at the camera's rate.
+    frames: int
+    seconds: float
+    #: Largest poke of an actuator, as fraction of full stroke.
+    stroke: float
+    warnings: tuple[str, ...] = ()
+
+
+class Parameter(Part):
+    """One argument of a procedure, enough to make a form of it."""
+
+    name: str
+    #: ``int``, ``float``, ``bool``, ``choice``, ``text``, ``matrix`` (a name out of ``State.products``).
+    kind: str
+    default: float | int | bool | str | None = None
+    unit: str = ""
+    help: str = ""
+    choices: tuple[str, ...] = ()
+    low: float | None = None
+    high: float | None = None
+
+
+class ProcedureEntry(Part):
+    """A procedure that a server offers."""
+
+    name: str
+    title: str
+    help: str
+    parameters: tuple[Parameter, ...] = ()

@@ -1,0 +1,1 @@
+"""Live data in shared memory, and at full rate on disk."""

@@ -1,0 +1,227 @@
+"""Segments of shared memory: their names, whose they are, and clearing up after the dead.
+
+A segment is a file in ``/dev/shm``, mapped. It gets its name only when its header stands, so that
+nobody sees half of one, and a process that is killed before leaves nothing. Its name carries the
+user and the process that owns it; the header carries when that process began, since process
+numbers come round again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+import re
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from escape_hw.errors import EscapeError, StorageError
+
+#: Where segments lie.
+SHARED = Path("/dev/shm")
+#: The first eight bytes of a segment.
+MAGIC = int.from_bytes(b"ESCRING\0", "little")
+#: Version of the layout; a segment of another version is refused.
+SCHEMA = 1
+#: Magic, schema, owner's process and its start: the same in every version of the layout.
+IDENTITY = struct.Struct("=QQQQ")
+
+_NAME = re.compile(r"escape-(?P<uid>\d+)-(?P<system>[A-Za-z0-9._-]+)-(?P<pid>\d+)-(?P<stream>[A-Za-z0-9_]+)")
+
+
+class StreamGone(EscapeError):
+    """A stream's memory is not there (any more), or is not what it should be."""
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A segment that was found.
+
+    Parameters
+    ----------
+    name
+        ``escape-<uid>-<system>-<pid>-<stream>``, a file in :data:`SHARED`.
+    pid, started
+        Its owner, and when that began in clock ticks after boot.
+    alive
+        Whether that very process lives.
+    """
+
+    name: str
+    system: str
+    stream: str
+    pid: int
+    started: int
+    size: int
+    alive: bool
+
+
+def segment_name(system: str, stream: str, pid: int | None = None) -> str:
+    """Name of the segment of a stream; of this process by default."""
+    system = re.sub(r"[^A-Za-z0-9._-]", "_", system)
+    return f"escape-{os.getuid()}-{system}-{os.getpid() if pid is None else pid}-{stream}"
+
+
+def process_start(pid: int) -> int | None:
+    """When a process began, in clock ticks after boot; ``None``: there is none (or only its remains)."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return None
+    # The command's name stands in brackets and may hold anything.
+    fields = text[text.rindex(")") + 2 :].split()
+    return None if fields[0] in "ZX" else int(fields[19])
+
+
+def create(name: str, size: int, fill: struct.Struct, *header: int) -> mmap.mmap:
+    """Make a segment: its memory taken, its header written, and then its name.
+
+    Parameters
+    ----------
+    name
+        Its name; one that a dead process left under it is removed.
+    size
+        Bytes; they are taken now, since writing to memory that is not there kills the process.
+    fill, header
+        The layout's own part of the header, which follows :data:`IDENTITY`.
+
+    Raises
+    ------
+    StorageError
+        No room in shared memory, or the name is taken by a living process.
+    """
+    path = SHARED / name
+    try:
+        handle = os.open(SHARED, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        try:
+            os.posix_fallocate(handle, 0, size)
+            memory = mmap.mmap(handle, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
+            fill.pack_into(memory, IDENTITY.size, *header)
+            IDENTITY.pack_into(memory, 0, MAGIC, SCHEMA, os.getpid(), process_start(os.getpid()) or 0)
+            _give_name(handle, path)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise StorageError(
+            f"{path}: {size / 1e6:.1f} MB of shared memory cannot be had ({error.strerror or error}); "
+            "see what lies there with 'escape streams', clear up after dead servers with 'escape streams "
+            "--reap', or make /dev/shm larger"
+        ) from error
+    return memory
+
+
+def _give_name(handle: int, path: Path) -> None:
+    source = f"/proc/self/fd/{handle}"
+    # With a folder given, which the whole path overrides, Python follows the link to the file itself.
+    try:
+        os.link(source, path, src_dir_fd=handle)
+    except FileExistsError:
+        found = examine(path.name)
+        if found is None or found.alive:
+            raise
+        path.unlink()
+        os.link(source, path, src_dir_fd=handle)
+
+
+def attach(name: str) -> mmap.mmap:
+    """Map a segment for reading.
+
+    Raises
+    ------
+    StreamGone
+        It is not there, another user's, of another version, or no segment at all.
+    """
+    path = SHARED / name
+    if not _NAME.fullmatch(name):
+        raise StreamGone(f"'{name}' is no name of a stream's memory; 'escape streams' lists those there are")
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            status = os.fstat(handle)
+            if status.st_uid not in (os.getuid(), 0):
+                raise StreamGone(f"{path} belongs to user {status.st_uid}; it is not read")
+            memory = mmap.mmap(handle, status.st_size, flags=mmap.MAP_SHARED, prot=mmap.PROT_READ)
+        finally:
+            os.close(handle)
+    except (OSError, ValueError) as error:
+        raise StreamGone(f"{path}: no such stream ({error}); has its server ended?") from error
+    magic, schema, *_ = IDENTITY.unpack_from(memory) if len(memory) >= IDENTITY.size else (0, 0)
+    if (magic, schema) != (MAGIC, SCHEMA):
+        memory.close()
+        raise StreamGone(
+            f"{path} is of version {schema}, this program reads {SCHEMA}; "
+            "use the same version of escape-hw as its server"
+            if magic == MAGIC
+            else f"{path} is no stream of ESCAPE"
+        )
+    return memory
+
+
+def remove(name: str) -> None:
+    """Take a segment's name away; those who have it mapped keep what they see."""
+    with contextlib.suppress(FileNotFoundError):
+        (SHARED / name).unlink()
+
+
+def examine(name: str) -> Segment | None:
+    """What a segment says of itself; ``None`` when it is none, or has gone."""
+    parts = _NAME.fullmatch(name)
+    if parts is None:
+        return None
+    try:
+        with open(SHARED / name, "rb", opener=_no_link) as file:
+            head, size = file.read(IDENTITY.size), os.fstat(file.fileno()).st_size
+    except OSError:
+        return None
+    if len(head) < IDENTITY.size or IDENTITY.unpack(head)[0] != MAGIC:
+        return None
+    _, _, pid, started = IDENTITY.unpack(head)
+    alive = process_start(pid) == started
+    return Segment(name, parts["system"], parts["stream"], pid, started, size, alive)
+
+
+def _no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC)
+
+
+def segments(system: str | None = None, pid: int | None = None) -> tuple[Segment, ...]:
+    """The segments of this user, those of one system or one process where that is given."""
+    mine = sorted(path.name for path in SHARED.glob(f"escape-{os.getuid()}-*"))
+    found = (examine(name) for name in mine)
+    return tuple(
+        one for one in found
+        if one is not None and system in (None, one.system) and pid in (None, one.pid)
+    )  # fmt: skip
+
+
+def reap(pid: int | None = None) -> tuple[Segment, ...]:
+    """Remove the segments whose owner is dead, of one process or of all; says which."""
+    dead = tuple(one for one in segments(pid=pid) if not one.alive)
+    for one in dead:
+        remove(one.name)
+    return dead
+
+
+def readers(names: Iterable[str]) -> dict[str, tuple[int, ...]]:
+    """Processes of this user that have each segment mapped, its owner apart."""
+    users: dict[str, list[int]] = {name: [] for name in names}
+    for pid in sorted(int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()):
+        for name in _mapped(pid) & users.keys():
+            users[name].append(pid)
+    owners = {name: examine(name) for name in users}
+    return {
+        name: tuple(pid for pid in pids if (one := owners[name]) is None or pid != one.pid)
+        for name, pids in users.items()
+    }
+
+
+def _mapped(pid: int) -> set[str]:
+    """Names of the segments that a process has mapped."""
+    try:
+        lines = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:  # it has ended, or is another user's
+        return set()
+    prefix = f"{SHARED}/escape-"
+    return {line[line.index(prefix) + len(str(SHARED)) + 1 :] for line in lines if prefix in line}

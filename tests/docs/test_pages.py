@@ -1,0 +1,72 @@
+"""What the tutorials and how-to pages say can be done is done, in the order in which it stands there."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from pages import ROOT, Block, blocks_of, call, escape, spelled_right
+
+DOCS = ROOT / "docs"
+#: Pages whose blocks belong together and are run whole; of the others, commands are parsed.
+RUN = sorted([*DOCS.glob("tutorial/*.md"), *DOCS.glob("how-to/*.md"), DOCS / "reference" / "products.md"])
+EVERY = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "_generated"} & set(page.parts))
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(DOCS))
+
+
+def run_block(block: Block, folder: Path) -> None:
+    if block.language == "python":
+        done = call([sys.executable, "-c", block.text], folder)
+        assert done.returncode == 0, done.stderr
+    elif block.language == "sh":
+        for line in block.commands():
+            done = escape(line, folder)
+            # Whether this computer can drive real devices is not for a test to say.
+            allowed = (0, 1) if line.startswith("escape doctor") else (0,)
+            assert done.returncode in allowed, f"{line}: {done.stderr}"
+
+
+@pytest.mark.parametrize("page", RUN, ids=name_of)
+def test_a_page_can_be_followed(page: Path, tmp_path: Path) -> None:
+    for block in blocks_of(page):
+        if "slow" not in block.marks:
+            run_block(block, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUN, ids=name_of)
+def test_a_page_can_be_followed_to_its_end(page: Path, tmp_path: Path) -> None:
+    blocks = blocks_of(page)
+    if not any("slow" in block.marks for block in blocks):
+        pytest.skip("holds nothing that takes long")
+    for block in blocks:
+        run_block(block, tmp_path)
+
+
+@pytest.mark.parametrize("page", EVERY, ids=name_of)
+def test_blocks_are_well_formed(page: Path) -> None:
+    for block in blocks_of(page):
+        for line in block.commands() if block.language == "sh" else ():
+            spelled_right(line.replace("\\", ""))
+        if block.language == "toml":
+            tomllib.loads(block.text)
+        if block.language == "json":
+            json.loads(block.text)
+        if block.language == "python":
+            compile(block.text, str(page), "exec")
+
+
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("sphinx", reason="pip install 'escape-hw[docs]'")
+    words = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    done = call([*words, "-d", str(tmp_path / "trees"), str(DOCS), str(tmp_path / "site")], ROOT)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "site" / "reference" / "_generated" / "configuration.html").is_file()
+    text = (tmp_path / "site" / "reference" / "_generated" / "command-line.html").read_text(encoding="utf-8")
+    assert "calibrate" in text

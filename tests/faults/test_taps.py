@@ -1,0 +1,98 @@
+"""Those who look at a running bench: what they see is what passes, and their failure is theirs alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from small_bench import assert_flat, small
+
+from escape_hw.api.taps import Taps
+from escape_hw.calibration.closed_loop import integrator_for
+from escape_hw.calibration.loop_run import RunningLoop
+from escape_hw.calibration.sensor_setup import extractor
+
+
+class Seen:
+    """Copies what every tap is told."""
+
+    def __init__(self) -> None:
+        self.frames, self.images, self.slopes, self.commands, self.residuals = [], [], [], [], []
+
+    def taps(self) -> Taps:
+        return Taps(
+            frame=self.frames.append,
+            science=self.images.append,
+            slopes=lambda index, slopes: self.slopes.append((index, slopes.copy())),
+            command=lambda shape: self.commands.append(shape.copy()),
+            residual=lambda index, modes, rms: self.residuals.append((index, modes.copy(), rms)),
+        )
+
+
+def closed(bench, good, frames=60):
+    """Close the loop for some frames; what an observer sees of it."""
+    control = integrator_for(bench, good.matrix, good.grid)
+    loop = RunningLoop(bench, good.matrix.m2c, extractor(bench, good.grid), control, science=True)
+    seen = []
+    try:
+        bench.run(loop.run(frames, observe=(lambda *row: seen.append([np.array(v) for v in row]),)))
+    finally:
+        bench.dm.flatten()
+    assert_flat(bench)
+    return loop, seen
+
+
+def test_taps_see_what_passes(bench, good):
+    look = Seen()
+    bench.taps = look.taps()
+    loop, seen = closed(bench, good, 300)
+    indices = [int(row[0]) for row in seen]
+    assert [frame.index for frame in look.frames] == indices
+    assert [index for index, _ in look.slopes] == indices
+    np.testing.assert_array_equal([s for _, s in look.slopes], [row[1] for row in seen])
+    # The ramp to flat comes after the loop's commands.
+    np.testing.assert_allclose(look.commands[:300], [good.matrix.m2c @ row[2] for row in seen], atol=1e-12)
+    assert not look.commands[-1].any()
+    assert len(look.commands) > 300
+    assert [index for index, _, _ in look.residuals] == indices
+    rms = [np.linalg.norm(modes) for _, modes, _ in look.residuals]
+    np.testing.assert_allclose(rms, [value for *_, value in look.residuals], rtol=1e-5)
+    np.testing.assert_allclose(rms, np.array(loop.record.residual), rtol=1e-5)
+    assert len(look.images) >= loop.record.science.count > 0
+
+
+def test_nobody_looks_unless_asked(bench, good):
+    assert bench.taps == Taps()
+    assert (bench.wfs.tap, bench.dm.tap, bench.science.tap) == (None, None, None)
+    assert type(extractor(bench, good.grid)).__name__ == "SlopeExtractor"
+    bench.taps = Seen().taps()
+    bench.taps = Taps()
+    assert (bench.wfs.tap, bench.dm.tap, bench.science.tap) == (None, None, None)
+
+
+def test_a_tap_that_fails_is_dropped_and_the_loop_goes_on(bench, good, caplog):
+    calls = []
+
+    def failing(*row):
+        calls.append(row)
+        raise ValueError("the screen is gone")
+
+    bench.taps = Taps(failing, failing, failing, failing, failing)
+    loop, seen = closed(bench, good)
+    assert len(seen) == loop.record.frames == 60
+    told = [record.message for record in caplog.records if "is dropped" in record.message]
+    assert told == [f"the tap of {name} failed and is dropped" for name in
+                    ("frames", "slopes", "commands", "residuals")]  # fmt: skip
+    assert len(calls) == 4
+
+
+def test_a_run_ends_with_the_same_numbers_whether_it_is_looked_at_or_not(good):
+    commands = []
+    for look in (False, True):
+        with small("twin.loss_probability=0") as bench:
+            if look:
+                bench.taps = Seen().taps()
+            closed(bench, good)
+            commands.append(bench.dm.sent_count)
+            _, seen = closed(bench, good)
+            commands.append(np.stack([row[2] for row in seen]))
+    assert commands[0] == commands[2]
+    np.testing.assert_array_equal(commands[1], commands[3])

@@ -1,0 +1,126 @@
+"""A pyramid under turbulence and random pokes: what the model takes for the mean, and its doubt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from small_pyramid import configuration
+
+from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.api.registration import Registration
+from escape_hw.pipeline.pyramid_slopes import slopes_of_image
+from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+from escape_sim.pyramid_turbulence import Pokes, strength, unit_screens
+
+
+@pytest.fixture(scope="module")
+def pupils() -> PyramidPupils:
+    return nominal_pupils(configuration())
+
+
+def poked(pupils: PyramidPupils, rms: float, turbulence: float | None = 0.0) -> PyramidModel:
+    """The model of a sensor that saw pokes of ``rms`` of the stroke on all modes together."""
+    return PyramidModel(configuration(), replace(pupils, pokes=rms), turbulence=turbulence)
+
+
+def random_pokes(model: PyramidModel) -> Pokes:
+    assert model._pokes is not None
+    return model._pokes
+
+
+def test_pokes_have_the_structure_function_of_their_phases(pupils: PyramidPupils) -> None:
+    pokes = random_pokes(poked(pupils, 0.04))
+    phases, lit = pokes.phases(400), pokes.lit
+    inside = phases[:, lit]
+    assert np.sqrt(inside.var(axis=1).mean()) == pytest.approx(pokes.rms_rad, rel=0.05)
+    structure, n = pokes.structure(), lit.shape[0]
+    assert structure[n - 1, n - 1] == pytest.approx(0, abs=1e-9 * structure.max())
+    for apart in (2, 5, 10):
+        both = lit[:, apart:] & lit[:, :-apart]
+        seen = np.square(phases[:, :, apart:] - phases[:, :, :-apart])[:, both].mean()
+        assert seen == pytest.approx(structure[n - 1, n - 1 + apart], rel=0.1)
+
+
+def test_pokes_are_shared_among_modes_as_far_as_their_actuators_go() -> None:
+    modes = np.random.default_rng(0).standard_normal((4, 8, 8))
+    lit = np.ones((8, 8), bool)
+    pokes = Pokes.of(0.1, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
+    amplitude = np.sqrt(np.square(pokes.modes_rad / modes).mean(axis=(1, 2)))
+    assert amplitude[2] == pytest.approx(0.02, rel=1e-6)
+    assert amplitude[[0, 1, 3]] == pytest.approx(np.sqrt((0.01 - 0.0004) / 3), rel=1e-6)
+    # Asked for more than the limits leave, as by hand: all of them grow alike.
+    more = Pokes.of(2.0, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
+    assert np.square(more.modes_rad / modes).mean(axis=(1, 2)).sum() == pytest.approx(4.0)
+
+
+def test_strong_pokes_take_response_away(pupils: PyramidPupils) -> None:
+    calm = PyramidModel(configuration(), pupils, turbulence=0.0).zonal_matrix(Registration())
+    shaken = poked(pupils, 0.06).zonal_matrix(Registration())
+    assert 0.2 < np.vdot(calm, shaken) / np.vdot(calm, calm) < 0.8
+
+
+def test_the_mean_response_beside_pokes_is_that_of_frames(pupils: PyramidPupils) -> None:
+    config, model = configuration(), poked(pupils, 0.04)
+    optics, x = model.optics(), model._pupil.coordinates_m
+    shape = np.random.default_rng(4).standard_normal(model.n_act)
+    surfaces = model._influence(1.0).surfaces(Registration(), model.sub_aperture_m, x, x)
+    path = 2 * config.devices.dm.stroke_m * np.tensordot(shape, surfaces, 1)
+    want = model.zonal_matrix(Registration()) @ shape
+    step = 0.01 * config.system.wavelength_m / path.std()
+    seen = []
+    for phase in random_pokes(model).phases(300) * (config.system.wavelength_m / (2 * np.pi)):
+        up, down = (
+            slopes_of_image(optics.frame((phase + sign * step * path).astype(np.float32)), pupils)
+            for sign in (1, -1)
+        )
+        seen.append((up - down) / (2 * step))
+    mean = np.mean(seen, axis=0)
+    noise = np.std(seen, axis=0).mean() / np.sqrt(len(seen))
+    # Pokes are stronger at the rim than in the middle, the model takes them for even.
+    assert np.sqrt(np.mean(np.square(mean - want))) < 0.1 * np.std(want) + 1.5 * noise
+    assert np.vdot(mean, want) / np.vdot(want, want) == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("ratio", [1.5, 4.0, 8.0, 14.0])
+def test_the_strength_is_told_beside_pokes(pupils: PyramidPupils, ratio: float) -> None:
+    model = poked(pupils, 0.05)
+    optics, pokes = model.optics(), random_pokes(model)
+    # Other phases than those that the estimate compares with.
+    rng = np.random.default_rng(5)
+    air = np.array([screen.T[::-1] for screen in unit_screens(optics.amplitude.shape[0], 4.0)])
+    air = np.tile(air * ratio ** (5 / 6), (4, 1, 1))
+
+    def slopes() -> NDArray[np.float64]:
+        beside = np.tensordot(rng.standard_normal((len(air), len(pokes.modes_rad))), pokes.modes_rad, 1)
+        paths = ((air + beside) * (optics.wavelength_m / (2 * np.pi))).astype(np.float32)
+        return np.array([slopes_of_image(optics.frame(path), pupils) for path in paths])
+
+    first, second = slopes(), slopes()
+    freedom = np.sqrt(len(air) / (len(air) - 1))
+    first, second = (freedom * (s - s.mean(axis=0)) for s in (first, second))
+    rms = float(np.sqrt(np.mean(np.square([first, second]))))
+    seen = replace(pupils, motion=rms, steady=float(np.mean(first * second) / rms**2))
+    assert strength(optics, seen, 4.0, pokes) == pytest.approx(ratio, rel=0.3)
+
+
+def test_pokes_alone_are_no_turbulence(pupils: PyramidPupils) -> None:
+    model = poked(replace(pupils, motion=0.4, steady=0.0), 0.05, turbulence=None)
+    assert model.turbulence == 0
+
+
+def test_the_doubt_falls_with_the_states_that_were_seen(pupils: PyramidPupils) -> None:
+    config, few = configuration(), replace(pupils, looks=4.0, centre_sigma_px=0.01)
+    model = PyramidModel(config, few, turbulence=8.0)
+    once = model.registration_doubt
+    assert (once > 0).all()
+    assert 0.5 < once[0] < 30
+    assert 0.01 < once[2] < 3
+    many = PyramidModel(config, replace(few, looks=400.0, centre_sigma_px=0.0), turbulence=8.0)
+    assert many.registration_doubt[2:3] == pytest.approx(once[2:3] / 10)
+    still = PyramidModel(config, replace(pupils, centre_sigma_px=0.01), turbulence=8.0)
+    assert still.registration_doubt[2] == 0
+    assert (many.registration_doubt[3:] < once[3:]).all()
+    assert still.registration_doubt[0] == pytest.approx(1.0, rel=0.1)

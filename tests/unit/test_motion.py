@@ -1,0 +1,64 @@
+"""What the slopes of a run say of the air: how much it moves, for how long, and beside which pokes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.calibration.acquire import Motion
+
+
+def pupils() -> PyramidPupils:
+    valid = np.ones((8, 8), bool)
+    return PyramidPupils(
+        np.zeros((4, 2)), 8.0, np.zeros((4, 2), np.intp), valid, np.zeros((64, 2), np.float32),
+        np.ones((8, 8), np.float32),
+    )  # fmt: skip
+
+
+def run(frames: int, memory: float, white: float, seed: int) -> PyramidPupils:
+    """Slopes that forget over ``memory`` frames beside a white share of their variance."""
+    rng = np.random.default_rng(seed)
+    motion, keep = Motion(128), np.exp(-1 / memory)
+    air = rng.standard_normal(128)
+    for _ in range(frames):
+        air = keep * air + np.sqrt(1 - keep**2) * rng.standard_normal(128)
+        slopes = np.sqrt(1 - white) * air + np.sqrt(white) * rng.standard_normal(128)
+        motion.add((0.3 * slopes + 0.1).astype(np.float32), 0.05 * rng.standard_normal(4))
+    found = motion.of(pupils())
+    assert isinstance(found, PyramidPupils)
+    return found
+
+
+@pytest.mark.parametrize(("memory", "white"), [(20.0, 0.0), (20.0, 0.6), (5.0, 0.3)])
+def test_motion_pokes_and_what_lasts(memory: float, white: float) -> None:
+    found = [run(1500, memory, white, seed) for seed in range(4)]
+    assert np.mean([f.motion for f in found]) == pytest.approx(0.3, rel=0.03)
+    assert np.mean([f.pokes for f in found]) == pytest.approx(0.1, rel=0.03)
+    assert np.mean([f.steady for f in found]) == pytest.approx((1 - white) * np.exp(-2 / memory), abs=0.04)
+    # The integral of an exponential's correlation is twice its memory.
+    integral = 1 + (1 - white) * (2 / (np.exp(1 / memory) - 1))
+    assert np.mean([f.looks for f in found]) == pytest.approx(1500 / integral, rel=0.3)
+
+
+def test_too_few_frames_tell_no_looks() -> None:
+    assert run(3, 5.0, 0.0, 1).looks == 0
+    assert run(2, 5.0, 0.0, 1).steady == 0
+
+
+def test_a_run_that_goes_on_later_tells_the_same() -> None:
+    rng = np.random.default_rng(7)
+    slopes, pokes = rng.standard_normal((300, 16)).cumsum(axis=0), rng.standard_normal((300, 4))
+    whole, first, second = Motion(16), Motion(16), Motion(16)
+    for k in range(300):
+        whole.add(slopes[k].astype(np.float32), pokes[k])
+        if k == 170:
+            second.restore(first.state())
+        (first if k < 170 else second).add(slopes[k].astype(np.float32), pokes[k])
+    one, other = whole.of(pupils()), second.of(pupils())
+    assert isinstance(one, PyramidPupils)
+    assert isinstance(other, PyramidPupils)
+    assert (other.motion, other.pokes, other.looks) == pytest.approx((one.motion, one.pokes, one.looks))
+    # Two pairs across the interruption are lost.
+    assert other.steady == pytest.approx(one.steady, abs=0.02)
