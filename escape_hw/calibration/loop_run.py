@@ -19,6 +19,7 @@ from escape_hw.calibration.acquire import LightWatch, next_frame, reachable
 from escape_hw.pipeline.command_shape import shaper
 from escape_hw.pipeline.controller import Controller
 from escape_hw.pipeline.frame_stack import FrameStack
+from escape_hw.pipeline.strehl import peak_is_clipped
 from escape_hw.streams.loop_timing import LoopTiming
 
 #: Seconds after closing during which the science frames do not count.
@@ -174,7 +175,7 @@ class RunningLoop:
             if self._science is not None and record.frames > self._closing:
                 image = self._science.poll()
                 if image is not None and record.frames > self._closing + 2:
-                    record.science.add(image.data)
+                    record.science.add(image.data, clipped=peak_is_clipped(image))
             if report.step():
                 yield report.now({"residual": _newest(record.residual)}, residual_nm=record.residual[-1])
         return record
