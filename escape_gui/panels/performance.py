@@ -26,8 +26,8 @@ class PerformancePanel(Panel):
     title: ClassVar[str] = "Performance"
     help: ClassVar[str] = (
         "Strehl ratio of the science camera by its peak against the model, and residual wavefront of the "
-        "modes the loop controls, over the last two minutes. Gaps: the panel was hidden, the loop open, or no model "
-        "image."
+        "modes the loop controls, over the last two minutes. Gaps: the panel was "
+        "hidden, the loop was open, or there is no model image."
     )
     rate_hz: ClassVar[float] = 10.0
     empty: ClassVar[str] = (
