@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt, QTimer, QUrl
-from PySide6.QtGui import QDesktopServices
+from PySide6.QtGui import QDesktopServices, QResizeEvent
 from PySide6.QtWidgets import (
     QComboBox,
     QFrame,
@@ -148,6 +148,8 @@ class ProcedurePanel(Panel):
         _put(self.progress, "" if running is None else words.progress_line(running))
         _put(self._metrics, "" if running is None else self._watched(running.metrics))
         self.pause.setText("Go on" if running is not None and running.paused else "Pause")
+        # While something runs, what came of the last one only takes its room.
+        self._outcome.setVisible(self._ended is not None and running is None)
         if state.last is not None and (self._ended is None or state.last.id != self._ended.id):
             self._show_ended(state.last)
 
@@ -283,6 +285,12 @@ class ProcedurePanel(Panel):
         if path and Path(path).exists():
             QDesktopServices.openUrl(QUrl.fromLocalFile(path))
 
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Words wrap anew."""
+        super().resizeEvent(event)
+        for label in (self._about, self.plan, self.progress, self._metrics):
+            _fit(label)
+
     def restyle(self) -> None:
         """Numbers in letters that do not jitter."""
         theme = self.context.theme
@@ -296,6 +304,12 @@ def _put(label: QLabel, text: str) -> None:
     """Words that take no room while there are none."""
     label.setText(text)
     label.setVisible(bool(text))
+    _fit(label)
+
+
+def _fit(label: QLabel) -> None:
+    """Lines that wrap ask for their height only where somebody gives it to them."""
+    label.setMinimumHeight(max(0, label.heightForWidth(label.width())) if label.text() else 0)
 
 
 def _words() -> QLabel:

@@ -139,7 +139,7 @@ class MapTiles(QWidget):
 
     def _title(self, tile: Tile) -> str:
         low, high = tile.limits
-        scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:.3g}"
+        scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:.4g}"
         muted = self._theme.colours.muted
         return f"<b>{tile.title}</b><br><span style='color:{muted}'>{tile.note}<br>colours {scale}</span>"
 

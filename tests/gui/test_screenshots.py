@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import serving
+from PIL import Image
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QImage
 from PySide6.QtTest import QTest
 from whole_run import Operator, operating
 
@@ -22,13 +23,16 @@ def picture(operator: Operator, name: str) -> None:
     for note in tuple(operator.window.toasts.notes):
         note.shut.click()
     operator.settle(1.0)
-    image = operator.window.grab().toImage().convertToFormat(QImage.Format.Format_RGB888)
-    few = image.convertToFormat(QImage.Format.Format_Indexed8, Qt.ImageConversionFlag.ThresholdDither)
     FIGURES.mkdir(exist_ok=True)
-    assert few.save(str(FIGURES / f"{name}.png"), "PNG")
+    path = FIGURES / f"{name}.png"
+    assert operator.window.grab().save(str(path))
+    with Image.open(path) as image:
+        few = image.convert("RGB").quantize(128)
+    few.save(path, optimize=True)
 
 
-def test_pictures_of_the_tutorial(tmp_path: Path) -> None:
+def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving, "SYSTEM", "razor-shwfs")
     with operating("razor-shwfs", tmp_path) as operator:
         window = operator.window
         panels, source = window.panels, window.context.session
@@ -46,7 +50,7 @@ def test_pictures_of_the_tutorial(tmp_path: Path) -> None:
         operator.until(lambda: panels["modes"].which.currentData() == "as measured now", "maps fill in")
         picture(operator, "measuring")
         operator.until(lambda: operator.ended(before), "it ends")
-        operator.run("push-pull")
+        operator.run("push-pull", frames="1")
         operator.until(lambda: "push-pull" in panels["modes"].matrices, "the baseline is shown")
         panels["modes"].mosaic.choose(9)
         picture(operator, "detail")
@@ -56,6 +60,7 @@ def test_pictures_of_the_tutorial(tmp_path: Path) -> None:
         loop = panels["loop"]
         held = [one.name for one in source.source.state.products if one.name.startswith("escape")]
         loop.matrix.setCurrentText(min(held, key=len))
+        loop.matrix.activated.emit(loop.matrix.currentIndex())
         QTest.mousePress(loop.close_button, Qt.MouseButton.LeftButton)
         operator.settle(1.5)
         QTest.mouseRelease(loop.close_button, Qt.MouseButton.LeftButton)

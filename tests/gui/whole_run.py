@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import serving
 from conftest import dispose
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
-from serving import SYSTEM, serving
 
 from escape_gui.app import Desk
 from escape_gui.main_window import MainWindow
@@ -110,11 +110,11 @@ class Operator:
 @contextmanager
 def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Operator]:
     """A server of a system, and the window as the command makes it."""
-    with serving(system, "--quiet", folder=folder) as served:
+    with serving.serving(system, "--quiet", folder=folder) as served:
         os.environ["XDG_RUNTIME_DIR"] = served.environment["XDG_RUNTIME_DIR"]
         session = Session()
         window = MainWindow(session, Settings(**{"workspace": "calibrate", **settings}), None)
-        desk = Desk(window, session, SYSTEM, None)
+        desk = Desk(window, session, serving.SYSTEM, None)
         window.resize(1280, 800)
         window.ticker.start()
         window.show()
