@@ -1,7 +1,8 @@
 """Optical gains on a pyramid twin: against the twin's truth, and what they do for the loop.
 
     python benchmarks/optical_gains.py gains --seeds 1 2 3      bias and errors against the truth
-    python benchmarks/optical_gains.py loops --seeds 1 2 3      Strehl ratios of three matrices, paired
+    python benchmarks/optical_gains.py loops --seeds 1 2 3      Strehl ratios of three matrices on equal air
+    python benchmarks/optical_gains.py paired --read FILE       what its lines say: means, paired differences
     python benchmarks/optical_gains.py pokes --seeds 1 2 3      Strehl ratio with and without the last pokes
 
 One JSON document per seed and line. The truth is push-pull around wavefronts frozen while the loop ran.
@@ -31,17 +32,20 @@ from escape_hw.pipeline.strehl import strehl
 from escape_hw.runtime.system import System, open_system
 from escape_sim.local_response import FrozenWavefronts, local_gains, twin_behind
 
+#: Where on the twin's clock the judged loops begin, in seconds: behind the air of the scan.
+FROM_S = 4.0
 
-def calibrated(bench: System, frames: int) -> tuple[CalibrationResult, CalibrationResult]:
+
+def calibrated(bench: System, options: argparse.Namespace) -> tuple[CalibrationResult, CalibrationResult]:
     """ESCAPE under turbulence, and the baseline (push-pull without it) on the same geometry."""
-    escape = bench.calibrate("escape", frames=frames)
-    baseline = bench.calibrate("push-pull", frames=5, grid=escape.grid)
+    escape = bench.calibrate("escape", frames=options.calibration)
+    baseline = bench.calibrate("push-pull", frames=options.baseline, grid=escape.grid)
     return escape, baseline
 
 
 def gains(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     """Gains at pokes of 0.2 % of the stroke against push-pull around the frozen wavefronts."""
-    _, baseline = calibrated(bench, options.calibration)
+    _, baseline = calibrated(bench, options)
     pupils, twin = baseline.grid, twin_behind(bench)
     if not isinstance(pupils, PyramidPupils):
         raise SystemExit("optical gains are a pyramid's; choose another system")
@@ -103,7 +107,7 @@ def scaled(result: CalibrationResult, factor: float) -> CalibrationResult:
 
 def loops(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     """Strehl ratios with the baseline, with ESCAPE scaled by its optical gains, with DO-CRIME alone."""
-    escape, baseline = calibrated(bench, options.calibration)
+    escape, baseline = calibrated(bench, options)
     if escape.measured is None:
         raise SystemExit("too few frames for a DO-CRIME matrix")
     psf = bench.take_model_psf(frames=5)
@@ -116,28 +120,35 @@ def loops(bench: System, options: argparse.Namespace) -> dict[str, Any]:
         "rounds": len(run.result.rounds),
     }
     usual = bench.config.loop.gain
-    shares = [
-        float(np.median(m.matrix.data.std(0) / run.rescaled.matrix.data.std(0))) for m in (baseline, docrime)
-    ]
-    matrices = {
-        "escape+og": (run.rescaled, 1.0),
-        "baseline": (baseline, shares[0]),
-        "docrime": (docrime, shares[1]),
-    }
-    for name, (matrix, share) in matrices.items():
-        # Each around the gain that is the usual one for its scale, as a sweep would find it, and each on
-        # a bench of its own with the same seed: the same turbulence from the first frame on.
-        document[name] = []
-        for factor in options.factors:
-            with open_system(options.system, seed=bench.config.system.seed, set=options.set) as fresh:
-                document[name].append(_judged(fresh, matrix, usual * share * factor, options.loop, psf))
+    for name, matrix in {"escape+og": run.rescaled, "baseline": baseline, "docrime": docrime}.items():
+        share = float(np.median(matrix.matrix.data.std(0) / run.rescaled.matrix.data.std(0)))
+        # Each at its own best gain, as a sweep would find it, from gains that are alike in their effect;
+        # and judged on other air than that which chose it, the same for all three.
+        scan = [
+            _judged(bench, matrix, usual * share * factor, options.scan, psf, options) | {"factor": factor}
+            for factor in options.factors
+        ]
+        best = max(scan, key=lambda one: one["strehl"][0] if one["strehl"] and one["stable"] else 0.0)
+        judged = _judged(bench, matrix, best["gain"], options.loop, psf, options, from_s=FROM_S)
+        document[name] = {"share": share, "scan": scan, "factor": best["factor"], **judged}
     return document
 
 
-def _judged(bench: System, matrix: CalibrationResult, gain: float, frames: int, psf: Any) -> dict[str, Any]:
-    result: LoopResult = bench.run(
-        closed_loop(bench, matrix.matrix, matrix.grid, gain=gain, frames=frames, model_psf=psf)
-    )
+def _judged(
+    bench: System,
+    matrix: CalibrationResult,
+    gain: float,
+    frames: int,
+    psf: Any,
+    options: argparse.Namespace,
+    from_s: float = 0.0,
+) -> dict[str, Any]:
+    """A loop on a bench of its own with the same seed: the same turbulence from ``from_s`` on."""
+    with open_system(options.system, seed=bench.config.system.seed, set=options.set) as fresh:
+        twin_behind(fresh).advance_to(from_s)
+        result: LoopResult = fresh.run(
+            closed_loop(fresh, matrix.matrix, matrix.grid, gain=gain, frames=frames, model_psf=psf)
+        )
     peak = result.strehl.peak if result.strehl is not None else None
     return {
         "gain": gain,
@@ -146,9 +157,23 @@ def _judged(bench: System, matrix: CalibrationResult, gain: float, frames: int, 
     }
 
 
+def paired(lines: list[str]) -> list[str]:
+    """Mean Strehl ratios over the seeds, and of differences on the same air, from documents of ``loops``."""
+    seeds = [one for one in map(json.loads, lines) if one["what"] == "loops"]
+    names = ("escape+og", "baseline", "docrime")
+    ratios = {name: np.array([one[name]["strehl"][0] for one in seeds]) for name in names}
+    said = [f"{len(seeds)} seeds"]
+    said += [f"{name}: {100 * ratio.mean():.2f} %" for name, ratio in ratios.items()]
+    for one, other in (("escape+og", "baseline"), ("docrime", "baseline"), ("docrime", "escape+og")):
+        difference = 100 * (ratios[one] - ratios[other])
+        error = difference.std(ddof=1) / np.sqrt(len(seeds)) if len(seeds) > 1 else np.nan
+        said.append(f"{one} minus {other}: {difference.mean():+.2f} +- {error:.2f} % of Strehl ratio")
+    return said
+
+
 def pokes(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     """Strehl ratio with the budgeted pokes, with those of 0.2 % of the stroke, and with next to none."""
-    _, baseline = calibrated(bench, options.calibration)
+    _, baseline = calibrated(bench, options)
     psf = bench.take_model_psf(frames=5)
     whole = poke_amplitudes(bench, baseline.matrix.m2c, options.poke)
     optics = bench.dm.info.stroke_m, bench.config.system.wavelength_m
@@ -175,11 +200,15 @@ def options_of(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("gains", "loops", "pokes"))
+    parser.add_argument("what", choices=("gains", "loops", "paired", "pokes"))
+    parser.add_argument("--read", type=argparse.FileType("r"), help="lines that loops printed")
     parser.add_argument("--system", default="razor-pywfs")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--calibration", type=int, default=1500, help="frames of ESCAPE")
+    parser.add_argument(
+        "--baseline", type=int, default=20, help="frames of the baseline per push and per pull"
+    )
     parser.add_argument("--frames", type=int, default=4000, help="frames of a measurement, at most")
     parser.add_argument("--accuracy", type=float, default=0.02)
     parser.add_argument("--poke", type=float, default=0.002)
@@ -187,8 +216,11 @@ def options_of(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--every", type=int, default=6, help="modes from one to the next that the truth is made for"
     )
-    parser.add_argument("--loop", type=int, default=900, help="frames of each closed loop")
-    parser.add_argument("--factors", nargs="+", type=float, default=[0.8, 1.2, 1.6])
+    parser.add_argument("--loop", type=int, default=1800, help="frames of each closed loop that is judged")
+    parser.add_argument(
+        "--scan", type=int, default=700, help="frames of each loop that looks for the best gain"
+    )
+    parser.add_argument("--factors", nargs="+", type=float, default=[0.55, 0.7, 0.85, 1.0, 1.2, 1.4])
     return parser.parse_args(arguments)
 
 
@@ -203,6 +235,15 @@ def documents(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         yield {"what": options.what, "seed": seed, **document, "wall_s": round(time.monotonic() - began, 1)}
 
 
-if __name__ == "__main__":
-    for one in documents(options_of()):
+def main() -> None:
+    """Parse, and do one of the four."""
+    options = options_of()
+    if options.what == "paired":
+        print(*paired(options.read.read().splitlines()), sep="\n")
+        return
+    for one in documents(options):
         print(json.dumps(one), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,1 @@
-"""The graphical interface: the only package that may import Qt.
-
-No window is part of this version; the command line and scripts do everything.
-"""
+"""The graphical interface: the only package that may import Qt. A client of the server, and no more."""

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from escape_hw.config.load import load_system
     from escape_hw.config.registry import register_device
     from escape_hw.io.fits import load_matrix, save_matrix
+    from escape_hw.remote.client import Connection, connect
     from escape_hw.runtime.system import System, open_system
     from escape_hw.safety.limits import MirrorLimits
 
@@ -59,6 +60,7 @@ _HOME = {
     "CameraSettings": "escape_hw.api.frames",
     "CalibrationResult": "escape_hw.api.results",
     "Checkpoint": "escape_hw.calibration.checkpoint",
+    "Connection": "escape_hw.remote.client",
     "DMInfo": "escape_hw.api.mirror",
     "DeformableMirror": "escape_hw.api.mirror",
     "Frame": "escape_hw.api.frames",
@@ -90,6 +92,7 @@ _HOME = {
     "best_gain": "escape_hw.calibration.gain_search",
     "bundled_systems": "escape_hw.config.bundled",
     "closed_loop": "escape_hw.calibration.closed_loop",
+    "connect": "escape_hw.remote.client",
     "docrime": "escape_hw.calibration.docrime",
     "docrime_closed_loop": "escape_hw.calibration.docrime_closed",
     "errors": "escape_hw.errors",
@@ -115,6 +118,7 @@ __all__ = [
     "CameraInfo",
     "CameraSettings",
     "Checkpoint",
+    "Connection",
     "DMInfo",
     "DeformableMirror",
     "Frame",
@@ -147,6 +151,7 @@ __all__ = [
     "best_gain",
     "bundled_systems",
     "closed_loop",
+    "connect",
     "docrime",
     "docrime_closed_loop",
     "errors",

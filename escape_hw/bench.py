@@ -121,6 +121,7 @@ class Bench:
             harmless("slopes", taps.slopes),
             harmless("commands", taps.command),
             harmless("residuals", taps.residual),
+            harmless("geometries", taps.geometry),
         )
         self.wfs.tap, self.dm.tap = self._taps.frame, self._taps.command
         if self.science is not None:

@@ -82,3 +82,19 @@ class Aborted(EscapeError):
     def __init__(self, message: str = "aborted by the operator", partial: object = None) -> None:
         super().__init__(message)
         self.partial = partial
+
+
+class LeaseHeld(EscapeError):
+    """Somebody else has the right to write, or nobody asked for it."""
+
+
+class ServerGone(EscapeError):
+    """No server answers."""
+
+    exit_code = 3
+
+
+class RequestRefused(EscapeError):
+    """A server does not take a request: malformed, not now, or not from here."""
+
+    exit_code = 2

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.results import StrehlEstimate
+from escape_hw.api.thumbnail import curve, table
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,3 +142,14 @@ class GainsResult:
     def gains(self) -> OpticalGains | None:
         """Of the last round, if there was one."""
         return self.rounds[-1].gains if self.rounds else None
+
+    def _repr_html_(self) -> str:
+        """For notebooks: gain by mode, and how the bootstrap went."""
+        gains = self.gains
+        rows: dict[str, object] = {"relative to": self.method, "rounds": len(self.rounds)}
+        if gains is not None:
+            rows["mean"] = f"{np.mean(gains.best):.3f} ± {np.mean(gains.best_sigma):.3f}"
+            rows["weakest, strongest"] = f"{gains.best.min():.3f}, {gains.best.max():.3f}"
+        rows["converged"] = "yes" if self.converged else "no"
+        rows["frames"] = f"{self.frames}, {self.lost_frames} lost"
+        return table(rows, "Optical gain by mode", "" if gains is None else curve(gains.best))

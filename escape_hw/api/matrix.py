@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.thumbnail import picture, table
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InteractionMatrix:
@@ -83,6 +85,25 @@ class InteractionMatrix:
             image[self.valid] = part
             both.append(image)
         return both[0], both[1]
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the matrix in small, what it is of, and how good it is."""
+        snr = self.snr()
+        known = (
+            f"{snr.min():.3g} at worst, median {np.median(snr):.3g}" if np.isfinite(snr).all() else "computed"
+        )
+        rows: dict[str, object] = {
+            "method": self.method,
+            "system": f"{self.system}{' (SIMULATED)' if self.simulated else ''}",
+            "size": f"{self.n_slopes} slopes × {self.n_modes} modes, in {self.slope_unit} per unit mode",
+            "signal to noise": known,
+            **{
+                name: self.metrics[name]
+                for name in ("frames", "poke", "delay_frames")
+                if name in self.metrics
+            },
+        }
+        return table(rows, "Interaction matrix", picture(self.data))
 
 
 def snr_of(data: NDArray[np.floating], sigma: NDArray[np.floating]) -> NDArray[np.float64]:

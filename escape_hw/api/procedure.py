@@ -42,7 +42,7 @@ class Progress:
         Scalars worth watching.
     arrays
         Arrays worth plotting that change a few times a second at most: ``matrix``, ``matrix_sigma``,
-        ``registration``, ``registration_sigma``, ``step_norm``, ``registration_track``, ``gains``,
+        ``valid``, ``registration``, ``registration_sigma``, ``step_norm``, ``registration_track``, ``gains``,
         ``gains_sigma``, ``gains_smooth``, ``gains_rounds``, ``residual``. In a matrix, modes that were
         not measured yet are NaN.
     """

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.api.thumbnail import curve, table
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +91,21 @@ class RegistrationEstimate:
             for name, v, s in zip(PARAMETERS, values, self.sigma, strict=True)
         }
 
+    def _repr_html_(self) -> str:
+        """For notebooks: the parameters with their errors and units, and how SPRINT came there."""
+        found = {
+            name: f"{one.value:.3f} ± {one.sigma:.3f} {one.unit}" for name, one in self.measured().items()
+        }
+        rows = {
+            **found,
+            "gain": f"{self.gain.value:.4f} ± {self.gain.sigma:.4f}",
+            "converged": f"{'yes' if self.converged else 'NO'}, {len(self.iterations)} iterations",
+            **{f"warning {number}": text for number, text in enumerate(self.warnings, 1)},
+        }
+        return table(
+            rows, "Registration", curve([np.log10(max(one.step_norm, 1e-12)) for one in self.iterations])
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
@@ -111,6 +127,18 @@ class CalibrationResult:
     partial: bool = False
     mean_frame: NDArray[np.float32] | None = None
     notes: tuple[str, ...] = ()
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the matrix, and the registration behind it."""
+        parts = [self.matrix._repr_html_()]
+        if self.registration is not None:
+            parts.append(self.registration._repr_html_())
+        rows = {
+            "frames": f"{self.frames}, {self.lost_frames} lost, {self.sky_seconds:.1f} s",
+            **({"PARTIAL": "stopped by the operator"} if self.partial else {}),
+            **{f"note {number}": text for number, text in enumerate(self.notes, 1)},
+        }
+        return "".join([*parts, table(rows)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.frames import Frame
+from escape_hw.api.sensor import SensorGeometry
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +33,8 @@ class Taps:
         Index of the sensor's newest frame, and slopes ``(n_slopes,)``, float32.
     command
         What the mirror got ``(n_act,)``, float64, fraction of full stroke.
+    geometry
+        The sensor's geometry, whenever slopes are about to be made on it.
     residual
         Of a closed loop: index of the frame, reconstructed residual ``(n_modes,)``, float32, and its rms,
         both nm rms wavefront.
@@ -42,6 +45,7 @@ class Taps:
     slopes: Callable[[int, NDArray[np.float32]], object] | None = None
     command: Callable[[NDArray[np.float64]], object] | None = None
     residual: Callable[[int, NDArray[np.float32], float], object] | None = None
+    geometry: Callable[[SensorGeometry], object] | None = None
 
 
 def harmless(name: str, tap: Callable[P, object] | None) -> Callable[P, None] | None:

@@ -27,7 +27,7 @@ class Alarm:
     seconds
         When, since tracking began.
     kind
-        ``jump``, ``misfit``, ``noise``, ``actuator``, ``limit``, ``diverged`` or ``dark``.
+        ``jump``, ``misfit``, ``noise``, ``delay``, ``actuator``, ``limit``, ``diverged`` or ``dark``.
     text
         What happened and what to do.
     """

@@ -66,7 +66,7 @@ class ClosedLoopPokes:
         control = integrator_for(bench, matrix, grid)
         self._loop = RunningLoop(bench, matrix.m2c, extractor(bench, grid), control)
         self._enough = self._stopped = False
-        self._preview = Preview(matrix.n_modes)
+        self._preview = Preview(matrix.n_modes, lambda: grid)
         self._picture: Mapping[str, NDArray[np.float32]] = {}
         self._beside = BackgroundEstimator(estimator, patient=bench.simulated, look=self._look)
 

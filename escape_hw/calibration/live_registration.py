@@ -18,6 +18,7 @@ from escape_hw.api.model import DoubtfulModel, SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, TemporalResponse
 from escape_hw.calibration.covariance import sandwich
+from escape_hw.calibration.derivatives import modal_matrix
 from escape_hw.calibration.fading_sums import FadingSums, turned
 from escape_hw.calibration.gain_curve import bends_of, curve_basis
 from escape_hw.calibration.linearisation import GAIN, WIDTH, Problem, State
@@ -54,7 +55,8 @@ class LiveEstimate:
     change
         Covariance of the registration ``(5, 5)`` without what errs alike at all times: that of a change.
     gains, gains_sigma
-        Gain of every mode relative to the synthetic model, and its error as a change ``(n_modes,)``.
+        Gain of every mode ``(n_modes,)``: :attr:`matrix` projected on the synthetic model, so what unequal
+        actuators and slopes take from a mode is in it; and its error as a change.
     rate
         Drift per second ``(6,)``: gain, then the registration.
     surprise
@@ -252,7 +254,8 @@ class LiveRegistration:
         left /= columns.sigma
         gain, timing = present.value[GAIN], value[GAIN] * self._weights.gain_sigma(response)
         gain_sigma = float(np.hypot(np.sqrt(present.covariance[GAIN, GAIN]), timing))
-        gains, gains_sigma = self._curve(present, timing)
+        unit = modal_matrix(self._model, self._start, self._frame.m2c, 1 + state.width)
+        gains = np.asarray((self._now * unit).sum(axis=0) / np.square(unit).sum(axis=0))
         width_sigma = float(np.sqrt(np.linalg.inv(system.information())[WIDTH, WIDTH]))
         estimate = RegistrationEstimate(
             Registration.from_array(present.value[1:6]),
@@ -264,7 +267,7 @@ class LiveRegistration:
             float(np.mean(np.square(system.residual))),
         )
         return LiveEstimate(
-            estimate, present.moving[1:6, 1:6], gains, gains_sigma, present.rate[:6],
+            estimate, present.moving[1:6, 1:6], gains, self._gains_sigma(present, timing), present.rate[:6],
             float(np.abs(present.surprise).max()),
             float(np.mean(np.square(left))), float(np.sqrt(own.variance.mean())),
             state.actuator_gain.copy(), self._now, response,
@@ -284,18 +287,18 @@ class LiveRegistration:
         values = np.concatenate([[state.gain], state.alpha, state.variant[n_variants:]])
         return self._line.update(values, noise, static)
 
-    def _curve(self, present: Present, timing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Gain of every mode and its error."""
+    def _gains_sigma(self, present: Present, timing: float) -> NDArray[np.float64]:
+        """Error of every mode's gain, by what the common gain and the curve err."""
         gain = present.value[GAIN]
         relative = 1 + present.value[6:] @ self._basis
         jacobian = np.concatenate([relative[None], np.zeros((5, relative.size)), gain * self._basis])
         covariance = present.moving.copy()
         covariance[GAIN, GAIN] += timing**2
         variance = np.einsum("pm,pq,qm->m", jacobian, covariance, jacobian)
-        return gain * relative, np.sqrt(np.maximum(variance, 0.0))
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def scaled_by_curve(matrix: InteractionMatrix, live: LiveEstimate) -> InteractionMatrix:
+def scaled_to_gains(matrix: InteractionMatrix, live: LiveEstimate) -> InteractionMatrix:
     """A pseudo-synthetic matrix at the live gain, with each mode's own gain in place of the common one."""
     share = live.gains / live.registration.gain.value
     return replace(matrix, data=(matrix.data * share).astype(np.float32), sigma=matrix.sigma * np.abs(share))

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.response import SLOPES, Filtered
 
+#: Standard errors by which a known response may miss what is measured, and what is nothing in any case.
+_APART, _LITTLE = 6.0, 0.05
+
 
 class ResponseSums:
     """Weights of the lags by instrumental variables: what a matrix makes of the pokes at every lag.
@@ -59,7 +62,7 @@ class ResponseSums:
         return np.asarray(np.linalg.lstsq(self._normal, self._right, rcond=1e-9)[0])
 
     def response(self, known: TemporalResponse | None) -> TemporalResponse:
-        """The response scaled to sum 1; the known one while it has the smaller errors.
+        """The response scaled to sum 1; the known one while it has the smaller errors and may be true.
 
         Parameters
         ----------
@@ -76,9 +79,10 @@ class ResponseSums:
         # Scaled to sum 1, a weight errs with all others: d(w / sum) = (1 - w 1^T) dw / sum.
         scaled = (np.eye(weights.size) - np.outer(weights / total, np.ones(weights.size))) @ bread / total
         sigma = np.sqrt(np.diag(scaled @ self._scores @ scaled.T))
-        if known is not None and known.sigma.max() < sigma.max():
+        measured = TemporalResponse(weights / total, sigma)
+        if known is not None and known.sigma.max() < sigma.max() and not contradicts(measured, known):
             return known
-        return TemporalResponse(weights / total, sigma)
+        return measured
 
     def gain_sigma(self, response: TemporalResponse) -> float:
         """Relative error that the response's errors put on the gain of a matrix."""
@@ -89,3 +93,10 @@ class ResponseSums:
         # The weights' errors sum to zero, so what all lags have in common does not count.
         spread = float(np.sqrt(np.square((seen - here) * response.sigma).sum()))
         return spread / max(abs(here), 1e-300)
+
+
+def contradicts(measured: TemporalResponse, known: TemporalResponse) -> bool:
+    """Whether two responses differ by more than their errors let one expect."""
+    errors = np.hypot(measured.sigma, known.sigma)
+    apart = np.abs(measured.weights - known.weights)
+    return bool((apart > np.maximum(_APART * errors, _LITTLE)).any())

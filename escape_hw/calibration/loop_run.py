@@ -18,6 +18,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, next_frame, reachable
 from escape_hw.pipeline.controller import Controller
 from escape_hw.pipeline.frame_stack import FrameStack
+from escape_hw.streams.loop_timing import LoopTiming
 
 #: Seconds after closing during which the science frames do not count.
 CLOSING_S = 0.3
@@ -98,6 +99,8 @@ class RunningLoop:
     ----------
     record
         What all stretches gathered so far, also when one of them was aborted.
+    timing
+        Latencies and the spacing of frames since the loop was made.
     """
 
     def __init__(
@@ -110,6 +113,7 @@ class RunningLoop:
         science: bool = False,
     ) -> None:
         self.bench, self.control, self.slopes_of, self.record = bench, control, slopes_of, LoopRecord()
+        self.timing = LoopTiming()
         self._m2c, self._to_modes = np.ascontiguousarray(m2c), np.linalg.pinv(m2c)
         self._light = LightWatch(bench.wfs.name, slopes_of.grid)
         self._science = bench.science if science else None
@@ -182,7 +186,9 @@ class RunningLoop:
         np.add(self.control(self._slopes), poke, out=self._total)
         shape = np.dot(self._m2c, self._total, out=self._shape)
         sent, over = self._sent(shape, whole)
-        record.latency.append(time.perf_counter_ns() - began)
+        ended = time.perf_counter_ns()
+        record.latency.append(ended - began)
+        self.timing.add(began, ended)
         self._light(self.slopes_of.flux)
         if over is not None:
             record.shortened += 1

@@ -95,7 +95,7 @@ def modulated(
         run = _Run(bench, extractor(bench, grid), report, mean_frame, keep, frames=n_frames)
         if state is not None:
             run.restore(state)
-        partial, preview = False, Preview(n_modes)
+        partial, preview = False, Preview(n_modes, lambda: grid)
         try:
             for modes in batches[len(run.found) :]:
                 yield from run.measure(m2c[:, modes], amplitude[modes], until)

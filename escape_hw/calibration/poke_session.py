@@ -96,7 +96,7 @@ class PokeSession:
         """
         bench, to_modes = self.bench, np.linalg.pinv(self.m2c)
         self.planned = frames
-        report, preview = Reporter(stage, frames), Preview(self.m2c.shape[1])
+        report, preview = Reporter(stage, frames), Preview(self.m2c.shape[1], lambda: self.grid)
         try:
             bench.dm.flatten()
             prepare_sensor(bench)

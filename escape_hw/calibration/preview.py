@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.sensor import SensorGeometry
+
 #: Seconds between two pictures at least ...
 PERIOD_S = 1.0
 #: ... and share of the time that making them may take.
@@ -24,10 +26,12 @@ class Preview:
     ----------
     n_modes
         Modes of the whole matrix; those not measured yet are shown as NaN.
+    grid
+        Tells the geometry that the slopes belong to, once it is known.
     """
 
-    def __init__(self, n_modes: int) -> None:
-        self._n_modes = n_modes
+    def __init__(self, n_modes: int, grid: Callable[[], SensorGeometry | None]) -> None:
+        self._n_modes, self._grid = n_modes, grid
         self._next = time.monotonic() + PERIOD_S
 
     def due(self) -> bool:
@@ -46,7 +50,9 @@ class Preview:
     def _arrays(
         self, matrix: NDArray[np.floating], sigma: NDArray[np.floating]
     ) -> Mapping[str, NDArray[np.float32]]:
-        return {"matrix": self._whole(matrix), "matrix_sigma": self._whole(sigma)}
+        grid = self._grid()
+        where = {} if grid is None else {"valid": grid.valid.astype(np.float32)}
+        return {**where, "matrix": self._whole(matrix), "matrix_sigma": self._whole(sigma)}
 
     def _whole(self, columns: NDArray[np.floating]) -> NDArray[np.float32]:
         """All modes, also those not measured yet."""

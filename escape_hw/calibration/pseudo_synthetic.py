@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -60,6 +62,28 @@ def synthesise(
     data, sigma = pseudo_synthetic(bench.model(grid), estimate, m2c)
     matrix = measured_matrix(bench, grid, m2c, data, sigma, "escape", gain=estimate.gain.value)
     return CalibrationResult(matrix, grid, 0, 0, 0.0, registration=estimate)
+
+
+def synthetic_of(
+    measured: CalibrationResult, model: SyntheticModel, estimate: RegistrationEstimate
+) -> CalibrationResult:
+    """The pseudo-synthetic matrix behind a measured one, with no bench at hand.
+
+    Parameters
+    ----------
+    measured
+        The calibration whose matrix was fitted.
+    model
+        The synthetic model on the geometry of that calibration.
+    estimate
+        The registration that fits it.
+    """
+    data, sigma = pseudo_synthetic(model, estimate, measured.matrix.m2c)
+    matrix = replace(
+        measured.matrix, data=data.astype(np.float32), sigma=sigma.astype(np.float32), method="escape",
+        metrics={"gain": estimate.gain.value},
+    )  # fmt: skip
+    return replace(measured, matrix=matrix, measured=None, registration=estimate)
 
 
 def simulated(bench: Bench, grid: SensorGeometry, m2c: NDArray[np.float64]) -> CalibrationResult:

@@ -120,7 +120,7 @@ def push_pull(
         run = _Run(bench, slopes_of, report, mean_frame, keep, skip=skip, frames=n_frames)
         if state is not None:
             run.restore(state)
-        partial, preview = False, Preview(m2c.shape[1])
+        partial, preview = False, Preview(m2c.shape[1], lambda: grid)
         try:
             for mode in range(len(run.columns), m2c.shape[1]):
                 yield from run.measure(m2c[:, mode], amplitude[mode], until)

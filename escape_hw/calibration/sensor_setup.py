@@ -92,6 +92,8 @@ def extractor(bench: Bench, grid: SensorGeometry) -> SlopeFunction:
         )
     dark = bench.dark if bench.dark is not None else np.full(shape, grid.background, np.float32)
     slopes_of = kind_of(bench).extractor(bench, grid, shape, dark)
+    if bench.taps.geometry is not None:
+        bench.taps.geometry(grid)
     return slopes_of if bench.taps.slopes is None else _TappedSlopes(slopes_of, bench.wfs, bench.taps.slopes)
 
 

@@ -36,7 +36,7 @@ from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepa
 from escape_hw.calibration.sprint import sprint
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.track_proposal import InUse, Proposal, inverted, propose, taken
-from escape_hw.calibration.track_watch import TrackWatch
+from escape_hw.calibration.track_watch import RunawayWatch, TrackWatch
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
 from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.standard_error import LEAST
@@ -162,7 +162,7 @@ class _Tracker:
         self.response, self.memory = response, memory_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
         self.used = InUse(matrix, inverted(matrix, self.dropped), start, 1.0)
-        self.watch = TrackWatch(start.registration, t.largest_shift)
+        self.watch = TrackWatch(start.registration, t.largest_shift, response)
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
@@ -170,6 +170,7 @@ class _Tracker:
         self.pending: Future[_Answer | None] | None = None
         self.metrics: dict[str, float] = {}
         self.arrays: dict[str, NDArray[np.float32]] = {}
+        self.runaway = RunawayWatch()
 
     def prepare(self, motion: Motion) -> None:
         """Build the model for the light that the closed loop leaves, and start on it; in the thread.
@@ -187,7 +188,7 @@ class _Tracker:
             curved=len(SCATTER) if bench.config.sensor.kind == "pyramid" else 0,
         )  # fmt: skip
         unit = modal_matrix(self.model, start.registration, matrix.m2c, start.width.value)
-        self.begun = np.square(matrix.data).sum(axis=0) / (unit * matrix.data).sum(axis=0)
+        self.begun = (unit * matrix.data).sum(axis=0) / np.square(unit).sum(axis=0)
         self.used = replace(self.used, gain=float(self.begun.mean()))
 
     def run(self, seconds: float) -> Procedure[TrackResult]:
@@ -202,7 +203,7 @@ class _Tracker:
             science.stop()
         slopes_of = extractor(bench, self.grid)
         loop = RunningLoop(bench, self.used.matrix.m2c, slopes_of, self.control, science=science is not None)
-        report = Reporter("tracking", math.ceil(seconds / STEP_S), "s")
+        report = Reporter("tracking", math.ceil(seconds / STEP_S), "second")
         with ThreadPoolExecutor(1, thread_name_prefix="live registration") as pool:
             try:
                 yield from self._track(loop, report, pool)
@@ -232,9 +233,10 @@ class _Tracker:
             yield from self._passed(loop.run(self.frames), report, 0)
         ready.result()
         for second in range(report.total):
+            frames, shortened = loop.record.frames, loop.record.shortened
             steps = loop.run(self.frames, inject=self._poke, observe=[self.tape])
             yield from self._passed(steps, report, second)
-            if loop.record.diverged:
+            if loop.record.diverged or self.runaway(loop.record, frames, shortened):
                 self._lose()
                 return
             # A twin's clock stands still meanwhile; at a real bench the loop does not wait.

@@ -12,7 +12,7 @@ from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Measured, RegistrationEstimate
 from escape_hw.api.tracking import Exchange
-from escape_hw.calibration.live_registration import LiveEstimate, scaled_by_curve
+from escape_hw.calibration.live_registration import LiveEstimate, scaled_to_gains
 from escape_hw.calibration.pseudo_synthetic import pseudo_synthetic
 from escape_hw.pipeline.reconstructor import reconstructor
 
@@ -83,7 +83,7 @@ def propose(
     worth
         Relative change from which on an exchange is worthwhile.
     """
-    new = scaled_by_curve(made, live)
+    new = scaled_to_gains(made, live)
     scale = float(np.linalg.norm(new.data))
     mismatch = float(np.linalg.norm(new.data - used.matrix.data)) / scale
     change = Measured(live.registration.gain.value, float(live.gains_sigma.mean()))

@@ -8,8 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from escape_hw.api.registration import Registration
+from escape_hw.api.results import TemporalResponse
 from escape_hw.api.tracking import Alarm
 from escape_hw.calibration.live_registration import LiveEstimate
+from escape_hw.calibration.live_response import contradicts
+from escape_hw.calibration.loop_run import LoopRecord
 
 #: Standard errors that an update may miss what was expected by.
 JUMP = 8.0
@@ -22,6 +25,9 @@ STRANGE_ACTUATOR = 0.5
 QUIET = 5
 #: Updates that tell what is usual.
 _USUAL = 30
+#: The loop is lost when its residual is this many times the usual, or that many if the mirror is held at its
+#: limits for this share of the frames; and the seconds that tell what is usual at least.
+LOST, LOST_HELD, _HELD, _FIRST = 4.0, 2.0, 0.9, 3
 
 
 class TrackWatch:
@@ -33,10 +39,14 @@ class TrackWatch:
         Registration that tracking began with.
     largest_shift
         How far the mirror may shift before a new calibration is due, % of a sub-aperture.
+    response
+        The temporal response that the matrix was measured with, where it is known.
     """
 
-    def __init__(self, start: Registration, largest_shift: float) -> None:
-        self._start, self._largest = start.to_array(), largest_shift
+    def __init__(
+        self, start: Registration, largest_shift: float, response: TemporalResponse | None = None
+    ) -> None:
+        self._start, self._largest, self._response = start.to_array(), largest_shift, response
         self._noise: deque[float] = deque(maxlen=_USUAL)
         self._misfit: deque[float] = deque(maxlen=_USUAL)
         self._last: dict[str, int] = {}
@@ -58,6 +68,8 @@ class TrackWatch:
         if not found:
             self._noise.append(live.noise)
             self._misfit.append(live.misfit)
+        # The live registration goes on with the response that it measures: told once.
+        self._response = live.response
         return found
 
     def _findings(self, live: LiveEstimate) -> dict[str, str]:
@@ -80,6 +92,11 @@ class TrackWatch:
                 f"the slopes move {live.noise / usual:.1f} times as much as usual beyond what the mirror "
                 "explains; is there enough light, or does something vibrate?"
             )
+        if self._response is not None and contradicts(live.response, self._response):
+            found["delay"] = (
+                f"the mirror answers after {live.response.delay:.2f} frames, not {self._response.delay:.2f}; "
+                "look for another exposure or frame rate, or a computer that is late"
+            )
         worst = int(np.argmax(np.abs(live.actuators)))
         if abs(live.actuators[worst]) > STRANGE_ACTUATOR:
             found["actuator"] = (
@@ -93,6 +110,28 @@ class TrackWatch:
                 f"tracking.largest_shift ({self._largest:g}); calibrate anew"
             )
         return found
+
+
+class RunawayWatch:
+    """Looks at every second of a loop for one that runs away.
+
+    While pokes are injected a command beyond the limits is shortened as a whole, so a loop that runs away
+    holds a few actuators at their limits, not many; and a pyramid's slopes saturate before the mirror does.
+    """
+
+    def __init__(self) -> None:
+        self._residual: deque[float] = deque(maxlen=_USUAL)
+
+    def __call__(self, record: LoopRecord, frames: int, shortened: int) -> bool:
+        """Whether the loop was lost in the frames after the first ``frames``, ``shortened`` of them cut."""
+        residual = np.array(record.residual[frames:])
+        rms = float(np.sqrt(np.mean(np.square(residual))))
+        usual = float(np.median(self._residual)) if len(self._residual) >= _FIRST else np.inf
+        held = record.shortened - shortened > _HELD * len(residual)
+        if rms > (LOST_HELD if held else LOST) * usual:
+            return True
+        self._residual.append(rms)
+        return False
 
 
 def _usual(values: Sequence[float]) -> float:

@@ -17,12 +17,18 @@ from escape_hw.cli import (
     doctor,
     emulate,
     gains,
+    gui,
+    interchange,
+    keys,
     loop,
     modulator,
     perf,
     products,
     rehearse,
     reproduce,
+    serve,
+    sprint,
+    streams,
     systems,
     track,
     udev,
@@ -41,11 +47,15 @@ app = typer.Typer(
 app.command("systems")(systems.systems)
 app.add_typer(systems.config_app, name="config")
 app.command("calibrate")(calibrate.calibrate)
-app.command("sprint")(calibrate.sprint)
+app.command("sprint")(sprint.sprint)
 app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.command("track")(track.track)
+app.command("serve")(serve.serve)
+app.add_typer(keys.app, name="keys")
 app.add_typer(reproduce.app, name="reproduce")
+app.add_typer(interchange.export_app, name="export")
+app.add_typer(interchange.import_app, name="import")
 app.command("show")(products.show)
 app.command("compare")(products.compare)
 app.command("report")(products.report)
@@ -54,11 +64,14 @@ app.add_typer(dm.app, name="dm")
 app.add_typer(camera.app, name="camera")
 app.add_typer(modulator.app, name="modulator")
 app.add_typer(asm.app, name="asm")
+app.command("gui")(gui.gui)
+app.command("replay")(gui.replay)
 app.command("doctor")(doctor.doctor)
 app.command("discover")(discover.discover)
 app.add_typer(udev.app, name="udev")
 app.command("emulate")(emulate.emulate)
 app.command("rehearse")(rehearse.rehearse)
+app.command("streams")(streams.streams)
 
 
 def _version(wanted: bool) -> None:

@@ -1,78 +1,19 @@
-"""``escape calibrate`` and ``escape sprint``."""
+"""``escape calibrate``."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.loop import fitting_matrix, refuse_simulated
 from escape_hw.cli.session import Session, session
 
 if TYPE_CHECKING:
-    from escape_hw.api.procedure import Procedure
     from escape_hw.api.results import CalibrationResult
-    from escape_hw.bench import Bench
-    from escape_hw.calibration.checkpoint import Checkpoint
-    from escape_hw.io.fits import MatrixProduct
-    from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
-
-
-@dataclass(frozen=True, slots=True)
-class _Request:
-    """How a calibration is asked for; kept with its state, so that it can be resumed without asking again."""
-
-    method: str = "escape"
-    frames: int | None = None
-    poke: float | None = None
-    accuracy: float | None = None
-    snr: float | None = None
-    plain: bool = False
-    estimator: str | None = None
-    closed_loop: str | None = None
-
-    def checked(self) -> _Request:
-        """The request, if its parts go together; otherwise it is refused before anything is opened."""
-        from escape_hw.config.models import ESTIMATORS
-        from escape_hw.errors import ConfigError
-        from escape_hw.runtime.procedures import CLOSED_LOOP, METHODS
-
-        if self.method not in METHODS:
-            raise ConfigError(f"--method {self.method}: unknown; it is one of {', '.join(METHODS)}")
-        if self.poke is not None and not 0 < self.poke <= 1:
-            raise ConfigError(f"--poke {self.poke:g}: it must lie in (0, 1], a fraction of full stroke")
-        if self.accuracy is not None and (self.method != "escape" or not self.accuracy > 0):
-            raise ConfigError("--accuracy: it goes with --method escape and must be positive")
-        if self.snr is not None and not self.snr > 0:
-            raise ConfigError(f"--snr {self.snr:g}: it must be positive")
-        if self.plain and (self.method != "docrime" or self.closed_loop is not None):
-            raise ConfigError("--plain: it goes with --method docrime in open loop")
-        if self.closed_loop is not None and self.method not in CLOSED_LOOP:
-            raise ConfigError(f"--closed-loop: it goes with --method {', '.join(CLOSED_LOOP)}")
-        if self.estimator is not None and (self.method != "escape" or self.estimator not in ESTIMATORS):
-            raise ConfigError(
-                f"--estimator {self.estimator}: it goes with --method escape and is one of "
-                f"{', '.join(ESTIMATORS)}"
-            )
-        return self
-
-    def procedure(
-        self, bench: Bench, closing: CalibrationResult | None, keep: Checkpoint
-    ) -> Procedure[CalibrationResult]:
-        """The procedure that does it."""
-        from escape_hw.calibration.stopping import Target
-        from escape_hw.runtime.procedures import calibrate_by
-
-        asked = self.snr is not None or self.accuracy is not None
-        return calibrate_by(
-            bench, self.method, frames=self.frames, poke=self.poke, whiten=not self.plain,
-            estimator=self.estimator, closing=closing, keep=keep,
-            until=Target(self.snr, self.accuracy) if asked else None,
-        )  # fmt: skip
 
 
 def calibrate(
@@ -138,48 +79,17 @@ def calibrate(
             "plain": plain or None, "estimator": estimator,
             "closed_loop": None if closed_loop is None else str(closed_loop.absolute()),
         }  # fmt: skip
-        request = _request(asked, resume).checked()
-        choice = options.Choice.of(_system(system, resume), set, seed, mode).calibrating(
-            pokes=pokes, solver=solver, modes_choice=modes_choice, loss=loss
-        )
+        from escape_hw.runtime.calibration_task import CalibrationRequest, CalibrationTask
+
+        request = CalibrationRequest.of(asked, resume)
+        changes: dict[str, object] = {
+            "pokes": pokes, "solver": solver, "modes_choice": modes_choice, "loss": loss,
+        }  # fmt: skip
+        task = CalibrationTask(request, resume=resume, force=force, settings=changes)
+        choice = options.Choice.of(_system(system, resume), set, seed, mode)
         if modes is not None:
             choice = _with_modes(one, choice, modes)
-        config = one.configured(choice)
-        closing = None
-        if request.closed_loop is not None:
-            closing = fitting_matrix(request.closed_loop, config, force)
-        with one.run_folder(config, f"calibrate-{request.method}", out) as folder:
-            keep = _checkpoint(folder, request, resume)
-            with one.bench(choice) as bench:
-                from escape_hw.runtime.records import BenchRecord
-
-                if closing is not None:
-                    refuse_simulated(closing, bench, force)
-                record = BenchRecord.of(bench)
-                used = None if closing is None else closing.result
-                result, stop = one.attempt(request.procedure(bench, used, keep))
-            with one.saving(stop):
-                _finish(one, folder, record, result, request, closing)
-            if stop is not None:
-                raise stop
-            keep.done()
-
-
-def _request(asked: dict[str, Any], resume: Path | None) -> _Request:
-    """What is asked for, with what the run to resume was asked for where nothing is said."""
-    given = {key: value for key, value in asked.items() if value is not None}
-    if resume is None:
-        return _Request(**given)
-    from escape_hw.errors import ProductError
-    from escape_hw.io.state_file import STATE, load_state
-
-    path = resume / STATE
-    if not path.is_file():
-        raise ProductError(
-            f"{path}: not there; {resume} is no run, it was broken off in its first seconds, or it came to "
-            "its end"
-        )
-    return _Request(**{**load_state(path).values["request"], **given})
+        one.perform(task, choice, out, partial(_show, one))
 
 
 def _system(system: str | None, resume: Path | None) -> str:
@@ -193,77 +103,23 @@ def _system(system: str | None, resume: Path | None) -> str:
     return str(resume / "config.toml")
 
 
-def _checkpoint(folder: RunFolder, request: _Request, resume: Path | None) -> Checkpoint:
-    from escape_hw.calibration.checkpoint import Checkpoint
-    from escape_hw.io.state_file import STATE
-
-    source = None if resume is None else resume / STATE
-    return Checkpoint(folder.file(STATE), source, request=asdict(request))
-
-
 def _with_modes(one: Session, choice: options.Choice, modes: int) -> options.Choice:
     """The choice with another number of modes; the loop goes on dropping the same share of them.
 
     Who sets ``loop.dropped_modes`` gets what was set.
     """
-    wanted = f"basis.n_modes={modes}"
+    from escape_hw.runtime.calibration_task import with_modes
+
     if any(text.partition("=")[0].strip() == "loop.dropped_modes" for text in choice.set):
-        return choice.plus(wanted)
+        return choice.plus(f"basis.n_modes={modes}")
     usual = one.configured(choice)
-    dropped = min(usual.loop.dropped_modes, modes * usual.loop.dropped_modes // usual.basis.n_modes)
+    overrides, dropped = with_modes(usual, modes)
     if dropped != usual.loop.dropped_modes:
         one.tell(f"loop.dropped_modes: {usual.loop.dropped_modes} becomes {dropped} with {modes} modes")
-    return choice.plus(wanted, f"loop.dropped_modes={dropped}")
+    return choice.plus(*overrides)
 
 
-def _finish(
-    one: Session,
-    folder: RunFolder,
-    record: BenchRecord,
-    result: CalibrationResult,
-    request: _Request,
-    closing: MatrixProduct | None,
-) -> None:
-    """Save, judge, report and show a calibration."""
-    from escape_hw.io.documents import calibration_document
-    from escape_hw.runtime import criteria
-    from escape_hw.runtime.keep import finish, keep_calibration
-    from escape_hw.runtime.reproduce import measured_part
-
-    measured = measured_part(result)
-    labels: dict[str, Any] = {"im": {"measured": "DO-CRIME", "column": ""}}
-    parents = {} if closing is None else {"closing": closing.path}
-    if measured is not None:
-        parents = {"docrime": keep_calibration(folder, record, "docrime", measured, parents)}
-        labels["docrime"] = {"label": "DO-CRIME"}
-    keep_calibration(folder, record, "im", result, parents)
-    checks = []
-    if result.matrix.method == "escape" and not result.partial:
-        checks.append(criteria.converged("ESCAPE", result.registration))
-    if request.accuracy is not None and result.registration is not None:
-        worst = float(result.registration.sigma[:2].max())
-        text = f"standard error of the shifts: {worst:.3g} (wanted {request.accuracy:g}) % of a sub-aperture"
-        checks.append(criteria.check(text, worst <= request.accuracy))
-    if request.snr is not None:
-        least = float((result.measured or result.matrix).snr().min())
-        text = f"signal-to-noise ratio of the weakest mode: {least:.3g} (wanted {request.snr:g})"
-        checks.append(criteria.check(text, least >= request.snr))
-    document = finish(
-        folder,
-        {
-            **record.head("calibrate"),
-            "title": f"Calibration of {record.system}",
-            **calibration_document(result),
-            "criteria": checks,
-            "labels": labels,
-            **record.tail(one.wall_seconds),
-        },
-    )
-    one.result(document, met=all(entry["met"] for entry in checks))
-    _show(one, record, result, document)
-
-
-def _show(one: Session, record: BenchRecord, result: CalibrationResult, document: dict[str, Any]) -> None:
+def _show(one: Session, result: CalibrationResult, record: BenchRecord, document: dict[str, Any]) -> None:
     from escape_hw.cli.views import bands, calibration_lines, checks_view, products_view, rich_table
     from escape_hw.report.tables import registration_table
 
@@ -271,79 +127,3 @@ def _show(one: Session, record: BenchRecord, result: CalibrationResult, document
     if result.registration is not None:
         one.show(rich_table(registration_table({"": result.registration}, record.planted)))
     one.show(*checks_view(document["criteria"]), *products_view(document["products"]))
-
-
-def sprint(
-    system: options.System,
-    im: options.Matrix,
-    out: options.Out = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    solver: options.Solver = None,
-    modes_choice: options.ModesChoice = None,
-    loss: options.Loss = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-) -> None:
-    """Find the registration behind a measured interaction matrix; opens no device."""
-    with session("sprint", json=json, quiet=quiet) as one:
-        choice = options.Choice.of(system, set, seed, mode).calibrating(
-            solver=solver, modes_choice=modes_choice, loss=loss
-        )
-        config = one.configured(choice)
-        with one.run_folder(config, "sprint", out) as folder:
-            _sprint(one, folder, config, im)
-
-
-def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
-    from dataclasses import replace
-
-    from escape_hw.calibration.sprint import sprint
-    from escape_hw.cli.views import bands, checks_view, products_view, rich_table
-    from escape_hw.config.registry import model_factory
-    from escape_hw.io import documents
-    from escape_hw.io.fits import load_matrix, save_matrix
-    from escape_hw.io.provenance import utc_text
-    from escape_hw.report.tables import registration_table
-    from escape_hw.runtime import criteria
-    from escape_hw.runtime.keep import finish
-    from escape_hw.runtime.records import config_record
-
-    product = load_matrix(
-        im,
-        expect_system=config.system.name,
-        expect_sensor=config.sensor.kind,
-        expect_actuators=config.devices.dm.n_act,
-    )
-    measured = product.result.measured or product.matrix
-    model = model_factory(config.calibration.model)(config, product.grid)
-    settings = config.calibration
-    estimate = sprint(
-        measured,
-        model,
-        modes=min(settings.sprint_modes, measured.n_modes),
-        choice=settings.modes_choice,
-        solver=settings.solver,
-        loss=settings.loss,
-        learning_rate=settings.learning_rate,
-    )
-    result = replace(product.result, matrix=measured, measured=None, registration=estimate)
-    origin = replace(config_record(config), parents={im.name: product.sha256})
-    folder.add("im", save_matrix(folder.file("im.fits"), result, origin))
-    checks = [criteria.converged(im.name, estimate)]
-    document = finish(
-        folder,
-        {
-            **documents.head("sprint", measured.system, measured.simulated, config.system.seed),
-            "title": f"Registration of {measured.system}",
-            **documents.calibration_document(result),
-            "criteria": checks,
-            "labels": {"im": {"column": ""}},
-            "finished_utc": utc_text(),
-            "wall_seconds": one.wall_seconds,
-        },
-    )
-    one.result(document, met=estimate.converged)
-    one.show(bands(measured.simulated, False), rich_table(registration_table({"": estimate})))
-    one.show(*checks_view(checks), *products_view(document["products"]))

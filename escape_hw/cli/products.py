@@ -32,6 +32,7 @@ def _show_product(one: Session, file: Path) -> None:
     from escape_hw.io.fits import KIND_MATRIX, load_matrix
     from escape_hw.io.gains import KIND_GAINS, load_gains
     from escape_hw.io.psf import load_loop
+    from escape_hw.io.telemetry import KIND_TELEMETRY, load_telemetry
     from escape_hw.report.tables import Table, registration_table, rounds_table, strehl_table
 
     hdus, _ = fits_file.read(file)
@@ -52,6 +53,12 @@ def _show_product(one: Session, file: Path) -> None:
         document |= documents.gains_document(gains.result)
         sha256 = gains.sha256
         one.show(rich_table(rounds_table(gains.result)))
+    elif header["KIND"] == KIND_TELEMETRY:
+        telemetry = load_telemetry(file)
+        frames, n_slopes = telemetry.result.slopes.shape
+        document |= {"frames": frames, "n_slopes": n_slopes, "rate_hz": telemetry.result.rate_hz}
+        sha256 = telemetry.sha256
+        one.show(f"{frames} frames of {n_slopes} slopes at {telemetry.result.rate_hz:.6g} Hz")
     else:
         loop = load_loop(file)
         document |= documents.loop_document(loop.result)

@@ -8,7 +8,7 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from escape_hw.cli.options import Choice
     from escape_hw.config.models import SystemConfig
     from escape_hw.io.run_folder import RunFolder
+    from escape_hw.runtime.records import BenchRecord
     from escape_hw.runtime.system import System
+    from escape_hw.runtime.task import Task
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -140,6 +142,37 @@ class Session:
     def saving(self, stop: Aborted | None) -> AbstractContextManager[None]:
         """While a result is saved: after an abort, no further Ctrl-C keeps it from its file."""
         return contextlib.nullcontext() if stop is None else self.interrupts.saving()
+
+    def perform(
+        self,
+        task: Task[T],
+        choice: Choice,
+        out: Path | None,
+        show: Callable[[T, BenchRecord, dict[str, Any]], object],
+    ) -> None:
+        """Do a task on the chosen system, keep its result, and show it.
+
+        Raises
+        ------
+        Aborted
+            The result is partial; it was kept and shown.
+        """
+        choice = choice.plus(*task.overrides)
+        config = self.configured(choice)
+        task.load(config)
+        with self.run_folder(config, task.kind, out) as folder:
+            with self.bench(choice) as bench:
+                from escape_hw.runtime.records import BenchRecord
+
+                record = BenchRecord.of(bench)
+                result, stop = self.attempt(task.procedure(bench, folder))
+            with self.saving(stop):
+                kept = task.keep(folder, record, result, self.wall_seconds)
+                self.result(kept.document, met=kept.met)
+                show(result, record, kept.document)
+            if stop is not None:
+                raise stop
+            task.done()
 
     @contextmanager
     def run_folder(self, config: SystemConfig, kind: str, out: Path | None) -> Iterator[RunFolder]:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.loop import fitting_matrix, refuse_simulated
 from escape_hw.cli.session import Session, session
 
 if TYPE_CHECKING:
-    from escape_hw.api.procedure import Procedure
     from escape_hw.api.tracking import TrackResult
-    from escape_hw.bench import Bench
-    from escape_hw.io.fits import MatrixProduct
-    from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
 
 
@@ -50,65 +46,18 @@ def track(
 ) -> None:
     """Close the loop and follow what drifts: registration, optical gains, matrix."""
     with session("track", json=json, quiet=quiet) as one:
-        given = {"tracking.poke": poke, "tracking.memory_s": memory, "loop.gain": gain}
-        settings = [f"{key}={value}" for key, value in given.items() if value is not None]
-        choice = options.Choice.of(system, [*(set or []), *settings], seed, mode)
-        config = one.configured(choice)
-        product = fitting_matrix(im, config, force)
-        with one.run_folder(config, "track", out) as folder:
-            with one.bench(choice) as bench:
-                from escape_hw.runtime.records import BenchRecord
+        from escape_hw.runtime.track_task import TrackTask
 
-                refuse_simulated(product, bench, force)
-                record = BenchRecord.of(bench)
-                result, stop = one.attempt(_procedure(bench, product, seconds, not propose, strehl))
-            with one.saving(stop):
-                _finish(one, folder, record, product, result)
-            if stop is not None:
-                raise stop
+        task = TrackTask(
+            im, seconds=seconds, poke=poke, memory=memory, gain=gain, exchange=not propose, strehl=strehl,
+            force=force,
+        )  # fmt: skip
+        one.perform(task, options.Choice.of(system, set, seed, mode), out, partial(_show, one))
 
 
-def _procedure(
-    bench: Bench, product: MatrixProduct, seconds: float, exchange: bool, strehl: bool
-) -> Procedure[TrackResult]:
-    """Model PSF where the bench can take one, then the tracker."""
-    from escape_hw.calibration.track import track as follow
-    from escape_hw.runtime.procedures import model_psf
-
-    psf = (yield from model_psf(bench)) if strehl and bench.science is not None else None
-    return (
-        yield from follow(
-            bench, product.matrix, product.grid, seconds=seconds, registration=product.registration,
-            response=product.result.response, exchange=exchange, model_psf=psf,
-        )
-    )  # fmt: skip
-
-
-def _finish(
-    one: Session, folder: RunFolder, record: BenchRecord, product: MatrixProduct, result: TrackResult
-) -> None:
+def _show(one: Session, result: TrackResult, record: BenchRecord, document: dict[str, Any]) -> None:
     from escape_hw.cli.views import bands, products_view
-    from escape_hw.io.track_document import track_document
-    from escape_hw.runtime.keep import finish, keep_calibration
 
-    folder.add("table", folder.write_text("track.csv", result.to_csv()))
-    if result.latest is not None:
-        keep_calibration(folder, record, "im", result.latest, {"im": product.path})
-    document = finish(
-        folder,
-        {
-            **record.head("track"),
-            "title": f"Tracking {record.system}",
-            **track_document(result),
-            "im": product.path.absolute(),
-            "criteria": [
-                {"text": "loop stable", "met": result.stable},
-                {"text": f"no alarms ({len(result.alarms)})", "met": not result.alarms},
-            ],
-            **record.tail(one.wall_seconds),
-        },
-    )
-    one.result(document, met=result.stable and not result.alarms)
     one.show(bands(record.simulated, result.partial))
     for name, found in document["registration"].items():
         one.show(f"{name}: {found['value']:.3f} ± {found['sigma']:.3f} {found['unit']}")

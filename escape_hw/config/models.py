@@ -11,6 +11,7 @@ from escape_hw.config.device_models import DeviceConfig, DevicesConfig, Mode
 from escape_hw.config.modulator_models import with_tilt
 from escape_hw.config.section import Breach, Section, enforce
 from escape_hw.config.sensor_models import AnySensor, PyramidSection, SensorSection
+from escape_hw.config.server_models import ServerSection
 from escape_hw.config.telescope_models import TelescopeSection
 from escape_hw.config.toml_text import dump_toml
 from escape_hw.config.tracking_models import TrackingSection
@@ -160,6 +161,7 @@ class SystemConfig(Section):
         default_factory=CalibrationSection, description="defaults of the calibration procedures"
     )
     tracking: TrackingSection = Field(default_factory=TrackingSection, description="the tracker")
+    server: ServerSection = Field(default_factory=ServerSection, description="limits of the server")
     twin: TwinConfig = Field(default_factory=TwinConfig, description="the simulated bench")
 
     @model_validator(mode="before")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 from escape_hw.api.device import Device
@@ -19,11 +20,13 @@ DEVICES = "escape.devices"
 MODELS = "escape.models"
 EMULATORS = "escape.emulators"
 REHEARSALS = "escape.rehearsals"
+WINDOWS = "escape.windows"
 _KINDS = {
     DEVICES: "device driver",
     MODELS: "synthetic model",
     EMULATORS: "emulator",
     REHEARSALS: "rehearsal",
+    WINDOWS: "window",
 }
 #: What the name of every twin begins with; other drivers drive real hardware.
 TWIN = "sim-"
@@ -33,6 +36,8 @@ TWIN = "sim-"
 DeviceFactory = Callable[[str, SystemConfig, dict[str, object]], Device]
 #: ``factory(config, grid) -> model``; without a grid the model takes the nominal one.
 ModelFactory = Callable[[SystemConfig, SensorGeometry | None], SyntheticModel]
+#: ``run(system, address, screenshot, reset_settings) -> exit code``: shows the window until it is closed.
+WindowRunner = Callable[[str, str, Path | None, bool], int]
 #: Drivers that a script registered for its own process.
 _OWN: dict[str, DeviceFactory] = {}
 
@@ -115,6 +120,17 @@ def rehearsal_factory() -> RehearsalFactory:
         The package that holds it is not completely installed.
     """
     return cast(RehearsalFactory, _load(REHEARSALS, "bench"))
+
+
+def window_runner() -> WindowRunner:
+    """What shows the graphical interface.
+
+    Raises
+    ------
+    ConfigError
+        The interface or what it needs is not installed.
+    """
+    return cast(WindowRunner, _load(WINDOWS, "gui"))
 
 
 def _load(group: str, name: str, hardware: bool = False) -> Any:

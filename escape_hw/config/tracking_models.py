@@ -11,7 +11,7 @@ class TrackingSection(Section):
     """How ``escape track`` follows a drifting system."""
 
     poke: float = Field(
-        0.0005,
+        0.00025,
         gt=0,
         le=0.1,
         description="pokes in the closed loop are uniform in +-poke, rms surface as fraction of full stroke",

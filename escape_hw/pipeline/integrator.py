@@ -62,6 +62,11 @@ class LeakyIntegrator:
         self.residual = np.zeros(n_modes, np.float32)
 
     @property
+    def reconstructor(self) -> NDArray[np.float32]:
+        """The reconstructor in use ``(n_modes, n_slopes)``; not to be written to."""
+        return self._matrix
+
+    @property
     def gains(self) -> NDArray[np.float32]:
         """Gain of each mode ``(n_modes,)``; a copy."""
         return self._gains.copy()

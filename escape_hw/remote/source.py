@@ -54,15 +54,19 @@ class Source(Protocol):
 #: Streams by name, with the shape and unit of an entry. Frame streams have one entry per frame.
 STREAMS: dict[str, str] = {
     # per frame
-    "frames": "raw frame of the sensor's camera (rows, columns), counts",
+    "frames": "raw frame of the sensor's camera (rows, columns), counts; meta 'top': where pixels saturate",
     "slopes": "(n_slopes,), pixel",
     "modes": "reconstructed residual (n_modes,), nm rms wavefront; closed loop only",
     "commands": "what the mirror got (n_act,), fraction of full stroke",
     "psf": "science frame (rows, columns), counts",
+    # seldom
+    "model_psf": "image that the Strehl ratio is measured against (rows, columns), scale of 'psf'",
+    "latency_histogram": "counts in the bins of streams.histogram (2, bins): latency, spacing of frames",
     # a few times a second, while something is measured
     "measured_positions": "(n_act,), metres; adaptive secondaries only",
     "matrix": "interaction matrix as measured so far (n_slopes, n_modes), slopes per unit mode",
     "matrix_sigma": "its standard errors (n_slopes, n_modes)",
+    "valid": "sub-apertures that the matrix's slopes belong to (rows, columns), 0 or 1",
     "registration": "SPRINT's parameters by iteration (n_iterations, 5): shift x, y [sub-aperture], rotation "
     "[rad], radial, tangential scaling",
     "registration_sigma": "standard errors of the last iteration (5,), same units; NaN: not known yet",

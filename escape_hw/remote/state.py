@@ -235,7 +235,11 @@ class State(Part):
     telemetry: Telemetry = Telemetry()
     disk: Disk = Disk()
     streams: tuple[StreamEntry, ...] = ()
+    #: Counts up whenever the sensor's geometry changes: time to ask for it again.
+    geometries: int = 0
     clients: int = 0
+    #: Messages that were no requests, or none that may be made: malformed, too large, without the lease.
+    refused: int = 0
     #: What the server found when it started: a crash before, a calibration that can be resumed.
     notes: tuple[str, ...] = ()
 
@@ -285,7 +289,7 @@ class Parameter(Part):
     """One argument of a procedure, enough to make a form of it."""
 
     name: str
-    #: ``int``, ``float``, ``bool``, ``choice``, ``matrix`` (a name out of ``State.products``).
+    #: ``int``, ``float``, ``bool``, ``choice``, ``text``, ``matrix`` (a name out of ``State.products``).
     kind: str
     default: float | int | bool | str | None = None
     unit: str = ""

@@ -90,15 +90,34 @@ def _facts(run: RunContent) -> dict[str, str]:
     # A matrix and what was computed from it share their frames: one number for both.
     shared: dict[str, list[str]] = {}
     for label, result in run.calibrations.items():
+        if not result.frames:
+            continue
         text = f"{result.frames:,} ({result.sky_seconds:.3g} s)".replace(",", "\u2009")
         shared.setdefault(text, []).append(label)
     for text, labels in shared.items():
         found[f"{' and '.join(labels)}: frames"] = text
+    found |= _track_facts(run.document)
     if run.document.get("wall_seconds") is not None:
         found["wall clock"] = f"{float(run.document['wall_seconds']):.0f} s"
     for label, loop in run.loops.items():
         if loop.strehl is not None:
             found[f"{label}: Strehl ratio, peak"] = tables.percent(loop.strehl.peak).strip()
+    return found
+
+
+def _track_facts(document: dict[str, Any]) -> dict[str, str]:
+    """What a tracked run comes to."""
+    if not document.get("track"):
+        return {}
+    frames = f"{document['frames']:,} ({document['seconds']:.3g} s)".replace(",", "\u2009")
+    taken = sum(one["accepted"] for one in document["exchanges"])
+    found = {
+        "closed loop: frames": frames,
+        "pokes, of the stroke": f"±{100 * document['poke']:.3g} % each mode",
+        "new matrices taken": f"{taken} of {len(document['exchanges'])} proposed",
+    }
+    if document.get("strehl") is not None:
+        found["Strehl ratio, peak, mean"] = f"{100 * document['strehl']:.1f} %"
     return found
 
 

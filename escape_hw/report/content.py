@@ -15,11 +15,12 @@ from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.errors import ProductError
-from escape_hw.io import fits_file
+from escape_hw.io import documents, fits_file
 from escape_hw.io.fits import KIND_MATRIX, load_matrix
 from escape_hw.io.gains import KIND_GAINS, load_gains
 from escape_hw.io.psf import KIND_PSF, load_loop
 from escape_hw.io.run_folder import read_result
+from escape_hw.io.telemetry import KIND_TELEMETRY
 
 #: How methods are called in figures and tables.
 METHOD_LABELS = {
@@ -37,7 +38,11 @@ METHOD_LABELS = {
 
 @dataclass(slots=True)
 class RunContent:
-    """Everything a report shows; see :func:`read_run`."""
+    """Everything a report shows; see :func:`read_run`.
+
+    By label, as shown: ``calibrations``, ``loops``, ``gains``, and ``names``, the product each calibration
+    came from. By product: ``digests`` and ``kinds``, as their headers say.
+    """
 
     folder: Path
     document: dict[str, Any]
@@ -47,6 +52,8 @@ class RunContent:
     loops: dict[str, LoopResult] = field(default_factory=dict)
     gains: dict[str, GainsResult] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
+    kinds: dict[str, str] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)
     config_text: str = ""
     log_text: str = ""
 
@@ -121,16 +128,44 @@ def read_run(folder: Path | str) -> RunContent:
     return run
 
 
+def read_product(path: Path | str) -> RunContent:
+    """Read one FITS product as a run that holds nothing else.
+
+    Raises
+    ------
+    ProductError
+        It is missing, damaged or of an unknown kind.
+    """
+    file = Path(path).absolute()
+    hdus, _ = fits_file.read(file)
+    header = fits_file.header_dict(hdus)
+    document: dict[str, Any] = {
+        **documents.head("show", str(header["SYSTEM"]), bool(header["SIMULATE"]), header.get("SEED")),
+        "started_utc": str(header.get("DATE-OBS", header["DATE"])),
+        "products": {file.stem: file},
+    }
+    run = RunContent(file.parent, document, config_text=fits_file.read_text(file, hdus, "CONFIG"))
+    _add(run, file.stem, file, {})
+    for calibration in run.calibrations.values():
+        document |= documents.calibration_document(calibration)
+    for gains in run.gains.values():
+        document |= documents.gains_document(gains)
+    for loop in run.loops.values():
+        document |= documents.loop_document(loop)
+    return run
+
+
 def _add(run: RunContent, name: str, path: Path, label: Mapping[str, str]) -> None:
     hdus, digest = fits_file.read(path)
     kind = hdus[0].header["KIND"]
-    run.digests[name] = digest
+    run.digests[name], run.kinds[name] = digest, str(kind)
     if kind == KIND_MATRIX:
         result = load_matrix(path).result
         shown = _free(
             run.calibrations, label.get("label") or METHOD_LABELS.get(result.matrix.method, name), name
         )
         run.calibrations[shown] = result
+        run.names[shown] = name
         run.measured_labels[shown] = label.get("measured", METHOD_LABELS["docrime"])
         run.columns[shown] = label.get("column", "" if shown == "ESCAPE" else shown)
     elif kind == KIND_PSF:
@@ -139,8 +174,8 @@ def _add(run: RunContent, name: str, path: Path, label: Mapping[str, str]) -> No
     elif kind == KIND_GAINS:
         found = load_gains(path).result
         run.gains[label.get("label") or METHOD_LABELS.get(found.method, name)] = found
-    else:
-        raise ProductError(f"{path}: its kind is {kind!r}; this version knows IM, PSF and OG")
+    elif kind != KIND_TELEMETRY:
+        raise ProductError(f"{path}: its kind is {kind!r}; this version knows IM, PSF, OG and TELEM")
 
 
 def _free(taken: Mapping[str, object], label: str, name: str) -> str:

@@ -32,9 +32,9 @@ def course(
     figure = style.new_figure(9.2, 6.2)
     panels = figure.subplots(2, 2, sharex=True).ravel()
     for colour, name in zip(style.SERIES, ("shift_x", "shift_y"), strict=False):
-        first = float(columns[name][0]) if t.size else 0.0
-        _band(panels[0], t, columns[name] - first, columns[f"{name}_sigma"], colour, name.replace("_", " "))
-    style.tidy(panels[0]).set_title("shift since the first look [% of a sub-aperture]", fontsize=9.5)
+        usual = float(np.median(columns[name])) if t.size else 0.0
+        _band(panels[0], t, columns[name] - usual, columns[f"{name}_sigma"], colour, name.replace("_", " "))
+    style.tidy(panels[0]).set_title("shift about its median [% of a sub-aperture]", fontsize=9.5)
     panels[0].legend(frameon=False, fontsize=8)
     _band(panels[1], t, columns["rotation"], columns["rotation_sigma"], style.SERIES[0])
     style.tidy(panels[1]).set_title("rotation [deg]", fontsize=9.5)

@@ -14,6 +14,7 @@ from escape_hw.io.gains import save_gains
 from escape_hw.io.provenance import sha256_of
 from escape_hw.io.psf import save_loop
 from escape_hw.io.run_folder import RunFolder
+from escape_hw.io.telemetry import LoopTelemetry, save_telemetry
 from escape_hw.report.build import REPORT, write_report
 from escape_hw.runtime.records import BenchRecord
 
@@ -55,6 +56,21 @@ def keep_loop(
     path = folder.file(f"{name}.fits")
     saved = save_loop(path, result, record.system, record.simulated, record.origin(parents))
     return folder.add(name, saved)
+
+
+def keep_telemetry(
+    folder: RunFolder, record: BenchRecord, name: str, telemetry: LoopTelemetry, matrix: Path
+) -> Path:
+    """Save a loop's telemetry as ``NAME.fits``, with the matrix that closed it as its parent.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    origin = record.origin({matrix.name: sha256_of(matrix)})
+    path = folder.file(f"{name}.fits")
+    return folder.add(name, save_telemetry(path, telemetry, record.system, record.simulated, origin))
 
 
 def keep_gains(

@@ -50,8 +50,8 @@ class BenchRecord:
             config_text=config.to_toml(),
             basis=config.basis.kind,
             serials={name: device.info.serial for name, device in named.items() if device is not None},
-            layout=_layout(bench),
-            places_m=_places(bench),
+            layout=layout_of(bench),
+            places_m=places_of(bench),
             psf_px=None if science is None else float(science.psf_px),
             planted=config.twin.registration.to_registration() if stands else None,
         )
@@ -85,13 +85,13 @@ def config_record(config: SystemConfig) -> Provenance:
     return Provenance(config.to_toml(), config.basis.kind, config.system.seed, {}, {}, datetime.now(UTC))
 
 
-def _layout(bench: Bench) -> tuple[str, ...]:
+def layout_of(bench: Bench) -> tuple[str, ...]:
     """Map of the actuators as rows of 0 and 1; empty when they do not stand on a grid."""
     layout = bench.dm.info.layout
     return () if layout is None else tuple("".join("1" if spot else "0" for spot in row) for row in layout)
 
 
-def _places(bench: Bench) -> tuple[tuple[float, float], ...]:
+def places_of(bench: Bench) -> tuple[tuple[float, float], ...]:
     """Where actuators without a grid stand, (x, y) in metres; empty when they have one."""
     info = bench.dm.info
     return () if info.layout is not None else tuple((float(x), float(y)) for x, y in info.positions_m)

@@ -14,6 +14,7 @@ from escape_hw.api.procedure import Observer, Procedure, Stop
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
+from escape_hw.api.tracking import TrackResult
 from escape_hw.bench import Bench
 from escape_hw.config.load import load_system
 
@@ -360,6 +361,64 @@ class System(Bench):
         procedure = bootstrap_gains(
             self, calibration, poke=poke, accuracy=accuracy, frames=frames, model_psf=model_psf
         )
+        return self.run(procedure, progress=progress)
+
+    def track(
+        self,
+        calibration: CalibrationResult,
+        *,
+        seconds: float = 60.0,
+        poke: float | None = None,
+        memory_s: float | None = None,
+        exchange: bool = True,
+        gain: float | None = None,
+        model_psf: NDArray[np.float32] | None = None,
+        progress: bool = False,
+    ) -> TrackResult:
+        """Close the loop and follow what drifts: registration, optical gains, matrix; the mirror ends flat.
+
+        Parameters
+        ----------
+        calibration
+            From :meth:`calibrate` or :meth:`find_optical_gains`; a registration that is not in it is
+            found from its matrix.
+        seconds
+            How long, at least one.
+        poke
+            Pokes of each mode, rms surface as fraction of full stroke; as configured by default.
+        memory_s
+            Time in which old frames fade; as configured by default.
+        exchange
+            False: new matrices are only proposed.
+        gain
+            Gain of the integrator; as configured by default.
+        model_psf
+            From :meth:`take_model_psf`; with it the Strehl ratio is followed, too.
+        progress
+            Show a bar with the time left.
+
+        Returns
+        -------
+        TrackResult
+            ``rows`` holds a line per second, ``latest`` the matrix to go on with, ``alarms`` what a new
+            registration does not explain. ``stable`` is false when the loop was lost.
+
+        Raises
+        ------
+        ConfigError
+            A time, poke or memory that means nothing; nothing moved.
+        IncompatibleProduct, CalibrationError
+            The matrix does not fit, cannot be inverted, or shows no registration; nothing moved.
+        Aborted
+            Stopped by Ctrl-C.
+        """
+        from escape_hw.calibration.track import track
+
+        procedure = track(
+            self, calibration.matrix, calibration.grid, seconds=seconds,
+            registration=calibration.registration, response=calibration.response, poke=poke,
+            memory_s=memory_s, exchange=exchange, gain=gain, model_psf=model_psf,
+        )  # fmt: skip
         return self.run(procedure, progress=progress)
 
 

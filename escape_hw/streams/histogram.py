@@ -78,8 +78,12 @@ class Histogram:
         """Percentiles in microseconds; NaN while nothing was counted."""
         return tuple((percentiles_of(np.array(self.counts), shares) / 1e3).tolist())
 
-    def clear(self) -> None:
-        """Count from nothing again."""
-        for number in range(BINS):
-            self.counts[number] = 0
-        self.largest = self.total = 0
+    def departure(self, share: float) -> float:
+        """Percentile of how far durations depart from their median, in microseconds; NaN: nothing counted."""
+        counts = np.array(self.counts, np.float64)
+        if not counts.any():
+            return math.nan
+        off = np.abs(MIDDLES - percentiles_of(counts, 50))
+        order = np.argsort(off)
+        above = np.cumsum(counts[order])
+        return float(off[order][np.searchsorted(above, share / 100 * above[-1])]) / 1e3

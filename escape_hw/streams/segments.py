@@ -13,6 +13,7 @@ import mmap
 import os
 import re
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -203,18 +204,24 @@ def reap(pid: int | None = None) -> tuple[Segment, ...]:
     return dead
 
 
-def readers(name: str) -> tuple[int, ...]:
-    """Processes of this user that have a segment mapped, its owner apart."""
-    found = examine(name)
-    path = str(SHARED / name)
-    users = [int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit()]
-    owner = None if found is None else found.pid
-    return tuple(sorted(pid for pid in users if pid != owner and _maps(pid, path)))
+def readers(names: Iterable[str]) -> dict[str, tuple[int, ...]]:
+    """Processes of this user that have each segment mapped, its owner apart."""
+    users: dict[str, list[int]] = {name: [] for name in names}
+    for pid in sorted(int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()):
+        for name in _mapped(pid) & users.keys():
+            users[name].append(pid)
+    owners = {name: examine(name) for name in users}
+    return {
+        name: tuple(pid for pid in pids if (one := owners[name]) is None or pid != one.pid)
+        for name, pids in users.items()
+    }
 
 
-def _maps(pid: int, path: str) -> bool:
+def _mapped(pid: int) -> set[str]:
+    """Names of the segments that a process has mapped."""
     try:
-        text = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace")
+        lines = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:  # it has ended, or is another user's
-        return False
-    return path in text
+        return set()
+    prefix = f"{SHARED}/escape-"
+    return {line[line.index(prefix) + len(str(SHARED)) + 1 :] for line in lines if prefix in line}

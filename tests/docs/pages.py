@@ -11,6 +11,10 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
+#: The documentation's own pages, without those that its build writes.
+EVERY = sorted(
+    page for page in (ROOT / "docs").rglob("*.md") if not {"_build", "_generated"} & set(page.parts)
+)
 
 
 @dataclass(frozen=True)

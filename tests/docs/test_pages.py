@@ -8,12 +8,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from pages import ROOT, Block, blocks_of, call, escape, spelled_right
+from pages import EVERY, ROOT, Block, blocks_of, call, escape, spelled_right
 
 DOCS = ROOT / "docs"
 #: Pages whose blocks belong together and are run whole; of the others, commands are parsed.
 RUN = sorted([*DOCS.glob("tutorial/*.md"), *DOCS.glob("how-to/*.md"), DOCS / "reference" / "products.md"])
-EVERY = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "_generated"} & set(page.parts))
 
 
 def name_of(page: Path) -> str:

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from pages import ROOT, call, escape, spelled_right
+from pages import EVERY, ROOT, call, escape, spelled_right
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 #: Minutes each; that their words are right is checked all the same.
@@ -95,13 +95,12 @@ def test_mistakes_are_reported_as_shown(tmp_path: Path) -> None:
     assert told == shown
 
 
-@pytest.mark.parametrize(
-    "document", ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md")))]
-)
+@pytest.mark.parametrize("document", ["README.md", *(str(page.relative_to(ROOT)) for page in EVERY)])
 def test_links_lead_somewhere(document: str) -> None:
     path = ROOT / document
     text = path.read_text(encoding="utf-8")
     assert "@@" not in text
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
-        if not target.startswith(("http://", "https://")):
+        # Written from the code when the site is built, which another test does.
+        if not target.startswith(("http://", "https://")) and "_generated/" not in target:
             assert (path.parent / target).exists(), f"{document} points at {target}"

@@ -47,6 +47,7 @@ def test_open_loop_matrix_fills_in_and_costs_the_run_nothing(often):
         run, shown = watched(bench, docrime_run(bench, frames=3000))
     matrix = run.result.matrix
     assert len(shown["matrix"]) >= 3
+    assert np.array_equal(shown["valid"][0], matrix.valid)
     last, sigma = shown["matrix"][-1], shown["matrix_sigma"][-1]
     assert last.shape == sigma.shape == matrix.data.shape
     # Errors shrink as frames come in, and the last picture is the result but for its last block.
@@ -136,7 +137,7 @@ def test_pictures_take_a_small_share_of_the_time(monkeypatch):
         return np.ones((4, 2)), np.ones((4, 2))
 
     monkeypatch.setattr(preview.time, "monotonic", lambda: clock[0])
-    pictures = Preview(3)
+    pictures = Preview(3, lambda: None)
     for _ in range(100_000):
         clock[0] += 0.001
         if pictures.due():

@@ -11,6 +11,7 @@ from small_bench import assert_flat, small
 from small_system import configuration
 
 from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.track import track
 from escape_hw.calibration.track_proposal import inverted
 from escape_hw.cli import main
@@ -40,10 +41,10 @@ def followed(bench, start, seconds, *, at=None, do=None, **options):
         if progress.stage == "tracking" and at is not None and progress.done >= at and waiting:
             waiting.pop()(twin)
 
+    options = {"response": start.response, "poke": 0.002, **options}
     procedure = track(
-        bench, start.matrix, start.grid, seconds=seconds, registration=start.registration,
-        response=start.response, **{"poke": 0.002, **options},
-    )  # fmt: skip
+        bench, start.matrix, start.grid, seconds=seconds, registration=start.registration, **options
+    )
     found = bench.run(procedure, observers=(watch,))
     assert_flat(bench)
     return found
@@ -149,6 +150,55 @@ def test_a_dead_actuator_raises_an_alarm_that_no_registration_explains(start):
     assert found.alarms[0].seconds > 7
 
 
+@pytest.mark.parametrize(
+    "more",
+    [
+        "twin.loss_probability=0.05",
+        "twin.vibration.amplitude_rad=[4e-6,2e-6]",
+        "devices.dm.limits.max_stroke=0.12",
+        "devices.dm.limits.max_slew=0.03",
+    ],
+    ids=["lost frames", "vibration", "clipped by the stroke", "clipped by the slew"],
+)
+def test_faults_that_bias_nothing(start, more):
+    with small(QUIET, more) as bench:
+        truth = bench.dm.twin.flexure.at(0.0).to_array()
+        found = followed(bench, start, 5)
+    assert found.stable
+    last = np.array([found.rows[name][-1] for name in PARAMETERS])
+    sigma = np.array([found.rows[f"{name}_sigma"][-1] for name in PARAMETERS])
+    # Twelve lenslets across five actuators: the scalings err by more than the noise.
+    assert (np.abs(last - truth) < np.array([4, 4, 4, 6, 6]) * sigma).all()
+    assert found.optical_gain.mean() == pytest.approx(1, abs=0.05)
+    if "loss" in more:
+        assert found.lost_frames == pytest.approx(found.frames * 0.05 / 0.95, rel=0.3)
+        assert not found.alarms
+
+
+def test_a_wrong_delay_is_told_and_the_measured_one_taken(start):
+    late = TemporalResponse(np.roll(start.response.weights, 1), start.response.sigma)
+    with small(QUIET) as bench:
+        truth = bench.dm.twin.flexure.at(0.0).to_array()
+        found = followed(bench, start, 6, response=late)
+    alarms = [alarm for alarm in found.alarms if alarm.kind == "delay"]
+    assert len(alarms) == 1
+    assert f"not {late.delay:.2f}" in alarms[0].text
+    assert found.latest.response.delay == pytest.approx(start.response.delay, abs=0.1)
+    error = np.array([found.rows[name][-1] for name in PARAMETERS]) - truth
+    assert (np.abs(error[:3]) < [3.0, 3.0, 0.15]).all()
+    assert found.optical_gain.mean() == pytest.approx(1, abs=0.1)
+
+
+def test_a_script_tracks_what_it_calibrated(start):
+    with small(QUIET) as bench:
+        found = bench.track(start, seconds=2, poke=0.003, exchange=False)
+        assert_flat(bench)
+    assert found.poke == 0.003
+    assert len(found.rows["seconds"]) == 2
+    assert found.latest.registration.registration.shift_x == found.rows["shift_x"][-1]
+    assert not any(one.accepted for one in found.exchanges)
+
+
 def test_a_lost_star_ends_tracking_and_keeps_the_table(start):
     with small(QUIET) as bench:
         found = followed(bench, start, 12, at=5, do=lambda twin: setattr(twin, "beam_blocked", True))
@@ -156,6 +206,19 @@ def test_a_lost_star_ends_tracking_and_keeps_the_table(start):
     assert kinds(found) >= {"dark"}
     assert "no light" in found.alarms[-1].text
     assert 3 <= len(found.rows["seconds"]) <= 6
+
+
+def test_a_loop_that_runs_away_is_opened_and_told(start):
+    def turn(twin):
+        send = twin.dynamics.command
+        twin.dynamics.command = lambda time_s, shape: send(time_s, -shape)
+
+    with small(QUIET) as bench:
+        found = followed(bench, start, 12, at=5, do=turn)
+    assert not found.stable
+    assert found.alarms[-1].kind == "diverged"
+    assert found.alarms[-1].seconds > 5
+    assert found.latest is not None
 
 
 def test_stopped_it_keeps_what_it_has(start):

@@ -101,7 +101,7 @@ def test_the_end_of_a_reader_disturbs_nobody(end: str) -> None:
         with process(READER, writer.name, "go" if end == "exit" else "stay") as reader:
             assert says(reader) == "1"
             if end == "kill":
-                assert segments.readers(writer.name) == (reader.pid,)
+                assert segments.readers([writer.name]) == {writer.name: (reader.pid,)}
                 reader.send_signal(signal.SIGKILL)
             reader.wait(30)
         assert [one.name for one in segments.segments(SYSTEM, os.getpid())] == [writer.name]

@@ -105,6 +105,10 @@ class FakeProcedures:
         self.calls.append(("simulated", {}))
         return fake.calibration("simulated")
 
+    def synthetic_of(self, measured: Any, model: Any, estimate: Any):
+        matrix = replace(measured.matrix, method="escape")
+        return replace(measured, matrix=matrix, registration=estimate)
+
     def measure_model_psf(self, bench: FakeBench, **options: Any):
         bench.screen_seen["model_psf"] = bench.screen.state.inserted
         yield from steps("model PSF")
@@ -124,7 +128,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         "closed_loop": ("closed_loop",),
         "gain_search": ("best_gain",),
         "model_psf": ("measure_model_psf",),
-        "pseudo_synthetic": ("simulated",),
+        "pseudo_synthetic": ("simulated", "synthetic_of"),
     }
     for module, names in homes.items():
         stand_in = types.ModuleType(f"escape_hw.calibration.{module}")

@@ -121,6 +121,9 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
     product = load_matrix(found["products"]["im"])
     assert product.registration is not None
     assert product.header["PARENT1"] == "im.fits"
+    synthetic = load_matrix(found["products"]["escape"])
+    assert synthetic.matrix.method == "escape"
+    assert synthetic.registration is not None
 
 
 def test_loop_document_has_every_promised_field(document, bench, im, tmp_path):

@@ -8,8 +8,7 @@ import fake_results as fake
 import numpy as np
 import pytest
 
-from escape_hw.api.gains import ClosureStep, GainRound, GainsResult, OpticalGains
-from escape_hw.api.results import Measured, StrehlEstimate
+from escape_hw.api.gains import OpticalGains
 from escape_hw.errors import ProductError
 from escape_hw.io.documents import dumps, gains_document
 from escape_hw.io.gains import load_gains, save_gains
@@ -20,25 +19,6 @@ from escape_hw.report.tables import rounds_table
 N = 20
 
 
-def gains(level: float) -> OpticalGains:
-    rng = np.random.default_rng(0)
-    sigma = np.full(N, 0.02 * level)
-    sigma[4] = np.inf
-    value = level + sigma[0] * rng.standard_normal(N)
-    small = np.full(N, 0.01)
-    return OpticalGains(value, sigma, np.full(N, level), small, value, small, 0.004)
-
-
-def result() -> GainsResult:
-    strehl = StrehlEstimate(*(Measured(0.3, 0.01) for _ in range(3)))
-    first = GainRound(gains(0.7), 0.004, 800, 0.1, 0.03, 70.0, 0.25, True)
-    last = GainRound(gains(0.72), 0.0004, 9000, 0.02, 0.02, 60.0, 0.01, True, strehl)
-    steps = (ClosureStep(1e-6, 0.4, 0.02, 300.0, True), ClosureStep(0.2, np.nan, np.nan, np.inf, False))
-    return GainsResult(
-        "escape", (first, last), steps, True, 0.425, 12000, 7, {"DO-CRIME": gains(1.8)}, False, ("a note",)
-    )
-
-
 def same(one: OpticalGains, other: OpticalGains) -> None:
     for name in ("value", "sigma", "trend", "trend_sigma", "best", "best_sigma"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -46,7 +26,7 @@ def same(one: OpticalGains, other: OpticalGains) -> None:
 
 
 def test_a_product_gives_back_everything(tmp_path):
-    made = result()
+    made = fake.gains_result()
     path = save_gains(tmp_path / "gains.fits", made, "razor-pywfs", True, fake.ORIGIN)
     product = load_gains(path)
     found = product.result
@@ -62,7 +42,7 @@ def test_a_product_gives_back_everything(tmp_path):
 
 
 def test_an_aborted_bootstrap_without_a_round_is_kept_under_a_name_that_says_so(tmp_path):
-    made = replace(result(), rounds=(), beside={}, converged=False, partial=True)
+    made = replace(fake.gains_result(), rounds=(), beside={}, converged=False, partial=True)
     path = save_gains(tmp_path / "gains.fits", made, "razor-pywfs", True)
     assert path.name == "gains.partial.fits"
     found = load_gains(path).result
@@ -72,7 +52,7 @@ def test_an_aborted_bootstrap_without_a_round_is_kept_under_a_name_that_says_so(
 
 
 def test_another_kind_and_damage_are_refused(tmp_path):
-    path = save_gains(tmp_path / "gains.fits", result(), "razor-pywfs", True)
+    path = save_gains(tmp_path / "gains.fits", fake.gains_result(), "razor-pywfs", True)
     with pytest.raises(ProductError, match="its kind is 'OG'"):
         load_loop(path)
     content = bytearray(path.read_bytes())
@@ -83,41 +63,41 @@ def test_another_kind_and_damage_are_refused(tmp_path):
 
 
 def test_the_document_has_the_promised_fields():
-    document = gains_document(result())
+    document = gains_document(fake.gains_result())
     assert len(document["optical_gain"]) == len(document["sigma"]) == N
     assert document["converged"] is True
     assert [one["poke"] for one in document["rounds"]] == [0.004, 0.0004]
     assert document["rounds"][1]["strehl"]["peak"]["value"] == 0.3
     assert set(document["beside"]) == {"DO-CRIME"}
     assert dumps(document)
-    nothing = gains_document(replace(result(), rounds=()))
+    nothing = gains_document(replace(fake.gains_result(), rounds=()))
     assert nothing["optical_gain"] is None
     assert nothing["rounds"] == []
 
 
 def test_gains_on_both_sides_of_one_get_an_axis_each():
-    both = figures_gains.optical_gains(result())
+    both = figures_gains.optical_gains(fake.gains_result())
     assert len(both.axes) == 2
     labels = [text.get_text() for text in both.axes[0].get_legend().get_texts()]
     assert labels == ["ESCAPE (left)", "DO-CRIME (right)"]
-    alone = figures_gains.optical_gains(replace(result(), beside={}))
+    alone = figures_gains.optical_gains(replace(fake.gains_result(), beside={}))
     assert len(alone.axes) == 1
     # The mode without a measurement has no point.
     assert len(alone.axes[0].containers[0].lines[0].get_xdata()) == N - 1
 
 
 def test_the_bootstrap_is_drawn_and_tabled_with_and_without_rounds():
-    for one in (result(), replace(result(), rounds=())):
+    for one in (fake.gains_result(), replace(fake.gains_result(), rounds=())):
         figure = figures_gains.bootstrap(one)
         assert len(figure.axes[0].lines[0].get_xdata()) == 2
         assert len(rounds_table(one).rows) == len(one.rounds)
-    row = rounds_table(result()).rows[1]
+    row = rounds_table(fake.gains_result()).rows[1]
     assert row[1:3] == ("0.04", "9000")
     assert row[-1] == "30.0 ± 1.0"
 
 
 def test_the_product_is_shown(escape, document, tmp_path):
-    path = save_gains(tmp_path / "gains.fits", result(), "razor-pywfs", True)
+    path = save_gains(tmp_path / "gains.fits", fake.gains_result(), "razor-pywfs", True)
     code, found, _ = document("show", path)
     assert code == 0
     assert found["converged"] is True

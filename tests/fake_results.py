@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from escape_hw.api.gains import ClosureStep, GainRound, GainsResult, OpticalGains
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import (
@@ -192,3 +193,33 @@ def sky_time() -> dict[str, object]:
         },
         "bound": bound,
     }
+
+
+def optical_gains(level: float, n: int = 20) -> OpticalGains:
+    """Gains around a level; one mode was not measured."""
+    rng = np.random.default_rng(0)
+    sigma = np.full(n, 0.02 * level)
+    sigma[4] = np.inf
+    value = level + sigma[0] * rng.standard_normal(n)
+    small = np.full(n, 0.01)
+    return OpticalGains(value, sigma, np.full(n, level), small, value, small, 0.004)
+
+
+def gains_result() -> GainsResult:
+    """What a bootstrap of the optical gains returns."""
+    strehl = StrehlEstimate(*(Measured(0.3, 0.01) for _ in range(3)))
+    first = GainRound(optical_gains(0.7), 0.004, 800, 0.1, 0.03, 70.0, 0.25, True)
+    last = GainRound(optical_gains(0.72), 0.0004, 9000, 0.02, 0.02, 60.0, 0.01, True, strehl)
+    steps = (ClosureStep(1e-6, 0.4, 0.02, 300.0, True), ClosureStep(0.2, np.nan, np.nan, np.inf, False))
+    return GainsResult(
+        "escape",
+        (first, last),
+        steps,
+        True,
+        0.425,
+        12000,
+        7,
+        {"DO-CRIME": optical_gains(1.8)},
+        False,
+        ("a note",),
+    )

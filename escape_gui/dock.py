@@ -1,0 +1,99 @@
+"""A dock: a panel under a slim title with its condition, a menu to save it, and its help."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import Qt, Signal
+from PySide6.QtWidgets import QDockWidget, QHBoxLayout, QLabel, QMainWindow, QMenu, QToolButton, QWidget
+
+from escape_gui.panels.panel import Panel
+from escape_gui.theme import Theme
+from escape_gui.widgets.status_pill import Level, StatusPill
+from escape_hw.remote.state import Health
+
+LEVELS: dict[Health, Level] = {
+    Health.OK: Level.GOOD,
+    Health.STALE: Level.WARN,
+    Health.LOST: Level.BAD,
+    Health.FAULT: Level.BAD,
+    Health.CLOSED: Level.QUIET,
+}
+
+
+class Dock(QDockWidget):
+    """A panel in its frame.
+
+    Parameters
+    ----------
+    panel
+        The content.
+    theme
+        Colours and fonts.
+    window
+        Where it docks.
+    """
+
+    #: Panel's name and ``png``, ``csv`` or ``fits``.
+    save_wanted = Signal(str, str)
+    #: Panel's name.
+    help_wanted = Signal(str)
+
+    def __init__(self, panel: Panel, theme: Theme, window: QMainWindow) -> None:
+        # Without the window Qt would not find it when it restores a layout.
+        super().__init__(panel.title, window)
+        self.setObjectName(panel.name)
+        self.panel = panel
+        self._theme = theme
+        self.setWidget(panel)
+        self._title = QLabel(panel.title)
+        self._pill = StatusPill(theme)
+        self.setTitleBarWidget(self._make_title())
+        theme.changed.connect(self._restyle)
+        self._restyle()
+
+    def _make_title(self) -> QWidget:
+        bar = QWidget()
+        bar.setObjectName("title")
+        bar.setAttribute(Qt.WidgetAttribute.WA_StyledBackground)
+        row = QHBoxLayout(bar)
+        row.setContentsMargins(8, 2, 4, 2)
+        row.setSpacing(4)
+        row.addWidget(self._title)
+        row.addStretch()
+        row.addWidget(self._pill)
+        name = self.panel.name
+        save = _quiet("⤓", f"Save {self.panel.title}: picture, table or FITS")
+        save.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
+        menu = QMenu(save)
+        for kind, text in (("png", "Picture (PNG)"), ("csv", "Table (CSV)"), ("fits", "Arrays (FITS)")):
+            menu.addAction(text).triggered.connect(
+                lambda _=False, kind=kind: self.save_wanted.emit(name, kind)
+            )
+        save.setMenu(menu)
+        about = _quiet("?", f"Help on {self.panel.title}")
+        about.clicked.connect(lambda: self.help_wanted.emit(name))
+        shut = _quiet("×", f"Hide {self.panel.title}; View brings it back")
+        shut.clicked.connect(self.close)
+        for button in (save, about, shut):
+            row.addWidget(button)
+        return bar
+
+    def show_health(self) -> None:
+        """Bring the condition in the title up to date; a panel that is well says nothing."""
+        health = self.panel.health
+        quiet = health is Health.OK or (self.panel.is_empty and health is Health.STALE)
+        self._pill.setVisible(not quiet)
+        if not quiet:
+            self._pill.show_condition(LEVELS[health], health.value)
+
+    def _restyle(self) -> None:
+        self._title.setFont(self._theme.font(bold=True))
+
+
+def _quiet(text: str, tip: str) -> QToolButton:
+    button = QToolButton()
+    button.setObjectName("quiet")
+    button.setText(text)
+    button.setToolTip(tip)
+    button.setAccessibleName(tip)
+    button.setStyleSheet("QToolButton::menu-indicator { image: none; }")
+    return button

@@ -1,0 +1,144 @@
+"""Products that a server or a recording names, read from disk beside the window's own thread."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from escape_gui.views.gain_curves import Curve
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.errors import EscapeError
+from escape_hw.remote.state import Product
+from escape_hw.report.content import RunContent, read_product
+
+log = logging.getLogger(__name__)
+
+#: Order of methods in every list: measured with a source, measured without, computed.
+_ORDER = (
+    "push-pull",
+    "push-pull-fast",
+    "modulated",
+    "docrime",
+    "docrime-whitened",
+    "docrime-closed",
+    "escape",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Shelf:
+    """What was read so far; each time something is added it is a new one with a higher number.
+
+    Parameters
+    ----------
+    number
+        Counts up with every change.
+    matrices, gains
+        By label, baselines before what was measured without a source, and that before what was computed.
+    troubles
+        What could not be read, and why.
+    """
+
+    number: int = 0
+    matrices: dict[str, InteractionMatrix] = field(default_factory=dict)
+    gains: dict[str, Curve] = field(default_factory=dict)
+    troubles: dict[str, str] = field(default_factory=dict)
+
+
+class Library:
+    """Reads products once, in a thread of its own, and shows what it has as a :class:`Shelf`.
+
+    ``close`` ends the thread.
+    """
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="escape-library")
+        self._known: dict[tuple[str, str, int], Future[RunContent]] = {}
+        self._built: tuple[object, ...] = ()
+        self._shelf = Shelf()
+        self._lock = threading.Lock()
+
+    def want(self, products: Iterable[Product]) -> None:
+        """Read these, and forget others; returns at once."""
+        known = {_key(one): one for one in products if one.kind in ("matrix", "gains")}
+        with self._lock:
+            for key in [key for key in self._known if key not in known]:
+                del self._known[key]
+            for key, one in known.items():
+                if key not in self._known:
+                    self._known[key] = self._pool.submit(read_product, Path(one.path))
+
+    @property
+    def reading(self) -> bool:
+        """Whether something is still being read."""
+        with self._lock:
+            return any(not one.done() for one in self._known.values())
+
+    @property
+    def shelf(self) -> Shelf:
+        """Everything that has been read by now."""
+        with self._lock:
+            ready = {key: one for key, one in self._known.items() if one.done()}
+            if tuple(ready) != self._built:
+                self._built = tuple(ready)
+                self._shelf = _build(self._shelf.number + 1, ready)
+            return self._shelf
+
+    def close(self) -> None:
+        """End the thread."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _key(product: Product) -> tuple[str, str, int]:
+    """A product by name, place and age: a file written again is another one."""
+    try:
+        age = Path(product.path).stat().st_mtime_ns
+    except OSError:
+        age = 0
+    return product.name, product.path, age
+
+
+def _build(number: int, ready: dict[tuple[str, str, int], Future[RunContent]]) -> Shelf:
+    matrices: dict[str, InteractionMatrix] = {}
+    gains: dict[str, Curve] = {}
+    troubles: dict[str, str] = {}
+    for (name, path, _), future in ready.items():
+        error = future.exception()
+        if isinstance(error, EscapeError):
+            troubles[name] = str(error)
+            continue
+        if error is not None:
+            log.error("%s cannot be shown", path, exc_info=error)
+            troubles[name] = f"{path}: {error}"
+            continue
+        run = future.result()
+        for label, matrix in run.matrices().items():
+            _add(matrices, label, name, matrix)
+        for label, result in run.gains.items():
+            if result.gains is None:
+                continue
+            gains[label] = Curve.of(label, result.gains, [one.gains.best for one in result.rounds])
+            gains |= {other: Curve.of(other, one) for other, one in result.beside.items()}
+    ordered = dict(sorted(matrices.items(), key=lambda item: _rank(item[1])))
+    return Shelf(number, ordered, gains, troubles)
+
+
+def _add(matrices: dict[str, InteractionMatrix], label: str, name: str, matrix: InteractionMatrix) -> None:
+    """Under its label, or under label and product when another matrix has that label already."""
+    taken = matrices.get(label)
+    if taken is not None and _same(taken, matrix):
+        return
+    matrices[label if taken is None else f"{label} ({name})"] = matrix
+
+
+def _same(one: InteractionMatrix, other: InteractionMatrix) -> bool:
+    """Whether it is one matrix twice: as its own product, and inside of what was computed from it."""
+    return one.data.shape == other.data.shape and bool((one.data == other.data).all())
+
+
+def _rank(matrix: InteractionMatrix) -> int:
+    return _ORDER.index(matrix.method) if matrix.method in _ORDER else len(_ORDER)

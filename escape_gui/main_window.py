@@ -1,0 +1,363 @@
+"""The window: docks in three workspaces under one band, and what the actions do."""
+
+from __future__ import annotations
+
+import base64
+import logging
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+
+from PySide6.QtCore import QByteArray, Qt
+from PySide6.QtGui import QAction, QCloseEvent, QKeySequence
+from PySide6.QtWidgets import (
+    QApplication,
+    QDockWidget,
+    QFileDialog,
+    QLabel,
+    QMainWindow,
+    QMenuBar,
+    QTabBar,
+    QTabWidget,
+    QVBoxLayout,
+    QWidget,
+)
+
+from escape_gui import exports
+from escape_gui.actions import ACTIONS, MENUS
+from escape_gui.band import Band
+from escape_gui.dock import Dock
+from escape_gui.fault_bar import FaultBar
+from escape_gui.help_pages import page
+from escape_gui.key_map import key_map, keys_text
+from escape_gui.news import News
+from escape_gui.panels import PANELS
+from escape_gui.panels.panel import Context, Panel
+from escape_gui.replay.desk import ReplayDesk
+from escape_gui.session import Control, Session
+from escape_gui.settings import Settings, save_settings
+from escape_gui.situation import Situation
+from escape_gui.theme import Theme
+from escape_gui.ticker import Ticker
+from escape_gui.widgets.overlay import Overlay
+from escape_gui.widgets.status_pill import Level
+from escape_gui.widgets.toasts import Toasts
+from escape_gui.workspaces import WORKSPACES, arrange, workspace
+from escape_hw.errors import EscapeError, StorageError
+
+log = logging.getLogger(__name__)
+#: Version of the arrangement Qt stores; layouts of another one are dropped.
+LAYOUT_VERSION = 1
+
+
+class MainWindow(QMainWindow):
+    """One window on one source.
+
+    Parameters
+    ----------
+    session
+        Data and requests; the window does not close it.
+    settings
+        What is remembered.
+    store
+        Where to remember it; ``None``: nowhere.
+    panels
+        Kinds of panels to show.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        settings: Settings,
+        store: Path | None = None,
+        panels: Sequence[type[Panel]] = PANELS,
+    ) -> None:
+        super().__init__()
+        self._settings, self._store = settings, store
+        self.context = Context(Theme(settings.theme, settings.font_scale), session)
+        self.context.theme.apply()
+        self.setDockNestingEnabled(True)
+        self.setDockOptions(
+            QMainWindow.DockOption.AnimatedDocks
+            | QMainWindow.DockOption.AllowNestedDocks
+            | QMainWindow.DockOption.AllowTabbedDocks
+        )
+        self.setTabPosition(Qt.DockWidgetArea.AllDockWidgetAreas, QTabWidget.TabPosition.North)
+        self.actions_by_name = self._make_actions()
+        self.band = Band(self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"])
+        self.fault_bar = FaultBar(self.context, self.actions_by_name["clear_fault"])
+        self.tabs = self._make_tabs()
+        self.panels = {kind.name: kind(self.context) for kind in panels}
+        self.docks = {name: self._make_dock(panel) for name, panel in self.panels.items()}
+        self._make_top()
+        self._notes = {name: QLabel() for name in ("busy", "saved", "recording", "disk")}
+        for label in self._notes.values():
+            self.statusBar().addPermanentWidget(label)
+        self.toasts = Toasts(self, self.context.theme)
+        self.overlay = Overlay(self, self.context.theme)
+        self.news = News(self.toasts)
+        self.ticker = Ticker(session, self.panels.values(), self.refresh)
+        self.replay: ReplayDesk = ReplayDesk(
+            self, lambda: MainWindow(Session(), settings.model_copy(deep=True), None, panels)
+        )
+        session.failed.connect(lambda what, why: self.toasts.tell(Level.BAD, f"Could not {what}", why))
+        session.waiting_changed.connect(
+            lambda n: self._note("busy", f"{n} request(s) under way" if n else "")
+        )
+        self.workspace = workspace(settings.workspace)
+        self._restore()
+
+    # ------------------------------------------------------------ building
+    def _make_actions(self) -> dict[str, QAction]:
+        made = {}
+        for one in ACTIONS:
+            action = QAction(one.text, self)
+            action.setObjectName(one.name)
+            action.setShortcuts([QKeySequence(key) for key in one.keys])
+            action.setShortcutContext(Qt.ShortcutContext.WindowShortcut)
+            action.triggered.connect(lambda _=False, one=one: one.run(self))
+            self.addAction(action)
+            made[one.name] = action
+        return made
+
+    def _make_tabs(self) -> QTabBar:
+        tabs = QTabBar()
+        tabs.setAccessibleName("Workspaces")
+        tabs.setExpanding(False)
+        tabs.setDrawBase(False)
+        for one in WORKSPACES:
+            tabs.setTabToolTip(tabs.addTab(one.title), f"{one.purpose}.")
+        tabs.tabBarClicked.connect(lambda k: self.show_workspace(WORKSPACES[k].name) if k >= 0 else None)
+        tabs.currentChanged.connect(lambda k: self.show_workspace(WORKSPACES[k].name))
+        return tabs
+
+    def _make_dock(self, panel: Panel) -> Dock:
+        dock = Dock(panel, self.context.theme, self)
+        dock.save_wanted.connect(lambda name, kind: self.save_panel(kind, self.panels[name]))
+        dock.help_wanted.connect(lambda name: self.show_panel_help(self.panels[name]))
+        return dock
+
+    def _make_top(self) -> None:
+        bar = QMenuBar()
+        for title in MENUS:
+            menu = bar.addMenu(title)
+            for one in ACTIONS:
+                if one.menu == title:
+                    menu.addAction(self.actions_by_name[one.name])
+            if title == "&View":
+                menu.addSeparator()
+                shown = menu.addMenu("Sho&w")
+                for dock in self.docks.values():
+                    shown.addAction(dock.toggleViewAction())
+        bar.setCornerWidget(self.tabs, Qt.Corner.TopRightCorner)
+        top = QWidget()
+        column = QVBoxLayout(top)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(0)
+        for widget in (bar, self.band, self.fault_bar):
+            column.addWidget(widget)
+        self.setMenuWidget(top)
+
+    # ------------------------------------------------------------ layout
+    def _restore(self) -> None:
+        self.resize(1280, 800)
+        if self._settings.geometry:
+            self.restoreGeometry(_bytes(self._settings.geometry))
+        self._show_layout()
+        self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
+        self.setFocus()
+
+    def _show_layout(self) -> None:
+        stored = self._settings.layouts.get(self.workspace.name)
+        docks: dict[str, QDockWidget] = dict(self.docks)
+        size = self.size()
+        if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
+            arrange(self, docks, self.workspace)
+        # A layout of a larger window must not make this one larger.
+        self.resize(size)
+
+    def show_workspace(self, name: str) -> None:
+        """Change to another workspace, each as it was left."""
+        if name == self.workspace.name:
+            return
+        self._remember_layout()
+        self.workspace = workspace(name)
+        self._show_layout()
+        self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
+
+    def reset_layout(self) -> None:
+        """Put this workspace's panels back in place."""
+        self._settings.layouts.pop(self.workspace.name, None)
+        self._show_layout()
+
+    def _remember_layout(self) -> None:
+        self._settings.layouts[self.workspace.name] = _text(self.saveState(LAYOUT_VERSION))
+
+    def focus_panel(self, step: int) -> None:
+        """Give the focus to the next visible panel."""
+        seen = [name for name, dock in self.docks.items() if not dock.visibleRegion().isEmpty()]
+        if not seen:
+            return
+        now = self.panel_in_focus()
+        k = seen.index(now.name) + step if now is not None and now.name in seen else 0
+        panel = self.panels[seen[k % len(seen)]]
+        panel.setFocus(Qt.FocusReason.TabFocusReason)
+        if not panel.hasFocus():
+            panel.focusNextChild()
+
+    def panel_in_focus(self) -> Panel | None:
+        """The panel that has the focus."""
+        widget = QApplication.focusWidget()
+        while widget is not None and not isinstance(widget, Panel):
+            widget = widget.parentWidget()
+        return widget
+
+    # ------------------------------------------------------------ five times a second
+    def refresh(self) -> None:
+        """Bring band, actions and notes up to date."""
+        session = self.context.session
+        source, live = session.source, session.commands is not None
+        state = source.state
+        now = Situation(state, source.connected, live, session.may_write)
+        self.band.show_state(state, connected=now.connected, live=live, mine=now.may_write)
+        self.fault_bar.show_state(state)
+        for one in ACTIONS:
+            why = one.obstacle(now)
+            action = self.actions_by_name[one.name]
+            action.setEnabled(not why)
+            keys = f" ({keys_text(one.keys)})" if one.keys else ""
+            action.setToolTip(f"{one.tip}{keys}" if not why else f"{one.tip} Not now: {why}.")
+        for dock in self.docks.values():
+            dock.show_health()
+        self.news.look(state, connected=now.connected)
+        written = state.telemetry
+        self._note(
+            "recording",
+            f"recording {written.written} frames, {written.dropped} dropped" if written.recording else "",
+        )
+        self._note("disk", f"{state.disk.free_gb:.1f} GB free" if state.disk.folder else "")
+        self.setWindowTitle(f"ESCAPE · {state.system}" if state.system else "ESCAPE")
+
+    def _note(self, name: str, text: str) -> None:
+        self._notes[name].setText(text)
+
+    # ------------------------------------------------------------ what actions do
+    def ask(self, what: str, call: Callable[[Control], object], *, urgent: bool = False) -> None:
+        """Send a request whose answer nobody waits for."""
+        commands = self.context.session.commands
+        if commands is not None:
+            commands.ask(what, call, urgent=urgent)
+
+    def take_control(self) -> None:
+        """Ask for the lease, from its holder if there is one."""
+        held = self.context.session.source.state.lease is not None
+        self.ask("take control", lambda server: server.acquire(take_over=held))
+
+    def toggle_pause(self) -> None:
+        """Halt the procedure or go on with it."""
+        running = self.context.session.source.state.procedure
+        if running is not None and running.paused:
+            self.ask("go on", lambda server: server.resume())
+        else:
+            self.ask("pause", lambda server: server.pause())
+
+    def toggle_recording(self) -> None:
+        """Begin or end telemetry."""
+        on = not self.context.session.source.state.telemetry.recording
+        self.ask("record telemetry" if on else "stop recording", lambda server: server.record(on))
+
+    def toggle_theme(self) -> None:
+        """The other palette."""
+        self.context.theme.use_shade("light" if self.context.theme.shade == "dark" else "dark")
+
+    def step_letters(self, steps: int) -> None:
+        """Larger or smaller letters; 0: the normal size."""
+        self.context.theme.step_scale(steps)
+
+    def toggle_freeze(self) -> None:
+        """Hold the panels, or let them go on; band and safety buttons never freeze."""
+        self.ticker.frozen = not self.ticker.frozen
+        self.statusBar().showMessage("Panels are frozen; X goes on" if self.ticker.frozen else "", 0)
+
+    def toggle_key_map(self) -> None:
+        """Show the keys, or close them."""
+        if self.overlay.isVisible():
+            self.overlay.hide()
+        else:
+            self.overlay.open("Keyboard", key_map())
+
+    def show_panel_help(self, panel: Panel | None = None) -> None:
+        """Show a panel's help page; without one, of the panel in focus."""
+        panel = panel or self.panel_in_focus()
+        if panel is None:
+            self.toggle_key_map()
+        else:
+            self.overlay.open(panel.title, page(panel), markdown=True)
+
+    def save_panel(self, kind: str, panel: Panel | None = None) -> None:
+        """Ask where, then save a panel as ``png``, ``csv`` or ``fits``."""
+        panel = panel or self.panel_in_focus()
+        if panel is None:
+            self.toasts.tell(Level.WARN, "Which panel?", "Click a panel first, or use the ⤓ in its title.")
+            return
+        path = self._ask_path(panel.name, kind)
+        if path is not None:
+            self.save_to(path, kind, panel)
+
+    def save_window(self) -> None:
+        """Ask where, then save the whole window as a picture."""
+        path = self._ask_path("window", "png")
+        if path is not None:
+            self._tell_saved(lambda: exports.save_png(path, self))
+
+    def save_to(self, path: Path, kind: str, panel: Panel) -> None:
+        """Save a panel; says where, or why not."""
+        if kind == "png":
+            self._tell_saved(lambda: exports.save_png(path, panel))
+        elif kind == "csv":
+            self._tell_saved(lambda: exports.save_csv(path, panel))
+        else:
+            state = self.context.session.source.state
+            self._tell_saved(lambda: exports.save_fits(path, panel, state))
+
+    def _tell_saved(self, save: Callable[[], tuple[Path, ...]]) -> None:
+        try:
+            written = save()
+        except EscapeError as error:
+            self.toasts.tell(Level.BAD, "Not saved", str(error))
+            return
+        self._note("saved", f"saved {written[-1].name}")
+        self.toasts.tell(Level.GOOD, "Saved", "\n".join(str(path) for path in written))
+
+    def _ask_path(self, name: str, kind: str) -> Path | None:
+        moment = datetime.now().strftime("%Y-%m-%d_%H%M%S")
+        proposal = str(Path.home() / f"escape_{name}_{moment}.{kind}")
+        chosen, _ = QFileDialog.getSaveFileName(self, f"Save {name}", proposal, f"*.{kind}")
+        return Path(chosen) if chosen else None
+
+    def closeEvent(self, event: QCloseEvent) -> None:
+        """Remember the layout; the server goes on."""
+        self.ticker.stop()
+        self.replay.close()
+        self._remember_layout()
+        theme, settings = self.context.theme, self._settings
+        settings.geometry = _text(self.saveGeometry())
+        settings.theme, settings.font_scale = theme.shade, theme.scale
+        settings.workspace = self.workspace.name
+        if self._store is not None:
+            try:
+                save_settings(self._store, settings)
+            except StorageError as error:
+                log.warning("settings are not kept: %s", error)
+        super().closeEvent(event)
+
+
+def _bytes(text: str) -> QByteArray:
+    try:
+        return QByteArray(base64.b64decode(text, validate=True))
+    except ValueError:
+        return QByteArray()
+
+
+def _text(content: QByteArray) -> str:
+    return base64.b64encode(content.data()).decode()

@@ -1,0 +1,113 @@
+"""The server's log, to be searched."""
+
+from __future__ import annotations
+
+from collections import deque
+from html import escape
+from typing import ClassVar
+
+from PySide6.QtGui import QGuiApplication
+from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLineEdit, QPlainTextEdit, QPushButton
+
+from escape_gui.panels.panel import Context, Panel
+from escape_hw.remote.source import Source
+from escape_hw.remote.state import LogLine
+
+#: Lines kept; older ones are in the server's file.
+KEPT = 5000
+LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
+_COLOURS = {"WARNING": "warn", "ERROR": "bad", "CRITICAL": "bad", "DEBUG": "muted"}
+
+
+class LogPanel(Panel):
+    """Lines of the log, oldest first."""
+
+    name: ClassVar[str] = "log"
+    title: ClassVar[str] = "Log"
+    help: ClassVar[str] = (
+        "What the server has written, newest last. Type to see only lines with all of these words, choose "
+        "the least level, copy what is shown. It follows the newest line while it is scrolled to the end."
+    )
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.search = QLineEdit()
+        self.search.setPlaceholderText("Search")
+        self.search.setClearButtonEnabled(True)
+        self.search.setAccessibleName("Search the log")
+        self.search.textChanged.connect(self._show_again)
+        self.level = QComboBox()
+        self.level.addItems([level.title() for level in LEVELS])
+        self.level.setCurrentIndex(1)
+        self.level.setAccessibleName("Least level")
+        self.level.setToolTip("Show lines of this level and above")
+        self.level.currentIndexChanged.connect(self._show_again)
+        self.copy_button = QPushButton("Copy")
+        self.copy_button.setToolTip("Copy the lines shown")
+        self.copy_button.clicked.connect(self._copy)
+        self.text = QPlainTextEdit()
+        self.text.setReadOnly(True)
+        self.text.setMaximumBlockCount(KEPT)
+        self.text.setAccessibleName("Lines of the log")
+        self.text.setLineWrapMode(QPlainTextEdit.LineWrapMode.WidgetWidth)
+        row = QHBoxLayout()
+        row.addWidget(self.search, 1)
+        row.addWidget(self.level)
+        row.addWidget(self.copy_button)
+        self.body.addLayout(row)
+        self.body.addWidget(self.text, 1)
+        self._lines: deque[LogLine] = deque(maxlen=KEPT)
+        self._number = -1
+        self.restyle()
+
+    def tick(self, source: Source) -> None:
+        """New lines, all at once."""
+        new = source.log_after(self._number)
+        if not new:
+            return
+        self._number = new[-1].number
+        self._lines.extend(new)
+        self._append([line for line in new if self._wanted(line)])
+
+    def _wanted(self, line: LogLine) -> bool:
+        if line.level in LEVELS and LEVELS.index(line.level) < self.level.currentIndex():
+            return False
+        text = f"{line.text} {line.logger}".lower()
+        return all(word in text for word in self.search.text().lower().split())
+
+    def _append(self, lines: list[LogLine]) -> None:
+        if not lines:
+            return
+        bar = self.text.verticalScrollBar()
+        at_end = bar.value() >= bar.maximum() - 2
+        self.text.appendHtml("<br>".join(self._html(line) for line in lines))
+        if at_end:
+            bar.setValue(bar.maximum())
+
+    def _html(self, line: LogLine) -> str:
+        colours = self.context.theme.colours
+        colour = getattr(colours, _COLOURS.get(line.level, "text"))
+        moment = escape(line.at_utc.partition("T")[2][:8] or line.at_utc)
+        level = escape(f"{line.level:<8}").replace(" ", "&nbsp;")
+        return (
+            f'<span style="color:{colours.muted}">{moment}</span> '
+            f'<span style="color:{colour}">{level} {escape(line.text)}</span>'
+        )
+
+    def _show_again(self) -> None:
+        self.text.clear()
+        self._append([line for line in self._lines if self._wanted(line)])
+
+    def _copy(self) -> None:
+        QGuiApplication.clipboard().setText(self.text.toPlainText())
+
+    def clear(self) -> None:
+        """Another server counts from the beginning."""
+        self._lines.clear()
+        self._number = -1
+        self.text.clear()
+
+    def restyle(self) -> None:
+        """Lines stand in columns and carry the theme's colours."""
+        self.text.setFont(self.context.theme.font(0.9, mono=True))
+        self._show_again()

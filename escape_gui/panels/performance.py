@@ -1,0 +1,91 @@
+"""How good the correction is: Strehl ratio and residual over the last minutes."""
+
+from __future__ import annotations
+
+import time
+from typing import ClassVar
+
+import numpy as np
+from PySide6.QtWidgets import QHBoxLayout
+
+from escape_gui.panels.panel import Context, Panel, Shown
+from escape_gui.widgets.readout import Readout
+from escape_gui.widgets.strip_chart import History, StripChart
+from escape_hw.remote.source import Source
+from escape_hw.remote.state import State
+
+_KEPT = 4096
+
+
+class PerformancePanel(Panel):
+    """Two strip charts and their newest values."""
+
+    name: ClassVar[str] = "performance"
+    title: ClassVar[str] = "Performance"
+    help: ClassVar[str] = (
+        "Strehl ratio of the science camera by its peak against the model, and residual wavefront of the "
+        "modes the loop controls, over the last two minutes. Gaps: the loop was open, or there is no model "
+        "image."
+    )
+    rate_hz: ClassVar[float] = 10.0
+    empty: ClassVar[str] = (
+        "The loop has not been closed yet.\nCalibrate first, then choose a matrix under Loop and close it."
+    )
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        theme = context.theme
+        self.strehl = StripChart(theme, "Strehl ratio over time", "Strehl ratio [%]", number=0)
+        self.residual = StripChart(theme, "Residual over time", "residual [nm rms]", number=1)
+        self.residual.setXLink(self.strehl)
+        self.strehl.hide_bottom_label()
+        self.readouts = {
+            "strehl": Readout(theme, "Strehl", "%", 12),
+            "residual": Readout(theme, "residual", "nm rms", 7),
+        }
+        row = QHBoxLayout()
+        row.setSpacing(24)
+        for readout in self.readouts.values():
+            row.addWidget(readout)
+        row.addStretch()
+        self.body.addLayout(row)
+        self.body.addWidget(self.strehl, 1)
+        self.body.addWidget(self.residual, 1)
+        self._history = {"strehl": History(_KEPT), "residual": History(_KEPT)}
+
+    def take_state(self, state: State) -> None:
+        """Another point of each curve."""
+        loop, now = state.loop, time.monotonic()
+        if loop.closed:
+            self.set_empty(False)
+        if self.is_empty:
+            return
+        strehl = np.nan if loop.strehl is None or not loop.closed else 100 * loop.strehl
+        residual = loop.residual_nm if loop.closed else np.nan
+        self._history["strehl"].add(now, strehl)
+        self._history["residual"].add(now, residual)
+        sigma = "" if loop.strehl_sigma is None else f" ± {100 * loop.strehl_sigma:.1f}"
+        self.readouts["strehl"].show_value("–" if np.isnan(strehl) else f"{strehl:.1f}{sigma}")
+        self.readouts["residual"].show_value("–" if np.isnan(residual) else f"{residual:.1f}")
+
+    def tick(self, source: Source) -> None:
+        """The charts move on even when nothing comes."""
+        if self.is_empty:
+            return
+        now = time.monotonic()
+        self.strehl.show_history(self._history["strehl"], now)
+        self.residual.show_history(self._history["residual"], now)
+
+    def clear(self) -> None:
+        """Another source."""
+        for history in self._history.values():
+            history.clear()
+
+    def shown(self) -> tuple[Shown, ...]:
+        """One table of both curves; seconds before now."""
+        if self.is_empty:
+            return ()
+        times, strehl = self._history["strehl"].arrays
+        _, residual = self._history["residual"].arrays
+        table = np.stack([times - time.monotonic(), strehl, residual], axis=1)
+        return (Shown("performance", table, "", ("time [s]", "strehl [%]", "residual [nm rms]")),)

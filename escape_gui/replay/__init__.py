@@ -1,0 +1,1 @@
+"""Products and run folders, shown by the panels that show a living bench."""

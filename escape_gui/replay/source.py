@@ -1,0 +1,202 @@
+"""A run folder or a product as a source for panels: all to be looked at, nothing to be commanded."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from escape_gui.replay.geometry import geometry_of
+from escape_gui.replay.streams import Course, courses, main_calibration
+from escape_hw.errors import ConfigError
+from escape_hw.io.fits import KIND_MATRIX
+from escape_hw.io.gains import KIND_GAINS
+from escape_hw.remote.source import STREAMS, Sample
+from escape_hw.remote.state import (
+    Arguments,
+    Ended,
+    Finish,
+    Geometry,
+    LogLine,
+    LoopState,
+    Phase,
+    Plan,
+    ProcedureEntry,
+    Product,
+    State,
+    StreamEntry,
+)
+from escape_hw.report.content import RunContent, read_product, read_run
+
+#: Why nothing can be commanded.
+REASON = "This is a recording: it can be looked at, nothing in it can be moved."
+_LINE = re.compile(r"(\S+ \S+) ([A-Z]+) (\S+): (.*)")
+
+
+class ReplaySource:
+    """What a run left behind, as a :class:`~escape_hw.remote.source.Source`.
+
+    Parameters
+    ----------
+    path
+        A FITS product or the folder of a run.
+
+    Attributes
+    ----------
+    run
+        Everything that was read.
+
+    Raises
+    ------
+    ProductError
+        It is no run and no product, or it is damaged.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.run: RunContent = read_run(self.path) if self.path.is_dir() else read_product(self.path)
+        self._courses = courses(self.run)
+        self._position = 1.0
+        self._serial = 1
+        self._log = _log_lines(self.run.log_text)
+        self._opened_ns = time.monotonic_ns()
+
+    @property
+    def connected(self) -> bool:
+        """A recording is always there."""
+        return True
+
+    @property
+    def position(self) -> float:
+        """How much of the run is shown, 0 to 1."""
+        return self._position
+
+    @property
+    def steps(self) -> int:
+        """Steps of the longest course; 1 when nothing in it has one."""
+        return max((course.length for course in self._courses.values()), default=1)
+
+    def seek(self, position: float) -> None:
+        """Show the run as it was after this share of it."""
+        self._position = min(1.0, max(0.0, position))
+        self._serial += 1
+
+    def latest(self, stream: str, after: int = -1) -> Sample | None:
+        """See :class:`~escape_hw.remote.source.Source`."""
+        course = self._courses.get(stream)
+        if course is None or self._serial <= after:
+            return None
+        data = course.at(_step(course, self._position))
+        if data is None:
+            return None
+        return Sample(self._serial, self._opened_ns, self._opened_ns, np.asarray(data), course.meta)
+
+    @property
+    def state(self) -> State:
+        """What the run says of itself, in the words of a server."""
+        run, document = self.run, self.run.document
+        finish = Finish.ABORTED if run.partial() else Finish.DONE
+        name = str(document.get("title") or document.get("command", ""))
+        return State(
+            serial=self._serial,
+            at_utc=str(document.get("finished_utc") or document.get("started_utc") or ""),
+            version=str(document.get("software", "")),
+            system=str(document.get("system") or ""),
+            simulated=run.simulated,
+            seed=int(document.get("seed") or 0),
+            phase=Phase.STOPPED,
+            loop=_loop_state(run),
+            last=Ended(
+                id=0,
+                name=name,
+                finish=finish,
+                folder=str(run.folder),
+                products={key: str(path) for key, path in document["products"].items()},
+                document={key: value for key, value in document.items() if key != "products"},
+            ),
+            products=_products(run),
+            streams=tuple(
+                StreamEntry(name=name, segment="", unit=STREAMS.get(name, "")) for name in self._courses
+            ),
+        )
+
+    def geometry(self) -> Geometry:
+        """Where slopes and actuators stood."""
+        return geometry_of(self.run)
+
+    def log_after(self, number: int) -> Sequence[LogLine]:
+        """The run's own log."""
+        return self._log[max(0, number + 1) :]
+
+    def procedures(self) -> Sequence[ProcedureEntry]:
+        """Nothing can be started."""
+        return ()
+
+    def check(self, procedure: str, arguments: Arguments) -> Plan:
+        """Nothing can be started.
+
+        Raises
+        ------
+        ConfigError
+            Always.
+        """
+        raise ConfigError(REASON)
+
+
+def _step(course: Course, position: float) -> int:
+    return max(1, min(course.length, int(np.ceil(position * course.length))))
+
+
+def _loop_state(run: RunContent) -> LoopState:
+    if not run.loops:
+        return LoopState()
+    label, loop = list(run.loops.items())[-1]
+    peak = None if loop.strehl is None else loop.strehl.peak
+    known = peak is not None and np.isfinite(peak.sigma)
+    return LoopState(
+        closed=False,
+        matrix=label,
+        gain=loop.gain,
+        leak=loop.leak,
+        dropped_modes=loop.dropped_modes,
+        residual_nm=loop.residual_rms_nm,
+        strehl=None if peak is None else peak.value,
+        strehl_sigma=peak.sigma if peak is not None and known else None,
+    )
+
+
+#: Kinds of products in headers, and in a server's state.
+_KINDS = {KIND_MATRIX: "matrix", KIND_GAINS: "gains"}
+
+
+def _products(run: RunContent) -> tuple[Product, ...]:
+    """Every FITS product by name, the run's main matrix last."""
+    main = main_calibration(run)
+    made = [
+        Product(name=name, kind=_kind(run, name), path=str(path))
+        for name, path in run.document["products"].items()
+        if path.suffix == ".fits"
+    ]
+    last = None if main is None else run.names.get(main[0])
+    return tuple(sorted(made, key=lambda one: one.name == last))
+
+
+def _kind(run: RunContent, name: str) -> str:
+    return _KINDS.get(run.kinds.get(name, ""), "psf")
+
+
+def _log_lines(text: str) -> tuple[LogLine, ...]:
+    """Lines of ``run.log``; what follows a line without a head of its own belongs to it."""
+    lines: list[dict[str, Any]] = []
+    for raw in text.splitlines():
+        head = _LINE.fullmatch(raw)
+        if head is not None:
+            at, level, logger, words = head.groups()
+            lines.append({"at_utc": at.replace(",", "."), "level": level, "logger": logger, "text": words})
+        elif lines:
+            lines[-1]["text"] += "\n" + raw
+    return tuple(LogLine(number=number, **line) for number, line in enumerate(lines))

@@ -1,0 +1,80 @@
+"""What the window remembers. A damaged file never keeps it from starting."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import platformdirs
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from escape_hw.config.outline import nearest
+from escape_hw.io.storage import write_atomic
+
+
+class Settings(BaseModel):
+    """Look and layout."""
+
+    model_config = ConfigDict(validate_assignment=True, extra="ignore")
+
+    theme: Literal["dark", "light"] = "dark"
+    font_scale: float = Field(1.0, ge=0.8, le=2.0)
+    workspace: str = "operate"
+    #: Arrangement of the docks by workspace, as Qt wrote it, base64.
+    layouts: dict[str, str] = Field(default_factory=dict)
+    #: Size and place of the window, as Qt wrote it, base64.
+    geometry: str = ""
+
+
+def settings_file() -> Path:
+    """Where the settings lie."""
+    return Path(platformdirs.user_config_dir("escape")) / "gui.json"
+
+
+def load_settings(path: Path) -> tuple[Settings, tuple[str, ...]]:
+    """Read settings; whatever is wrong in the file is left out and told.
+
+    Returns
+    -------
+    settings : Settings
+        What could be read, defaults for the rest.
+    warnings : tuple of str
+        One line for each thing that was left out; empty for a sound or absent file.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return Settings(), ()
+    except (OSError, ValueError) as error:
+        return Settings(), (f"{path}: cannot be read ({error}); the window starts with its defaults",)
+    if not isinstance(content, dict):
+        return Settings(), (f"{path}: not a table of settings; the window starts with its defaults",)
+    return _sound_parts(path, content)
+
+
+def _sound_parts(path: Path, content: dict[str, Any]) -> tuple[Settings, tuple[str, ...]]:
+    settings, warnings = Settings(), []
+    for key, value in content.items():
+        if key not in Settings.model_fields:
+            meant = nearest(key, Settings.model_fields)
+            hint = f"; did you mean '{meant}'?" if meant else ""
+            warnings.append(f"{path}: unknown setting '{key}' is ignored{hint}")
+            continue
+        try:
+            setattr(settings, key, value)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"]
+            warnings.append(f"{path}: setting '{key}' is ignored: {reason}")
+    return settings, tuple(warnings)
+
+
+def save_settings(path: Path, settings: Settings) -> None:
+    """Write settings; the file is whole or the old one.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    write_atomic(path, (settings.model_dump_json(indent=2) + "\n").encode())

@@ -1,0 +1,81 @@
+"""What decides whether an action is possible now, and the words for why it is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from escape_hw.remote.state import Phase, State
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What decides whether an action is possible now.
+
+    Parameters
+    ----------
+    state
+        Newest state.
+    connected
+        The other side was heard of lately.
+    live
+        Requests can be made at all: no replay.
+    may_write
+        The lease is ours.
+    """
+
+    state: State
+    connected: bool
+    live: bool
+    may_write: bool
+
+
+#: Says why an action is impossible now; empty when it is possible.
+Obstacle = Callable[[Situation], str]
+
+
+def always(_: Situation) -> str:
+    """Nothing is in the way."""
+    return ""
+
+
+def to_ask(now: Situation) -> str:
+    """Why no request can be made at all."""
+    if not now.live:
+        return "a finished run is replayed, there is no server to ask"
+    return "" if now.connected else "the server does not answer"
+
+
+def to_write(now: Situation) -> str:
+    """Why nothing can be changed."""
+    if reason := to_ask(now):
+        return reason
+    if now.may_write:
+        return ""
+    holder = now.state.lease
+    return f"{holder.name} on {holder.host} has control" if holder else "take control first (Ctrl+L)"
+
+
+def to_abort(now: Situation) -> str:
+    """Why there is nothing to abort."""
+    return to_ask(now) or ("" if now.state.procedure else "no procedure runs")
+
+
+def to_pause(now: Situation) -> str:
+    """Why the procedure cannot be halted or continued."""
+    return to_write(now) or ("" if now.state.procedure else "no procedure runs")
+
+
+def to_take(now: Situation) -> str:
+    """Why control cannot be taken."""
+    return to_ask(now) or ("you have control" if now.may_write else "")
+
+
+def to_give_back(now: Situation) -> str:
+    """Why control cannot be given back."""
+    return to_ask(now) or ("" if now.may_write else "you do not have control")
+
+
+def to_clear(now: Situation) -> str:
+    """Why there is no fault to clear."""
+    return to_write(now) or ("" if now.state.phase is Phase.FAULT else "there is no fault")

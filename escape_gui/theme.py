@@ -1,0 +1,280 @@
+"""Colours and fonts: one dark and one light palette, and the two sizes of every number on the screen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Literal
+
+from PySide6.QtCore import QObject, Signal
+from PySide6.QtGui import QColor, QFont, QFontDatabase, QPalette
+from PySide6.QtWidgets import QApplication, QStyleFactory
+
+Shade = Literal["dark", "light"]
+#: Font scales that Ctrl +/- steps through.
+SCALES = (0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)
+_POINTS = 9.5
+_SANS = ("Inter", "Noto Sans", "DejaVu Sans", "Liberation Sans")
+_MONO = ("JetBrains Mono", "Noto Sans Mono", "DejaVu Sans Mono", "Liberation Mono")
+
+
+@dataclass(frozen=True, slots=True)
+class Colours:
+    """One palette. Text colours keep a contrast of 4.5 : 1 on every surface they may stand on."""
+
+    #: Surfaces from the back to the front: window, panel, plots and fields, buttons.
+    window: str
+    panel: str
+    field: str
+    button: str
+    line: str
+    text: str
+    muted: str
+    accent: str
+    on_accent: str
+    #: Conditions; each is text and shape on any surface.
+    good: str
+    warn: str
+    bad: str
+    #: Full-width bands with the word on them.
+    simulated: str
+    on_simulated: str
+    hardware: str
+    on_hardware: str
+    #: The safety buttons.
+    stop: str
+    on_stop: str
+    #: Curves, after Okabe and Ito, to be told apart with any colour vision.
+    series: tuple[str, ...]
+
+
+DARK = Colours(
+    window="#131517",
+    panel="#1a1d20",
+    field="#0e1012",
+    button="#2a2f34",
+    line="#353b41",
+    text="#e4e7ea",
+    muted="#9aa4ad",
+    accent="#56b4e9",
+    on_accent="#06141d",
+    good="#3fc79a",
+    warn="#f0b429",
+    bad="#ff7a6b",
+    simulated="#1f3d52",
+    on_simulated="#d6edfb",
+    hardware="#e69f00",
+    on_hardware="#171000",
+    stop="#b3261e",
+    on_stop="#ffffff",
+    series=("#56b4e9", "#e69f00", "#2bbf94", "#e08fbb", "#f0e442", "#ff8f4d"),
+)
+LIGHT = Colours(
+    window="#e9ebed",
+    panel="#f6f7f8",
+    field="#ffffff",
+    button="#dde1e5",
+    line="#b9c0c7",
+    text="#15191d",
+    muted="#4d5760",
+    accent="#005f9e",
+    on_accent="#ffffff",
+    good="#00634a",
+    warn="#7d4e00",
+    bad="#b3261e",
+    simulated="#cfe5f4",
+    on_simulated="#0b3550",
+    hardware="#ffc04d",
+    on_hardware="#241800",
+    stop="#b3261e",
+    on_stop="#ffffff",
+    series=("#0072b2", "#b85c00", "#00795a", "#a84a82", "#7a6f00", "#444c54"),
+)
+PALETTES: dict[Shade, Colours] = {"dark": DARK, "light": LIGHT}
+
+
+def contrast(one: str, other: str) -> float:
+    """Contrast ratio of two colours, from 1 to 21 (Web Content Accessibility Guidelines 2.2, 1.4.3)."""
+    bright, dim = sorted((_luminance(one), _luminance(other)), reverse=True)
+    return (bright + 0.05) / (dim + 0.05)
+
+
+def _luminance(colour: str) -> float:
+    """Relative luminance of an sRGB colour, 0 to 1 (same source)."""
+    channels = (int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+class Theme(QObject):
+    """The look in force. Panels ask it for colours and fonts and repaint on :attr:`changed`.
+
+    Parameters
+    ----------
+    shade
+        Palette to begin with.
+    scale
+        Font scale, one of :data:`SCALES` or anything between.
+    """
+
+    changed = Signal()
+
+    def __init__(self, shade: Shade = "dark", scale: float = 1.0) -> None:
+        super().__init__()
+        self.shade: Shade = shade
+        self.scale = min(max(scale, SCALES[0]), SCALES[-1])
+
+    @property
+    def colours(self) -> Colours:
+        """The palette in force."""
+        return PALETTES[self.shade]
+
+    def colour(self, name: str) -> QColor:
+        """A colour of the palette by its field name."""
+        return QColor(str(getattr(self.colours, name)))
+
+    def series(self, number: int) -> QColor:
+        """Colour of curve ``number``; begins again after the last."""
+        names = self.colours.series
+        return QColor(names[number % len(names)])
+
+    def use_shade(self, shade: Shade) -> None:
+        """Take the other palette."""
+        if shade != self.shade:
+            self.shade = shade
+            self.apply()
+
+    def step_scale(self, steps: int) -> None:
+        """Larger (+1) or smaller (-1) letters; 0 takes the normal size."""
+        nearest = min(range(len(SCALES)), key=lambda k: abs(SCALES[k] - self.scale))
+        chosen = SCALES[min(max(nearest + steps, 0), len(SCALES) - 1)] if steps else 1.0
+        if chosen != self.scale:
+            self.scale = chosen
+            self.apply()
+
+    def font(self, size: float = 1.0, *, mono: bool = False, bold: bool = False) -> QFont:
+        """A font at a multiple of the normal size; numbers that change stand in ``mono``."""
+        font = QFont(_family(_MONO if mono else _SANS, mono))
+        font.setPointSizeF(_POINTS * self.scale * size)
+        font.setBold(bold)
+        return font
+
+    def pixels(self, at_normal_size: float) -> int:
+        """A length that grows with the letters."""
+        return round(at_normal_size * self.scale)
+
+    def apply(self) -> None:
+        """Dress the application and tell everybody."""
+        application = QApplication.instance()
+        if isinstance(application, QApplication):
+            application.setStyle(QStyleFactory.create("Fusion"))
+            application.setPalette(qt_palette(self.colours))
+            application.setFont(self.font())
+            application.setStyleSheet(style_sheet(self))
+        self.changed.emit()
+
+
+def _family(wanted: tuple[str, ...], mono: bool) -> str:
+    installed = set(QFontDatabase.families())
+    general = QFontDatabase.SystemFont.FixedFont if mono else QFontDatabase.SystemFont.GeneralFont
+    return next((name for name in wanted if name in installed), QFontDatabase.systemFont(general).family())
+
+
+def qt_palette(colours: Colours) -> QPalette:
+    """The palette as Qt's Fusion style wants it."""
+    role = QPalette.ColorRole
+    roles = {
+        role.Window: colours.panel,
+        role.WindowText: colours.text,
+        role.Base: colours.field,
+        role.AlternateBase: colours.panel,
+        role.Text: colours.text,
+        role.Button: colours.button,
+        role.ButtonText: colours.text,
+        role.BrightText: colours.bad,
+        role.Highlight: colours.accent,
+        role.HighlightedText: colours.on_accent,
+        role.ToolTipBase: colours.button,
+        role.ToolTipText: colours.text,
+        role.PlaceholderText: colours.muted,
+        role.Link: colours.accent,
+        role.Mid: colours.line,
+        role.Dark: colours.line,
+    }
+    palette = QPalette()
+    for key, value in roles.items():
+        palette.setColor(key, QColor(value))
+    for key in (role.WindowText, role.Text, role.ButtonText):
+        palette.setColor(QPalette.ColorGroup.Disabled, key, QColor(colours.muted))
+    return palette
+
+
+def style_sheet(theme: Theme) -> str:
+    """What the Fusion style leaves open: flat docks, a focus ring, tabs and buttons of one kind."""
+    names = {field.name: getattr(theme.colours, field.name) for field in fields(Colours)}
+    sheet = _SHEET
+    for name in sorted(names, key=len, reverse=True):
+        sheet = sheet.replace(f"@{name};", f"{names[name]};").replace(f"@{name} ", f"{names[name]} ")
+    for unit in (2, 4, 6, 8, 12, 16, 24):
+        sheet = sheet.replace(f"@{unit}px", f"{theme.pixels(unit)}px")
+    return sheet
+
+
+_SHEET = """
+QMainWindow, QDialog { background: @window; }
+QMainWindow::separator { background: @window; width: 6px; height: 6px; }
+QMainWindow::separator:hover { background: @accent; }
+QToolTip { background: @button; color: @text; border: 1px solid @line; padding: 4px; }
+QMenuBar { background: @window; padding: 2px; }
+QMenuBar::item { padding: @4px @8px; background: transparent; border-radius: 4px; }
+QMenuBar::item:selected, QMenu::item:selected { background: @accent; color: @on_accent; }
+QMenu { background: @panel; border: 1px solid @line; padding: 4px; }
+QMenu::item { padding: @4px @24px; border-radius: 4px; }
+QMenu::item:disabled { color: @muted; }
+QMenu::separator { height: 1px; background: @line; margin: 4px 8px; }
+QStatusBar { background: @window; color: @muted; }
+QStatusBar::item { border: none; }
+QPushButton, QToolButton { background: @button; color: @text; border: 1px solid @line;
+    border-radius: 4px; padding: @4px @12px; }
+QToolButton { padding: @4px @8px; }
+QPushButton:hover, QToolButton:hover { border: 1px solid @accent; }
+QPushButton:pressed, QToolButton:pressed, QToolButton:checked, QPushButton:checked
+    { background: @accent; color: @on_accent; border: 1px solid @accent; }
+QPushButton:disabled, QToolButton:disabled { background: @panel; color: @muted; border: 1px solid @line; }
+QPushButton:focus, QToolButton:focus, QLineEdit:focus, QSpinBox:focus, QDoubleSpinBox:focus, QComboBox:focus,
+QTableView:focus, QPlainTextEdit:focus { border: 1px solid @accent; }
+QPushButton#stop { background: @stop; color: @on_stop; border: 1px solid @stop; font-weight: bold; }
+QPushButton#stop:disabled { background: @panel; color: @muted; border: 1px solid @line; }
+QPushButton#stop:focus, QPushButton#stop:hover { border: 1px solid @on_stop; }
+QToolButton#quiet { background: transparent; border: 1px solid transparent; padding: 0 @4px; color: @muted; }
+QToolButton#quiet:hover, QToolButton#quiet:focus { border: 1px solid @accent; color: @text; }
+QToolButton#quiet:checked { background: @button; color: @text; border: 1px solid @accent; }
+QLineEdit, QSpinBox, QDoubleSpinBox, QComboBox { background: @field; color: @text; border: 1px solid @line;
+    border-radius: 4px; padding: @2px @6px; selection-background-color: @accent;
+    selection-color: @on_accent; }
+QSpinBox::up-button, QSpinBox::down-button, QDoubleSpinBox::up-button, QDoubleSpinBox::down-button
+    { width: 0; border: none; }
+QLineEdit:disabled, QSpinBox:disabled, QDoubleSpinBox:disabled, QComboBox:disabled { color: @muted; }
+QComboBox QAbstractItemView { background: @field; color: @text; border: 1px solid @line; }
+QTableView, QPlainTextEdit, QTextBrowser, QListView { background: @field; color: @text;
+    border: 1px solid @line; border-radius: 4px; }
+QHeaderView::section { background: @panel; color: @muted; border: none; padding: @2px @6px; }
+QTabBar { qproperty-drawBase: 0; }
+QTabBar::tab { background: @window; color: @muted; padding: @4px @12px; border: none;
+    border-bottom: 2px solid transparent; }
+QTabBar::tab:selected { color: @text; background: @panel; border-bottom: 2px solid @accent; }
+QTabBar::tab:hover { color: @text; }
+QTabBar::tab:focus { border: 1px solid @accent; }
+QProgressBar { background: @field; color: @text; border: 1px solid @line; border-radius: 4px;
+    text-align: center; }
+QProgressBar::chunk { background: @simulated; }
+QScrollBar { background: transparent; border: none; }
+QScrollBar:vertical { width: @12px; }
+QScrollBar:horizontal { height: @12px; }
+QScrollBar::handle { background: @line; border-radius: 4px; min-height: 24px; min-width: 24px; margin: 2px; }
+QScrollBar::add-line, QScrollBar::sub-line { width: 0; height: 0; }
+QScrollBar::add-page, QScrollBar::sub-page { background: transparent; }
+#panel { background: @panel; }
+#title { background: @panel; border-bottom: 1px solid @line; }
+#caption { color: @muted; }
+#empty { color: @muted; }
+"""

@@ -1,0 +1,1 @@
+"""What panels show, as arrays and words: no Qt in here."""

@@ -1,0 +1,148 @@
+"""One mode as several matrices see it, with their difference, errors and signal-to-noise ratio."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_gui.views.mode_mosaic import LIMIT
+from escape_hw.api.matrix import InteractionMatrix, snr_of
+
+#: Ends that the scales of signal-to-noise ratios and of differences may take.
+_SNR_LIMITS = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+_LIMITS = (0.1, 0.25, 0.5, 1.0, LIMIT)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tile:
+    """A pair of maps, x and y beside each other.
+
+    Parameters
+    ----------
+    title
+        What it shows.
+    note
+        Numbers that go with it.
+    maps
+        ``(rows, 2 * columns + 1)``, NaN outside the pupil.
+    limits
+        Ends of the colour scale; symmetric for signed maps.
+    signed
+        Whether the sign matters.
+    """
+
+    title: str
+    note: str
+    maps: NDArray[np.float64]
+    limits: tuple[float, float]
+    signed: bool
+
+
+def pair(valid: NDArray[np.bool_], slopes: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Maps of x and y with a column between them ``(rows, 2 * columns + 1)``, NaN outside the pupil."""
+    rows, columns = valid.shape
+    both = np.full((rows, 2 * columns + 1), np.nan)
+    n = int(valid.sum())
+    both[:, :columns][valid] = slopes[:n]
+    both[:, columns + 1 :][valid] = slopes[n:]
+    return both
+
+
+def tiles(
+    matrices: Mapping[str, InteractionMatrix], mode: int, beside: tuple[str, str] | None = None
+) -> list[Tile]:
+    """Everything to be seen of one mode.
+
+    Parameters
+    ----------
+    matrices
+        By label, in the order to show them; those that lack the mode are left out.
+    mode
+        Counted from 0.
+    beside
+        Labels of the two whose difference is shown; by default the last and the first.
+
+    Returns
+    -------
+    list of Tile
+        One for each matrix, each divided by its own rms slope; the difference of two of them; standard
+        error and signal-to-noise ratio of the last one that states errors.
+    """
+    having = {label: one for label, one in matrices.items() if mode < one.n_modes}
+    found = [_signed(label, one, mode) for label, one in having.items()]
+    if beside is None and len(having) > 1:
+        labels = list(having)
+        beside = (labels[-1], labels[0])
+    if beside is not None and set(beside) <= set(having):
+        found += _difference(beside, having[beside[0]], having[beside[1]], mode)
+    stated = [(label, one) for label, one in having.items() if np.any(one.sigma[:, mode] > 0)]
+    if stated:
+        found += _errors(*stated[-1], mode)
+    return found
+
+
+def _signed(label: str, matrix: InteractionMatrix, mode: int) -> Tile:
+    column = matrix.data[:, mode].astype(float)
+    rms = _rms(column)
+    snr = float(snr_of(matrix.data[:, [mode]], matrix.sigma[:, [mode]])[0])
+    stated = f", SNR {snr:.3g}" if np.isfinite(snr) else ""
+    unit = "" if matrix.slope_unit == "1" else f" {matrix.slope_unit}"
+    note = f"rms {rms:.3g}{unit}{stated}"
+    return Tile(label, note, pair(matrix.valid, column / (rms or 1.0)), (-LIMIT, LIMIT), True)
+
+
+def _difference(
+    labels: Sequence[str], first: InteractionMatrix, second: InteractionMatrix, mode: int
+) -> list[Tile]:
+    """First less second, each divided by its rms over the sub-apertures that both have."""
+    if first.valid.shape != second.valid.shape:
+        return []
+    a, b = (pair(one.valid, one.data[:, mode]) for one in (first, second))
+    both = np.isfinite(a) & np.isfinite(b)
+    if not both.any():
+        return []
+    rms_a, rms_b = (_rms(one[both]) or 1.0 for one in (a, b))
+    difference = np.where(both, a / rms_a - b / rms_b, np.nan)
+    correlation = float(np.mean(a[both] * b[both])) / (rms_a * rms_b)
+    note = f"correlation {correlation:.4f}, gain {rms_a / rms_b:.3f}"
+    limit = _enough(3 * _rms(difference[both]), _LIMITS)
+    return [Tile(f"{labels[0]} − {labels[1]}", note, difference, (-limit, limit), True)]
+
+
+def _errors(label: str, matrix: InteractionMatrix, mode: int) -> list[Tile]:
+    """Standard errors, and the ratio of slope to error."""
+    column, sigma = matrix.data[:, mode].astype(float), matrix.sigma[:, mode].astype(float)
+    rms = _rms(column) or 1.0
+    relative = sigma / rms
+    top = float(np.nanmax(relative[np.isfinite(relative)], initial=0.0)) or 1.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.abs(column) / sigma
+    middle = float(np.nanmedian(ratio))
+    return [
+        Tile(
+            f"Error of {label}",
+            f"1 σ, rms {_rms(sigma) / rms:.2g}",
+            pair(matrix.valid, relative),
+            (0.0, top),
+            False,
+        ),
+        Tile(
+            f"SNR of {label}",
+            f"median {middle:.2g}",
+            pair(matrix.valid, ratio),
+            (0.0, _enough(2 * middle, _SNR_LIMITS)),
+            False,
+        ),
+    ]
+
+
+def _enough(wanted: float, limits: tuple[float, ...]) -> float:
+    """The least of the limits that is not below what is wanted, or the last."""
+    return next((one for one in limits if one >= wanted), limits[-1])
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,194 @@
+"""Many slope maps as one picture: x and y of each mode side by side, modes row by row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.matrix import snr_of
+
+#: Ends of the colour scale, in units of the mode's rms slope (as in the report's figure).
+LIMIT = 2.5
+#: Index of what lies outside the pupil; values take the indices 1 to 255, zero is :data:`ZERO`.
+OUTSIDE, ZERO = 0, 128
+#: Pixels between the two maps of a mode and between modes.
+_GAP, _MARGIN = 1, 3
+
+
+@dataclass(frozen=True, slots=True)
+class MosaicLayout:
+    """Where the maps of a page stand in its picture.
+
+    Parameters
+    ----------
+    shape
+        Rows and columns of one map, in sub-apertures.
+    columns
+        Modes beside each other.
+    rows
+        Modes below each other.
+    head
+        Room above each map for its number, in sub-apertures.
+    """
+
+    shape: tuple[int, int]
+    columns: int
+    rows: int
+    head: int = 0
+
+    @property
+    def per_page(self) -> int:
+        """Modes on a page."""
+        return self.columns * self.rows
+
+    @property
+    def cell(self) -> tuple[int, int]:
+        """Height and width of a mode's place with its margin, in sub-apertures."""
+        return self.shape[0] + _MARGIN + self.head, 2 * self.shape[1] + _GAP + _MARGIN
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the picture, in sub-apertures."""
+        height, width = self.cell
+        return self.rows * height + _MARGIN, self.columns * width + _MARGIN
+
+    def corner(self, place: int) -> tuple[int, int]:
+        """Row and column of the first pixel of the map at a place of the page."""
+        height, width = self.cell
+        return _MARGIN + self.head + place // self.columns * height, _MARGIN + place % self.columns * width
+
+    def at(self, row: float, column: float) -> tuple[int, str, int, int] | None:
+        """What lies at a point of the picture: place on the page, ``x`` or ``y``, row and column there."""
+        height, width = self.cell
+        down, into_row = divmod(int(np.floor(row)) - _MARGIN - self.head, height)
+        right, into_column = divmod(int(np.floor(column)) - _MARGIN, width)
+        n_rows, n_columns = self.shape
+        part, inside = divmod(into_column, n_columns + _GAP)
+        on_map = into_row < n_rows and inside < n_columns and part < 2
+        if not (on_map and 0 <= down < self.rows and 0 <= right < self.columns):
+            return None
+        return down * self.columns + right, "xy"[part], into_row, inside
+
+
+def fit(
+    shape: tuple[int, int], n_modes: int, size: tuple[float, float], least: float, head: float
+) -> MosaicLayout:
+    """The layout that shows most modes in a window without making any smaller than wanted.
+
+    Parameters
+    ----------
+    shape
+        Rows and columns of one map.
+    n_modes
+        How many modes there are.
+    size
+        Width and height of the window, in screen pixels.
+    least
+        Least width of a mode's pair of maps, in screen pixels.
+    head
+        Height of the number above a map, in screen pixels.
+    """
+    width, height = size
+    best = MosaicLayout(shape, 1, 1)
+    for columns in range(1, max(1, min(n_modes, int(width // least))) + 1):
+        pixels = width / (columns * best.cell[1] + _MARGIN)
+        one = MosaicLayout(shape, columns, 1, int(np.ceil(head / max(pixels, 1e-6))))
+        rows = max(1, min(int((height / max(pixels, 1e-6) - _MARGIN) // one.cell[0]), -(-n_modes // columns)))
+        if rows * columns > best.per_page or columns == 1:
+            best = MosaicLayout(shape, columns, rows, one.head)
+        if rows * columns >= n_modes:
+            break
+    return best
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModeStatistics:
+    """What is said of every mode.
+
+    Parameters
+    ----------
+    rms
+        Rms slope per unit mode ``(n_modes,)``.
+    snr
+        Signal-to-noise ratio ``(n_modes,)``; infinite where no error is stated.
+    """
+
+    rms: NDArray[np.float64]
+    snr: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, data: NDArray[np.floating], sigma: NDArray[np.floating] | None) -> ModeStatistics:
+        """Of a matrix ``(n_slopes, n_modes)`` and its standard errors, if they are known."""
+        rms = np.sqrt(np.mean(np.square(data, dtype=float), axis=0))
+        if sigma is None or sigma.shape != data.shape:
+            return cls(rms, np.full(rms.shape, np.inf))
+        return cls(rms, np.asarray(snr_of(data, np.nan_to_num(sigma, nan=0.0, posinf=0.0))))
+
+    def trust(self) -> NDArray[np.float64]:
+        """Share of each mode's power that is signal, 0 to 1: the Wiener weight SNR² / (1 + SNR²)."""
+        with np.errstate(invalid="ignore"):
+            power = np.square(self.snr)
+            return np.asarray(np.where(np.isinf(power), 1.0, power / (1.0 + power)))
+
+
+def normalised(data: NDArray[np.floating], statistics: ModeStatistics, fade: bool) -> NDArray[np.float32]:
+    """Every mode divided by its rms slope, so that all share one symmetric scale (paper: IM figures).
+
+    Parameters
+    ----------
+    data
+        ``(n_slopes, n_modes)``.
+    fade
+        Draw a mode as pale as it is uncertain: noise alone would look like a strong mode otherwise.
+    """
+    scale = np.divide(1.0, statistics.rms, out=np.zeros_like(statistics.rms), where=statistics.rms > 0)
+    if fade:
+        scale = scale * statistics.trust()
+    return np.asarray(data * scale, dtype=np.float32)
+
+
+def indices(values: NDArray[np.floating], limit: float = LIMIT) -> NDArray[np.uint8]:
+    """Colour indices of signed values: 1 to 255, zero at 128; what is not finite lies outside."""
+    scaled = np.clip(np.nan_to_num(values, nan=0.0, posinf=limit, neginf=-limit) * (127 / limit), -127, 127)
+    painted = (np.rint(scaled) + ZERO).astype(np.uint8)
+    return np.where(np.isnan(values), np.uint8(OUTSIDE), painted)
+
+
+def page_modes(layout: MosaicLayout, n_modes: int, page: int) -> range:
+    """Modes on a page; an earlier page when there are not so many."""
+    page = max(0, min(page, pages(layout, n_modes) - 1))
+    return range(page * layout.per_page, min(n_modes, (page + 1) * layout.per_page))
+
+
+def pages(layout: MosaicLayout, n_modes: int) -> int:
+    """How many pages the modes fill."""
+    return max(1, -(-n_modes // layout.per_page))
+
+
+def paint(
+    layout: MosaicLayout, valid: NDArray[np.bool_], values: NDArray[np.float32], modes: range
+) -> NDArray[np.uint8]:
+    """The picture of a page, colour indices as of :func:`indices`.
+
+    Parameters
+    ----------
+    valid
+        Valid sub-apertures ``(rows, columns)``.
+    values
+        ``(n_slopes, n_modes)``, see :func:`normalised`.
+    modes
+        Modes of the page.
+    """
+    picture = np.full(layout.size, OUTSIDE, np.uint8)
+    n, (rows, columns) = int(valid.sum()), layout.shape
+    painted = indices(values[:, modes.start : modes.stop])
+    for place in range(len(modes)):
+        top, left = layout.corner(place)
+        for part in (0, 1):
+            start = left + part * (columns + _GAP)
+            picture[top : top + rows, start : start + columns][valid] = painted[
+                part * n : (part + 1) * n, place
+            ]
+    return picture

@@ -1,0 +1,193 @@
+"""Arguments as text in a form, plans and progress as words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from escape_gui.views.convergence import short_unit
+from escape_hw.api.registration import PARAMETERS
+from escape_hw.api.results import Measured
+from escape_hw.remote.state import Arguments, Ended, Finish, Parameter, Plan, Product, Running
+from escape_hw.report.tables import TITLES, with_error
+
+#: What an argument without a value is called in a list of choices.
+NONE = "–"
+#: Words for parameters whose names do not read like words.
+_WORDS = {
+    "snr": "SNR goal", "im": "Matrix", "closed_loop": "In closed loop on", "frames": "Frames", "poke": "Poke",
+    "accuracy": "Accuracy goal", "strehl": "Measure Strehl", "best": "Search best gain",
+    "resume": "Resume run", "plain": "Paper's estimator",
+    "budget": "Strehl budget", "exchange": "Exchange matrix",
+}  # fmt: skip
+
+
+def label(parameter: Parameter) -> str:
+    """How a parameter is called in the form."""
+    return _WORDS.get(parameter.name, parameter.name.replace("_", " ").capitalize())
+
+
+def hint(parameter: Parameter) -> str:
+    """Its help with the allowed range."""
+    low, high, unit = parameter.low, parameter.high, f" {parameter.unit}" if parameter.unit else ""
+    words = [parameter.help]
+    if low is not None and high is not None:
+        words.append(f"{low:g} to {high:g}{unit}.")
+    elif low is not None:
+        words.append(f"At least {low:g}{unit}.")
+    elif high is not None:
+        words.append(f"At most {high:g}{unit}.")
+    elif unit:
+        words.append(f"In{unit}.")
+    if parameter.default is None:
+        words.append("May be left empty.")
+    return " ".join(word for word in words if word)
+
+
+def text_of(value: object) -> str:
+    """A value as it stands in the form."""
+    if value is None:
+        return ""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def value_of(parameter: Parameter, text: str) -> float | int | str | None:
+    """What a field's text means.
+
+    Raises
+    ------
+    ValueError
+        It is no number, not whole or out of range; says what would do.
+    """
+    text = text.strip().replace("−", "-")
+    if not text or text == NONE:
+        if parameter.default is None:
+            return None
+        raise ValueError(f"{label(parameter)}: empty; {text_of(parameter.default)} is usual")
+    if parameter.kind not in ("int", "float"):
+        return text
+    try:
+        number = float(text)
+    except ValueError:
+        raise ValueError(f"{label(parameter)}: '{text}' is no number") from None
+    low = -math.inf if parameter.low is None else parameter.low
+    high = math.inf if parameter.high is None else parameter.high
+    if not (math.isfinite(number) and low <= number <= high):
+        raise ValueError(f"{label(parameter)}: {text} is out of range. {hint(parameter)}")
+    if parameter.kind == "float":
+        return number
+    if number != int(number):
+        raise ValueError(f"{label(parameter)}: {text} is not a whole number")
+    return int(number)
+
+
+def matrices(products: tuple[Product, ...]) -> tuple[str, ...]:
+    """Names of the matrices to choose from, the newest first."""
+    return tuple(one.name for one in reversed(products) if one.kind == "matrix")
+
+
+def duration(seconds: float) -> str:
+    """A length of time for people: ``8.0 s``, ``4:12``, ``1:02:03``."""
+    if not math.isfinite(seconds):
+        return "–"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d} min"
+
+
+def plan_lines(plan: Plan) -> list[str]:
+    """A plan in two lines: what it takes, and how far the mirror moves."""
+    stroke = (
+        "the mirror stays flat" if not plan.stroke else f"pokes reach {100 * plan.stroke:.3g} % of the stroke"
+    )
+    return [f"{plan.frames} frames, {duration(plan.seconds)} at the camera's rate", stroke]
+
+
+def progress_line(running: Running) -> str:
+    """How far a procedure is."""
+    many = "s" if (running.total or running.done) != 1 else ""
+    # What goes on until it is stopped has no total.
+    whole = f" of {running.total}" if running.total else ""
+    line = f"{running.stage or running.name}: {running.done}{whole} {running.unit}{many}"
+    if running.paused:
+        return f"{line}, paused"
+    if running.remaining_s is not None and math.isfinite(running.remaining_s):
+        line += f", {duration(running.remaining_s)} left"
+    return line
+
+
+def metrics_line(metrics: Mapping[str, float]) -> str:
+    """Numbers worth watching."""
+    known = {name: value for name, value in metrics.items() if math.isfinite(value)}
+    return " · ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in known.items())
+
+
+def worst_mode(snr: np.ndarray[Any, np.dtype[np.float64]]) -> str:
+    """The mode that is known worst."""
+    known = np.where(np.isfinite(snr), snr, np.inf)
+    if not known.size or not np.isfinite(known.min()):
+        return ""
+    return f"worst mode {int(np.argmin(known)) + 1}: SNR {known.min():.3g}"
+
+
+def ended_line(ended: Ended) -> str:
+    """How a procedure ended, in one line."""
+    word = {
+        Finish.DONE: "Done",
+        Finish.ABORTED: "Aborted, what was measured is kept",
+        Finish.FAILED: "Failed",
+    }
+    return f"{word[ended.finish]}: {ended.name}" + (f". {ended.message}" if ended.message else "")
+
+
+def comparison_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None) -> list[str]:
+    """What came out, beside what came out the last time.
+
+    Parameters
+    ----------
+    now, before
+        Documents of two runs (``result.json``); ``None``: there was none before.
+    """
+    lines = _registration_lines(now, before)
+    for key, words, unit in (("gain", "Gain of the matrix", ""), ("residual_rms_nm", "Residual", " nm rms")):
+        value = now.get(key)
+        if isinstance(value, int | float):
+            lines.append(f"{words}: {value:.4g}{unit}{_change(value, (before or {}).get(key), unit)}")
+    snr, old = now.get("snr") or {}, (before or {}).get("snr") or {}
+    if isinstance(snr.get("min"), int | float):
+        lines.append(f"SNR of the worst mode: {snr['min']:.3g}{_change(snr['min'], old.get('min'), '')}")
+    strehl = now.get("strehl")
+    if isinstance(strehl, dict) and strehl.get("peak"):
+        lines.append(f"Strehl ratio: {100 * strehl['peak']['value']:.1f} %")
+    return lines
+
+
+def _registration_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None) -> list[str]:
+    found, old = now.get("registration") or {}, (before or {}).get("registration") or {}
+    lines = []
+    for name in PARAMETERS:
+        one = found.get(name)
+        if not one or one.get("value") is None:
+            continue
+        title, unit = TITLES[name]
+        line = f"{title}: {with_error(Measured(one['value'], one.get('sigma') or 0.0))} {short_unit(unit)}"
+        last = old.get(name)
+        if last and last.get("value") is not None:
+            error = math.hypot(one.get("sigma") or 0.0, last.get("sigma") or 0.0)
+            line += f" (Δ {with_error(Measured(one['value'] - last['value'], error))})"
+        lines.append(line)
+    return lines
+
+
+def _change(value: float, before: object, unit: str) -> str:
+    return f" (before: {before:.4g}{unit})" if isinstance(before, int | float) else ""
+
+
+def asked(parameters: tuple[Parameter, ...], values: Arguments) -> Arguments:
+    """What to send: arguments that differ from the defaults."""
+    return {one.name: values[one.name] for one in parameters if values[one.name] != one.default}

@@ -1,0 +1,121 @@
+"""Pairs of maps under their titles, as many as there are, in a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from PySide6.QtCore import QRect, QSize, Qt
+from PySide6.QtGui import QImage, QPainter, QPaintEvent
+from PySide6.QtWidgets import QGridLayout, QLabel, QSizePolicy, QVBoxLayout, QWidget
+
+from escape_gui.theme import Theme
+from escape_gui.views.mode_detail import Tile
+from escape_gui.views.mode_mosaic import indices
+from escape_gui.widgets.colour_scale import SIGNED, SIZE, table
+
+
+class MapPicture(QWidget):
+    """One picture, as large as there is room, its pixels square and sharp."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pixels: NDArray[np.uint8] = np.zeros((0, 0, 4), np.uint8)
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Expanding)
+        self.setMinimumHeight(32)
+
+    def show_tile(self, tile: Tile) -> None:
+        """Show a tile's maps."""
+        low, high = tile.limits
+        centred = tile.maps - (low + high) / 2
+        colours = table(SIGNED if tile.signed else SIZE)
+        self._pixels = np.ascontiguousarray(colours[indices(centred, (high - low) / 2)])
+        self.update()
+
+    def sizeHint(self) -> QSize:
+        """As large as its pixels, at least."""
+        rows, columns = self._pixels.shape[:2]
+        return QSize(columns, rows)
+
+    def paintEvent(self, event: QPaintEvent) -> None:
+        """Draw it in the middle."""
+        rows, columns = self._pixels.shape[:2]
+        if not rows:
+            return
+        image = QImage(self._pixels.data, columns, rows, 4 * columns, QImage.Format.Format_RGBA8888)
+        size = QSize(columns, rows).scaled(self.size(), Qt.AspectRatioMode.KeepAspectRatio)
+        corner = QRect(0, 0, size.width(), size.height())
+        corner.moveCenter(self.rect().center())
+        QPainter(self).drawImage(corner, image)
+
+
+class MapTiles(QWidget):
+    """One mode as several matrices see it.
+
+    Parameters
+    ----------
+    theme
+        Colours and fonts.
+    columns
+        Tiles beside each other.
+    """
+
+    def __init__(self, theme: Theme, columns: int = 2) -> None:
+        super().__init__()
+        self._theme, self._columns = theme, columns
+        self._tiles: tuple[Tile, ...] = ()
+        self._made: list[tuple[QWidget, QLabel, MapPicture]] = []
+        self._grid = QGridLayout(self)
+        self._grid.setContentsMargins(4, 4, 4, 4)
+        self._grid.setSpacing(8)
+        theme.changed.connect(self.restyle)
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """What is shown."""
+        return tuple(one.title for one in self._tiles)
+
+    def use_columns(self, columns: int) -> None:
+        """So many beside each other."""
+        if columns != self._columns:
+            self._columns = columns
+            for number, (holder, _, _) in enumerate(self._made):
+                self._grid.addWidget(holder, *divmod(number, columns))
+
+    def show_tiles(self, tiles: Sequence[Tile]) -> None:
+        """Show these instead of what was shown before."""
+        self._tiles = tuple(tiles)
+        while len(self._made) < len(self._tiles):
+            self._make()
+        for number, (holder, title, picture) in enumerate(self._made):
+            holder.setVisible(number < len(self._tiles))
+            if number < len(self._tiles):
+                title.setText(self._title(self._tiles[number]))
+                picture.show_tile(self._tiles[number])
+
+    def _make(self) -> None:
+        holder, title, picture = QWidget(), QLabel(), MapPicture()
+        title.setWordWrap(True)
+        title.setFont(self._theme.font(0.9))
+        # Words wrap rather than make a column wider than the others.
+        title.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Minimum)
+        column = QVBoxLayout(holder)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.setSpacing(2)
+        column.addWidget(title)
+        column.addWidget(picture, 1)
+        self._grid.addWidget(holder, *divmod(len(self._made), self._columns))
+        self._made.append((holder, title, picture))
+
+    def _title(self, tile: Tile) -> str:
+        low, high = tile.limits
+        scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:.3g}"
+        muted = self._theme.colours.muted
+        return f"<b>{tile.title}</b><br><span style='color:{muted}'>{tile.note}<br>colours {scale}</span>"
+
+    def restyle(self) -> None:
+        """Follow the palette."""
+        for _, title, _ in self._made:
+            title.setFont(self._theme.font(0.9))
+        self.show_tiles(self._tiles)

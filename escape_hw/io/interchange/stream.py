@@ -1,0 +1,96 @@
+"""What the streams of other software have in common: the newest array wins, and writes are counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from numpy.typing import DTypeLike, NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Publication:
+    """One array as it stood in a stream.
+
+    Parameters
+    ----------
+    data
+        A copy; of whichever shape and type the stream has.
+    count
+        Number of the write, which rises by one with each.
+    written_ns
+        When it was written, Unix time in nanoseconds; 0 where the stream does not tell.
+    """
+
+    data: NDArray[Any]
+    count: int
+    written_ns: int
+
+
+class Stream(Protocol):
+    """An open stream of arrays of one shape and type."""
+
+    @property
+    def name(self) -> str:
+        """Name."""
+        ...
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of its arrays, rows first."""
+        ...
+
+    @property
+    def dtype(self) -> DTypeLike:
+        """Type of its elements."""
+        ...
+
+    @property
+    def count(self) -> int:
+        """Number of the newest write."""
+        ...
+
+    def latest(self) -> Publication:
+        """The newest array.
+
+        Raises
+        ------
+        StreamLost
+            Its writer died halfway through it.
+        """
+        ...
+
+    def after(self, count: int, timeout_s: float) -> Publication | None:
+        """The newest array once it is newer than a write; ``None`` when none is in time.
+
+        Parameters
+        ----------
+        count
+            Number of that write.
+        timeout_s
+            Longest wait in seconds; 0: do not wait.
+
+        Raises
+        ------
+        StreamLost
+            Its writer died halfway through it.
+        """
+        ...
+
+    def write(self, data: NDArray[Any]) -> None:
+        """Publish an array of the stream's shape; elements are converted to its type.
+
+        Raises
+        ------
+        ValueError
+            The array has another shape.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of it; the stream itself stays."""
+        ...
+
+
+class StreamLost(Exception):
+    """A stream's newest array cannot be read whole."""

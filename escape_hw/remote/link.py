@@ -1,0 +1,191 @@
+"""The client's end of the wire: one thread owns the sockets, callers wait with a deadline."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as Late
+from typing import Any
+
+import zmq
+
+from escape_hw.errors import ServerGone
+from escape_hw.remote.address import Endpoint
+from escape_hw.remote.faults import from_wire
+
+log = logging.getLogger(__name__)
+
+_POLL_MS = 500
+#: Largest answer that is taken, bytes.
+_LARGEST = 256 << 20
+
+#: The answer, and the bytes beside it.
+Answer = tuple[Any, bytes]
+Keys = tuple[bytes, bytes, bytes]
+
+
+class Link:
+    """A connection to a server.
+
+    Parameters
+    ----------
+    endpoint
+        Where it listens.
+    on_event
+        Gets topic and document of every event, in the link's thread.
+    beat
+        Gives a message to be sent every ``beat_s`` seconds, or ``None``.
+    keys
+        The server's public key, this client's public and secret key; ``None`` on the same machine.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        on_event: Callable[[str, dict[str, Any]], object],
+        beat: Callable[[], Mapping[str, Any] | None],
+        beat_s: float = 0.5,
+        keys: Keys | None = None,
+    ) -> None:
+        self._on_event, self._beat, self._beat_s = on_event, beat, beat_s
+        self._context = zmq.Context()
+        self._requests = self._socket(zmq.DEALER, endpoint.requests, keys)
+        self._events = self._socket(zmq.SUB, endpoint.events, keys)
+        self._events.setsockopt(zmq.SUBSCRIBE, b"")
+        self._bell, self._button = self._context.socket(zmq.PAIR), self._context.socket(zmq.PAIR)
+        self._bell.bind("inproc://bell")
+        self._button.connect("inproc://bell")
+        self._lock = threading.Lock()
+        self._outbox: deque[tuple[bytes, bytes]] = deque()
+        self._waiting: dict[bytes, Future[Answer]] = {}
+        self._numbers = itertools.count(1)
+        self._ending = False
+        #: When the server was last heard of, monotonic seconds.
+        self.heard = 0.0
+        self._thread = threading.Thread(target=self._run, name="escape-link", daemon=True)
+        self._thread.start()
+
+    def _socket(self, kind: int, address: str, keys: Keys | None) -> zmq.Socket[bytes]:
+        socket = self._context.socket(kind)
+        socket.setsockopt(zmq.LINGER, 200)
+        socket.setsockopt(zmq.MAXMSGSIZE, _LARGEST)
+        socket.setsockopt(zmq.RECONNECT_IVL, 100)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+        if kind == zmq.DEALER:
+            # The server tells connections apart by this; nobody else learns it. It outlives a reconnect.
+            socket.setsockopt(zmq.ROUTING_ID, b"c" + os.urandom(16))
+        if keys is not None:
+            socket.curve_serverkey, socket.curve_publickey, socket.curve_secretkey = keys
+        socket.connect(address)
+        return socket
+
+    def ask(self, message: Mapping[str, Any], timeout_s: float) -> Answer:
+        """Send a request and wait for its answer.
+
+        Raises
+        ------
+        ServerGone
+            No answer in time.
+        EscapeError
+            What the server raised.
+        """
+        answer: Future[Answer] = Future()
+        number = str(next(self._numbers)).encode()
+        with self._lock:
+            if self._ending:
+                raise ServerGone("this connection is closed")
+            self._waiting[number] = answer
+            self._outbox.append((number, json.dumps(message).encode()))
+            self._button.send(b"")
+        try:
+            return answer.result(timeout_s)
+        except Late:
+            raise ServerGone(
+                f"no answer to '{message.get('verb')}' within {timeout_s:g} s; is the server still there?"
+            ) from None
+        finally:
+            with self._lock:
+                self._waiting.pop(number, None)
+
+    def close(self) -> None:
+        """Hang up; whoever waits for an answer gets none."""
+        with self._lock:
+            if self._ending:
+                return
+            self._ending = True
+            self._button.send(b"")
+        self._thread.join(timeout=5)
+        for socket in (self._requests, self._events, self._bell, self._button):
+            socket.close()
+        self._context.term()
+
+    def _run(self) -> None:
+        poller = zmq.Poller()
+        for socket in (self._requests, self._events, self._bell):
+            poller.register(socket, zmq.POLLIN)
+        beaten = 0.0
+        while not self._ending:
+            ready = dict(poller.poll(min(_POLL_MS, int(1000 * self._beat_s))))
+            if self._bell in ready:
+                self._bell.recv()
+            self._send_all()
+            # An event that was sent before an answer is known before it.
+            if self._events in ready:
+                self._take_events()
+            if self._requests in ready:
+                self._take_answer()
+            if time.monotonic() - beaten > self._beat_s and (message := self._beat()) is not None:
+                beaten = time.monotonic()
+                self._put(b"0", json.dumps(message).encode())
+
+    def _send_all(self) -> None:
+        while True:
+            with self._lock:
+                if not self._outbox:
+                    return
+                number, text = self._outbox.popleft()
+            self._put(number, text)
+
+    def _put(self, number: bytes, text: bytes) -> None:
+        try:
+            self._requests.send_multipart([number, text], zmq.NOBLOCK)
+        except zmq.Again:
+            log.debug("the server takes nothing; request %s is dropped", number)
+
+    def _take_answer(self) -> None:
+        parts = self._requests.recv_multipart()
+        self.heard = time.monotonic()
+        with self._lock:
+            answer = self._waiting.pop(parts[0], None)
+        if answer is None:
+            return
+        try:
+            reply = json.loads(parts[1])
+            if reply["ok"]:
+                answer.set_result((reply["answer"], parts[2] if len(parts) > 2 else b""))
+            else:
+                answer.set_exception(from_wire(reply["error"]))
+        except (IndexError, KeyError, ValueError) as error:
+            answer.set_exception(ServerGone(f"the server's answer makes no sense: {error!r}"))
+
+    def _take_events(self) -> None:
+        while True:
+            try:
+                self._take_event(self._events.recv_multipart(zmq.NOBLOCK))
+            except zmq.Again:
+                return
+
+    def _take_event(self, parts: list[bytes]) -> None:
+        self.heard = time.monotonic()
+        try:
+            self._on_event(parts[0].decode(), json.loads(parts[1]))
+        except Exception as error:
+            # One event that makes no sense must not end the connection.
+            log.warning("an event was not understood: %s: %s", type(error).__name__, error)

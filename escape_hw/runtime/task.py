@@ -1,0 +1,121 @@
+"""What an operator asks for, from the request to the kept result; command line and server share it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from escape_hw.errors import IncompatibleProduct
+
+if TYPE_CHECKING:
+    from escape_hw.api.procedure import Procedure
+    from escape_hw.bench import Bench
+    from escape_hw.config.models import SystemConfig
+    from escape_hw.io.fits import MatrixProduct
+    from escape_hw.io.run_folder import RunFolder
+    from escape_hw.runtime.records import BenchRecord
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A result that was saved.
+
+    Parameters
+    ----------
+    document
+        The run's ``result.json``, products as whole paths.
+    met
+        Whether the run met its own criteria.
+    """
+
+    document: dict[str, Any] = field(default_factory=dict)
+    met: bool = True
+
+
+class Task(Protocol[T]):
+    """One thing to do on an open bench. The methods are called in the order in which they stand here."""
+
+    @property
+    def kind(self) -> str:
+        """What the run's folder is called after."""
+        ...
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """How it changes the configuration, ``section.key=value`` each."""
+        ...
+
+    def load(self, config: SystemConfig) -> None:
+        """Read what it needs; nothing is opened yet.
+
+        Raises
+        ------
+        ConfigError
+            Its parts do not go together.
+        ProductError, IncompatibleProduct
+            A file that it needs is damaged, or belongs elsewhere.
+        """
+
+    def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[T]:
+        """The procedure that does it.
+
+        Raises
+        ------
+        IncompatibleProduct
+            A simulated matrix on hardware.
+        """
+
+    def keep(self, folder: RunFolder, record: BenchRecord, result: T, wall_seconds: float) -> Kept:
+        """Save, judge and report the result, a partial one as well.
+
+        Raises
+        ------
+        StorageError
+            It cannot be written.
+        """
+
+    def done(self) -> None:
+        """It came to its end, and nobody needs what was kept to go on with."""
+
+
+def fitting_matrix(im: Path, config: SystemConfig, force: bool = False) -> MatrixProduct:
+    """Read a matrix that belongs to this system, basis, mirror and mode.
+
+    Raises
+    ------
+    ProductError, IncompatibleProduct
+        It is damaged or belongs elsewhere.
+    """
+    from escape_hw.io.fits import load_matrix
+
+    return load_matrix(
+        im,
+        expect_system=config.system.name,
+        expect_sensor=config.sensor.kind,
+        expect_basis=config.basis.kind,
+        expect_modes=config.basis.n_modes,
+        expect_actuators=config.devices.dm.n_act,
+        allow_simulated=force or config.system.mode == "sim",
+    )
+
+
+def refuse_simulated(product: MatrixProduct, bench: Bench, force: bool) -> None:
+    """Single devices may have a mode of their own: what was really opened decides.
+
+    Raises
+    ------
+    IncompatibleProduct
+        The matrix was made in simulation, and the bench is hardware.
+    """
+    if product.matrix.simulated and not bench.simulated and not force:
+        raise IncompatibleProduct(
+            f"{product.path}: made in simulation; it is not for hardware (--force overrides)"
+        )
+
+
+def given(settings: dict[str, object]) -> tuple[str, ...]:
+    """Overrides of those settings that were given, ``None`` standing for as configured."""
+    return tuple(f"{key}={value}" for key, value in settings.items() if value is not None)

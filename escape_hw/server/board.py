@@ -1,0 +1,79 @@
+"""What the engine's threads know of each other: written by one, read by all."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+
+from escape_hw.api.flag import Flag
+from escape_hw.calibration.loop_orders import LoopOrders
+from escape_hw.errors import RequestRefused
+from escape_hw.io.provenance import utc_text
+from escape_hw.remote.state import Ended, Fault, Phase, Running
+
+
+@dataclass(frozen=True, slots=True)
+class LoopChoice:
+    """How the loop is closed, or would be; the matrix by its name."""
+
+    matrix: str = ""
+    gain: float = 0.0
+    leak: float = 0.0
+    dropped_modes: int = 0
+
+
+@dataclass(slots=True)
+class Board:
+    """The engine's present condition.
+
+    Parameters
+    ----------
+    stop
+        Set it to stop what runs.
+    paused
+        Whether the procedure is asked to halt.
+    closed
+        Whether the loop is closed.
+    orders, loop_metrics
+        What a loop that stays closed is asked, and what it tells of itself.
+    complaints
+        What devices were last heard to complain of, by name.
+    """
+
+    loop: LoopChoice
+    phase: Phase = Phase.STARTING
+    fault: Fault | None = None
+    running: Running | None = None
+    last: Ended | None = None
+    stop: Flag = field(default_factory=Flag)
+    paused: bool = False
+    closed: bool = False
+    orders: LoopOrders | None = None
+    loop_metrics: dict[str, float] = field(default_factory=dict)
+    needs_loop: bool = False
+    complaints: dict[str, str] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def latch(self, reason: str, way_out: str) -> None:
+        """Remember why the mirror was made safe; the first reason stays."""
+        if self.fault is None:
+            self.fault = Fault(reason=reason, at_utc=utc_text(), way_out=way_out)
+
+    def require_idle(self) -> None:
+        """Raise unless something may be started.
+
+        Raises
+        ------
+        RequestRefused
+            Says what is in the way.
+        """
+        if self.fault is not None:
+            raise RequestRefused(f"made safe: {self.fault.reason}; clear the fault first")
+        if self.running is not None:
+            raise RequestRefused(
+                f"'{self.running.name}' (run {self.running.id}) is running; abort it, or wait"
+            )
+        if self.phase is Phase.LOOP:
+            raise RequestRefused("the loop is closed; open it first")
+        if self.phase is not Phase.IDLE:
+            raise RequestRefused(f"the engine is {self.phase.value}; wait a moment")

@@ -1,0 +1,102 @@
+"""Messages between the front and the engine: JSON lines over a pair of sockets, no pickle."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import queue
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from escape_hw.io.documents import plain
+
+log = logging.getLogger(__name__)
+
+#: The most that may wait for a reader that is slow; older messages give way.
+_MOST_WAITING = 1000
+#: A line longer than this is no message.
+_LONGEST = 16 << 20
+
+
+def encode(message: Mapping[str, Any]) -> bytes:
+    """A message as a line."""
+    return json.dumps(plain(message), separators=(",", ":"), allow_nan=False).encode() + b"\n"
+
+
+class Lines:
+    """Cuts a stream of bytes into messages.
+
+    Raises
+    ------
+    ValueError
+        What came is no message.
+    """
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def feed(self, data: bytes) -> Iterator[dict[str, Any]]:
+        """The messages that are complete with these bytes."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) > _LONGEST:
+            raise ValueError(f"a message of more than {_LONGEST} bytes")
+        for line in lines:
+            yield json.loads(line)
+
+
+class Channel:
+    """The engine's end: messages are handed over at once and sent by a thread, so that no loop waits.
+
+    Parameters
+    ----------
+    connection
+        A connected socket.
+    """
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._waiting: queue.Queue[bytes | None] = queue.Queue(_MOST_WAITING)
+        self.dropped = 0
+        self._sender = threading.Thread(target=self._send, name="sender", daemon=True)
+        self._sender.start()
+
+    def post(self, message: Mapping[str, Any]) -> None:
+        """Hand a message over; it is dropped, and counted, when the reader is too slow."""
+        try:
+            self._waiting.put_nowait(encode(message))
+        except queue.Full:
+            self.dropped += 1
+
+    def messages(self) -> Iterator[dict[str, Any]]:
+        """What arrives, until the other side hangs up."""
+        lines = Lines()
+        while True:
+            try:
+                data = self._connection.recv(65536)
+            except OSError as error:
+                log.warning("the channel failed: %s", error)
+                return
+            if not data:
+                return
+            yield from lines.feed(data)
+
+    def close(self) -> None:
+        """Send what waits, and hang up."""
+        with contextlib.suppress(queue.Full):
+            self._waiting.put(None, timeout=1)
+        self._sender.join(timeout=2)
+        with contextlib.suppress(OSError):
+            # A reader of the same socket waits in recv, which closing alone does not end.
+            self._connection.shutdown(socket.SHUT_RDWR)
+        self._connection.close()
+
+    def _send(self) -> None:
+        while (line := self._waiting.get()) is not None:
+            try:
+                self._connection.sendall(line)
+            except OSError:
+                # The reader has gone; the engine learns it from the end of what it reads.
+                return

@@ -1,0 +1,187 @@
+"""The front's sockets: what comes in is bounded, checked and counted; nothing here waits for anybody."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zmq
+from pydantic import BaseModel, ValidationError
+
+from escape_hw.errors import ConfigError, RequestRefused
+from escape_hw.io.documents import plain
+from escape_hw.remote.address import Endpoint
+from escape_hw.remote.faults import to_wire
+from escape_hw.remote.keys import KeyPair
+from escape_hw.remote.requests import REQUESTS, AnyRequest
+
+log = logging.getLogger(__name__)
+
+#: Longest request, bytes; a message beyond the second number breaks its connection.
+LONGEST, _CUT_OFF = 64 * 1024, 1024 * 1024
+#: Longest number of a request, bytes.
+_LONGEST_ID = 64
+#: Messages that wait for a slow client before further ones are dropped.
+_WAITING = 200
+#: Messages taken in one go, so that a flood leaves time for everything else.
+_AT_ONCE = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """Where an answer goes: through which gate, to which connection, to which of its requests."""
+
+    gate: int
+    connection: bytes
+    number: bytes
+
+    @property
+    def sender(self) -> bytes:
+        """The connection, told apart from those at other gates."""
+        return bytes([self.gate]) + self.connection
+
+
+@dataclass(frozen=True, slots=True)
+class Letter:
+    """A request and where its answer goes."""
+
+    route: Route
+    request: AnyRequest
+
+
+class Door:
+    """Requests in, answers and events out, through one gate for this machine and one for others.
+
+    Parameters
+    ----------
+    context
+        ZeroMQ's.
+
+    Attributes
+    ----------
+    refused
+        Messages that were no requests.
+    """
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        self._context, self.refused = context, 0
+        self._gates: list[tuple[zmq.Socket[bytes], zmq.Socket[bytes]]] = []
+
+    @property
+    def sockets(self) -> tuple[zmq.Socket[bytes], ...]:
+        """What to poll for requests."""
+        return tuple(router for router, _ in self._gates)
+
+    def open(self, *endpoints: Endpoint, keys: KeyPair | None = None) -> None:
+        """Open a gate and listen.
+
+        Parameters
+        ----------
+        endpoints
+            Where.
+        keys
+            The server's own: clients without a key that is allowed get no answer and no event there.
+
+        Raises
+        ------
+        ConfigError
+            An address is in use, or not this machine's.
+        """
+        pair = (self._context.socket(zmq.ROUTER), self._context.socket(zmq.PUB))
+        self._gates.append(pair)
+        for socket in pair:
+            socket.setsockopt(zmq.LINGER, 200)
+            socket.setsockopt(zmq.SNDHWM, _WAITING)
+            socket.setsockopt(zmq.RCVHWM, 5 * _WAITING)
+            socket.setsockopt(zmq.HEARTBEAT_IVL, 2000)
+            socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 10000)
+            socket.setsockopt(zmq.MAXMSGSIZE, _CUT_OFF)
+            if keys is not None:
+                socket.curve_server, socket.zap_domain = True, b"escape"
+                socket.curve_secretkey, socket.curve_publickey = keys.secret, keys.public
+        for endpoint in endpoints:
+            for socket, address in zip(pair, (endpoint.requests, endpoint.events), strict=True):
+                _bind(socket, address)
+
+    def letters(self) -> Iterator[Letter]:
+        """What has arrived; what is no request is refused and counted."""
+        for gate, (router, _) in enumerate(self._gates):
+            for _ in range(_AT_ONCE):
+                try:
+                    parts = router.recv_multipart(zmq.NOBLOCK)
+                except zmq.Again:
+                    break
+                letter = self._opened(gate, parts)
+                if letter is not None:
+                    yield letter
+
+    def _opened(self, gate: int, parts: Sequence[bytes]) -> Letter | None:
+        number = parts[1] if len(parts) > 1 else b""
+        route = Route(gate, parts[0], number[:_LONGEST_ID])
+        try:
+            if len(parts) != 3 or len(number) > _LONGEST_ID:
+                raise RequestRefused(f"{len(parts) - 1} parts; a request has two: its number and its text")
+            if len(parts[2]) > LONGEST:
+                raise RequestRefused(f"{len(parts[2])} bytes; a request has at most {LONGEST}")
+            return Letter(route, REQUESTS.validate_json(parts[2]))
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_input=False)[0]
+            place = ".".join(map(str, first["loc"])) or "the text"
+            self.refuse(route, RequestRefused(f"no request: {place}: {first['msg']}"))
+        except RequestRefused as error:
+            self.refuse(route, error)
+        return None
+
+    def refuse(self, route: Route, error: Exception) -> None:
+        """Refuse a request, and count it."""
+        self.refused += 1
+        if self.refused & (self.refused - 1) == 0:  # 1, 2, 4, 8 ...: a flood does not fill the log
+            log.warning("request refused (%d so far): %s", self.refused, error)
+        self.fail(route, error)
+
+    def answer(self, route: Route, answer: object, data: bytes | None = None) -> None:
+        """Answer a request."""
+        said = answer.model_dump(mode="json") if isinstance(answer, BaseModel) else plain(answer)
+        self._send(route, {"ok": True, "answer": said}, data)
+
+    def fail(self, route: Route, error: Exception | Mapping[str, Any]) -> None:
+        """Answer a request with an error."""
+        known = to_wire(error) if isinstance(error, Exception) else dict(error)
+        self._send(route, {"ok": False, "error": known}, None)
+
+    def _send(self, route: Route, reply: Mapping[str, Any], data: bytes | None) -> None:
+        parts = [route.connection, route.number, json.dumps(reply, allow_nan=False).encode()]
+        try:
+            router = self._gates[route.gate][0]
+            router.send_multipart(parts if data is None else [*parts, data], zmq.NOBLOCK)
+        except zmq.ZMQError as error:
+            log.info("an answer could not be sent: %s", error)
+
+    def publish(self, topic: str, document: BaseModel | Mapping[str, Any]) -> None:
+        """Tell everybody who listens."""
+        text = document.model_dump_json() if isinstance(document, BaseModel) else json.dumps(plain(document))
+        for _, events in self._gates:
+            try:
+                events.send_multipart([topic.encode(), text.encode()], zmq.NOBLOCK)
+            except zmq.Again:
+                log.debug("event %s dropped", topic)
+
+    def close(self) -> None:
+        """Hang up."""
+        for pair in self._gates:
+            for socket in pair:
+                socket.close()
+        self._gates.clear()
+
+
+def _bind(socket: zmq.Socket[bytes], address: str) -> None:
+    try:
+        socket.bind(address)
+    except zmq.ZMQError as error:
+        raise ConfigError(f"{address}: {error.strerror}; choose another --port or --bind") from None
+    if address.startswith("ipc://"):
+        Path(address.removeprefix("ipc://")).chmod(0o600)

@@ -1,0 +1,102 @@
+"""Verdicts on the engine's state: when the mirror has to be made safe."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from escape_hw.config.server_models import ServerSection
+from escape_hw.remote.state import State
+
+#: Residuals over which the present and the usual one are taken, in states (five a second).
+_NOW, _USUAL = 5, 150
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Why the mirror has to be made safe, and what the operator can do then."""
+
+    reason: str
+    way_out: str
+
+
+class Watchdog:
+    """Looks at every state of an engine.
+
+    Parameters
+    ----------
+    limits
+        The configured limits.
+    clock
+        Monotonic seconds.
+    """
+
+    def __init__(self, limits: ServerSection, clock: Callable[[], float] = time.monotonic) -> None:
+        self._limits, self._clock = limits, clock
+        self._frames = -1
+        self._frames_at = self._clipped_since = clock()
+        self._residuals: deque[float] = deque(maxlen=_USUAL)
+        self._diverging_since: float | None = None
+        self._closed = False
+
+    def judge(self, state: State) -> Verdict | None:
+        """The verdict on a state; ``None``: all is well."""
+        if state.fault is not None:
+            return None
+        if state.loop.closed != self._closed:
+            self._closed = state.loop.closed
+            self._residuals.clear()
+            self._frames_at = self._clipped_since = self._clock()
+            self._diverging_since = None
+        return self._frames_arrive(state) or self._clipping(state) or self._diverging(state)
+
+    def _frames_arrive(self, state: State) -> Verdict | None:
+        now, limit = self._clock(), self._limits.no_frames_s
+        if state.rates.frames != self._frames or not state.loop.closed:
+            self._frames, self._frames_at = state.rates.frames, now
+            return None
+        silent = now - self._frames_at
+        if silent <= limit:
+            return None
+        return Verdict(
+            f"no frame for {silent:.1f} s in closed loop (limit {limit:g} s)",
+            "look at the sensor's camera and its cable, then clear the fault",
+        )
+
+    def _clipping(self, state: State) -> Verdict | None:
+        now, limit, most = self._clock(), self._limits.saturated_s, self._limits.saturated_share
+        if not state.loop.closed or state.mirror.clipped <= most:
+            self._clipped_since = now
+            return None
+        if now - self._clipped_since <= limit:
+            return None
+        return Verdict(
+            f"{100 * state.mirror.clipped:.0f} % of the actuators at their limits for "
+            f"{now - self._clipped_since:.1f} s (limit {100 * most:.0f} % for {limit:g} s)",
+            "lower the gain, take another matrix, or wait for better seeing; then clear the fault",
+        )
+
+    def _diverging(self, state: State) -> Verdict | None:
+        if not state.loop.closed or state.loop.residual_nm <= 0:
+            return None
+        self._residuals.append(state.loop.residual_nm)
+        if len(self._residuals) < 4 * _NOW:
+            return None
+        values = list(self._residuals)
+        present, usual = statistics.median(values[-_NOW:]), statistics.median(values[:-_NOW])
+        now, factor, limit = self._clock(), self._limits.diverging_factor, self._limits.diverging_s
+        if present <= factor * usual:
+            self._diverging_since = None
+            return None
+        if self._diverging_since is None:
+            self._diverging_since = now
+        if now - self._diverging_since < limit:
+            return None
+        return Verdict(
+            f"the residual grew to {present:.0f} nm, {present / usual:.1f} times the usual {usual:.0f} nm "
+            f"(limit {factor:g} times for {limit:g} s)",
+            "lower the gain or take another matrix, then clear the fault",
+        )

@@ -1,0 +1,82 @@
+"""What flows through the streams of this computer, for a table."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.streams import segments
+from escape_hw.streams.histogram import percentiles_of
+from escape_hw.streams.ring import RingReader, RingStats
+from escape_hw.streams.segments import Segment, StreamGone
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One stream; rates and percentiles are those since it was looked at before, NaN at first.
+
+    Parameters
+    ----------
+    rate_hz, size
+        Entries per second, and bytes of shared memory.
+    age_s
+        Seconds since the newest entry; NaN before the first.
+    interval_us
+        Median, 99th percentile and the largest spacing of entries.
+    """
+
+    system: str
+    stream: str
+    segment: str
+    pid: int
+    alive: bool
+    readers: tuple[int, ...]
+    size: int
+    written: int = 0
+    shape: tuple[int, ...] = ()
+    dtype: str = ""
+    rate_hz: float = math.nan
+    age_s: float = math.nan
+    interval_us: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+
+
+@dataclass(slots=True)
+class StreamTable:
+    """Looks at all streams of this user, time after time."""
+
+    _before: dict[str, tuple[float, RingStats]] = field(default_factory=dict)
+
+    def rows(self) -> tuple[Row, ...]:
+        """The streams there are now, living and dead."""
+        found = segments.segments()
+        users = segments.readers(one.name for one in found)
+        now = {one.name: self._row(one, users) for one in found}
+        self._before = {name: seen for name, seen in self._before.items() if name in now}
+        return tuple(now.values())
+
+    def _row(self, one: Segment, users: Mapping[str, tuple[int, ...]]) -> Row:
+        common = (one.system, one.stream, one.name, one.pid, one.alive, users[one.name], one.size)
+        try:
+            with RingReader(one.name) as reader:
+                stats = reader.stats()
+        except StreamGone:
+            return Row(*common)
+        now = time.monotonic()
+        then, before = self._before.get(one.name, (now, stats))
+        self._before[one.name] = now, stats
+        age = (time.monotonic_ns() - stats.arrived_ns) * 1e-9 if stats.written else math.nan
+        rate = (stats.written - before.written) / (now - then) if now > then else math.nan
+        return Row(
+            *common, stats.written, stats.shape, stats.dtype, rate, age,
+            _spacing(stats.intervals - before.intervals),
+        )  # fmt: skip
+
+
+def _spacing(counts: NDArray[np.uint64]) -> tuple[float, float, float]:
+    p50, p99, largest = (percentiles_of(counts, [50, 99, 100]) / 1e3).tolist()
+    return p50, p99, largest

@@ -1,0 +1,154 @@
+"""A window on a scripted source, and the proof that nothing of it is left behind."""
+
+from __future__ import annotations
+
+import gc
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+
+import shiboken6
+from PySide6.QtCore import QCoreApplication, QEvent, QTimer
+from PySide6.QtWidgets import QApplication
+from scripted import ScriptedControl, ScriptedSource
+
+from escape_gui.app import application
+from escape_gui.main_window import MainWindow
+from escape_gui.panels import PANELS
+from escape_gui.panels.camera import CameraPanel
+from escape_gui.panels.devices import DevicesPanel
+from escape_gui.panels.log import LogPanel
+from escape_gui.panels.panel import Panel
+from escape_gui.session import Session
+from escape_gui.settings import Settings
+
+
+@pytest.fixture(scope="session")
+def qapp() -> QApplication:
+    """The application, set up as the command does."""
+    return application()
+
+
+def segments() -> set[str]:
+    """Shared memory of this process."""
+    folder = Path("/dev/shm")
+    return {path.name for path in folder.glob(f"escape-*-{os.getpid()}-*")} if folder.is_dir() else set()
+
+
+def timers() -> set[int]:
+    """Timers that still run."""
+    found = (one for one in gc.get_objects() if isinstance(one, QTimer))
+    return {id(one) for one in found if shiboken6.isValid(one) and one.isActive()}
+
+
+def widgets() -> dict[int, str]:
+    """All widgets by the place of their C++ half; wrappers come and go."""
+    return {shiboken6.getCppPointer(one)[0]: repr(one) for one in QApplication.allWidgets()}
+
+
+def settle() -> None:
+    """Let Qt delete what was to be deleted, and Python what nobody holds."""
+    QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete.value)
+    QCoreApplication.processEvents()
+    gc.collect()
+    QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete.value)
+
+
+@pytest.fixture(autouse=True)
+def nothing_left(qapp: QApplication) -> Iterator[None]:
+    """Fail a test that leaves a widget, a running timer, a thread or shared memory."""
+    settle()
+    before = widgets().keys()
+    threads, shared, running = set(threading.enumerate()), segments(), timers()
+    yield
+    for _ in range(4):
+        # Some cycles are collected only after the widgets in them are gone.
+        settle()
+        left = [name for place, name in widgets().items() if place not in before]
+        if not left:
+            break
+    assert not left, f"widgets left behind: {left}"
+    assert timers() <= running, "a timer still runs"
+    assert set(threading.enumerate()) <= threads, "a thread still runs"
+    assert segments() <= shared, "shared memory is left"
+
+
+@pytest.fixture
+def source() -> ScriptedSource:
+    """A closed loop, with an entry in every stream."""
+    source = ScriptedSource()
+    source.push_all()
+    return source
+
+
+@pytest.fixture
+def control() -> ScriptedControl:
+    """A server that notes what it is asked."""
+    return ScriptedControl()
+
+
+@pytest.fixture
+def session(source: ScriptedSource, control: ScriptedControl) -> Iterator[Session]:
+    """A session on both."""
+    session = Session()
+    session.use(source, control)
+    yield session
+    session.close()
+    session.deleteLater()
+
+
+def shown(
+    session: Session, store: Path, panels: Sequence[type[Panel]] = PANELS, settings: Settings | None = None
+) -> MainWindow:
+    """A window that has looked once at everything."""
+    window = MainWindow(session, settings or Settings(), store, panels)
+    window.show()
+    QCoreApplication.processEvents()
+    window.ticker.tick(everything=True)
+    QCoreApplication.processEvents()
+    return window
+
+
+def dispose(window: MainWindow) -> None:
+    """Close a window and all it holds."""
+    window.close()
+    window.deleteLater()
+
+
+@pytest.fixture
+def make_window(session: Session, tmp_path: Path) -> Iterator[Callable[..., MainWindow]]:
+    """Makes windows of some panels, and closes them."""
+    made: list[MainWindow] = []
+
+    def make(panels: Sequence[type[Panel]] = PANELS, settings: Settings | None = None) -> MainWindow:
+        made.append(shown(session, tmp_path / "gui.json", panels, settings))
+        for dock in made[-1].docks.values() if len(panels) == 1 else ():
+            dock.show()
+        made[-1].ticker.tick(everything=True)
+        return made[-1]
+
+    yield make
+    for window in made:
+        if shiboken6.isValid(window):
+            dispose(window)
+
+
+@pytest.fixture
+def window(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
+    """The whole window."""
+    window = shown(session, tmp_path / "gui.json")
+    yield window
+    dispose(window)
+
+
+@pytest.fixture
+def small_window(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
+    """A window of three panels, for what does not concern the others."""
+    window = shown(session, tmp_path / "gui.json", (DevicesPanel, CameraPanel, LogPanel))
+    yield window
+    dispose(window)

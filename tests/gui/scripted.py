@@ -1,0 +1,278 @@
+"""A source whose every word the test decides, and a server that only notes what it was asked."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.errors import EscapeError
+from escape_hw.remote.source import Sample
+from escape_hw.remote.state import (
+    Arguments,
+    DeviceState,
+    Disk,
+    Fault,
+    Geometry,
+    Health,
+    Latency,
+    Lease,
+    Light,
+    LogLine,
+    LoopState,
+    Mirror,
+    Phase,
+    Plan,
+    ProcedureEntry,
+    Product,
+    Rates,
+    State,
+)
+from escape_hw.streams.histogram import BINS, bin_of
+
+CLIENT = "0123456789abcdef"
+LEASE = Lease(client=CLIENT, name="ana", host="bench", pid=7, since_utc="2026-11-21T20:00:00")
+DEVICES = (
+    DeviceState(
+        name="dm",
+        kind="mirror",
+        model="ALPAO DM97-15",
+        serial="BAX123",
+        simulated=True,
+        health=Health.OK,
+        facts={"temperature_c": 31.2},
+    ),
+    DeviceState(
+        name="wfs",
+        kind="camera",
+        model="XIMEA MQ013MG-ON",
+        serial="CX0815",
+        simulated=True,
+        health=Health.OK,
+        facts={"frame_rate_hz": 500.0, "exposure_s": 0.0019, "temperature_c": 41.0},
+    ),
+    DeviceState(
+        name="science",
+        kind="camera",
+        model="FLIR BFS-U3",
+        serial="19001",
+        simulated=True,
+        health=Health.OK,
+    ),
+)
+
+
+def disc(n: int, fill: float = 1.0) -> NDArray[np.bool_]:
+    """A disc of ``fill`` times the width of an ``n`` by ``n`` grid."""
+    y, x = np.indices((n, n)) - (n - 1) / 2
+    return np.hypot(x, y) <= fill * n / 2
+
+
+def rows_of(mask: NDArray[np.bool_]) -> tuple[str, ...]:
+    """A mask as :class:`Geometry` writes it."""
+    return tuple("".join("1" if one else "0" for one in row) for row in mask)
+
+
+def shack_hartmann(n: int = 24, pitch: float = 15.54) -> Geometry:
+    """A sensor of ``n`` sub-apertures across and an 11 by 11 mirror."""
+    valid = disc(n)
+    rows, columns = np.nonzero(valid)
+    half = 0.5 * pitch
+    places = [(14 + (c + 0.5) * pitch, 14 + (r + 0.5) * pitch) for r, c in zip(rows, columns, strict=True)]
+    outlines = tuple((x, y, half) for x, y in places)
+    return Geometry(valid=rows_of(valid), layout=rows_of(disc(11, 1.03)), outlines_px=outlines, n_modes=94)
+
+
+def secondary() -> Geometry:
+    """A pyramid and 336 actuators on rings."""
+    places = []
+    for ring in range(1, 11):
+        count = 6 * ring + (1 if ring <= 6 else 0)
+        angles = 2 * np.pi * np.arange(count) / count
+        places += [(0.03 * ring * float(np.cos(a)), 0.03 * ring * float(np.sin(a))) for a in angles]
+    pupils = ((45.0, 48.0, 32.0), (128.0, 46.0, 32.0), (65.0, 152.0, 32.0), (130.0, 130.0, 32.0))
+    return Geometry(valid=rows_of(disc(64)), places_m=tuple(places[:336]), outlines_px=pupils, n_modes=100)
+
+
+def spots(geometry: Geometry, size: int = 400, seed: int = 0) -> NDArray[np.uint16]:
+    """A frame with one spot in each sub-aperture, in counts of ten bits."""
+    rng = np.random.default_rng(seed)
+    y, x = np.indices((size, size)) + 0.5
+    frame = rng.poisson(6.0, (size, size)).astype(float)
+    for cx, cy, half in geometry.outlines_px:
+        r, c = int(cy), int(cx)
+        part = (slice(max(r - 6, 0), r + 7), slice(max(c - 6, 0), c + 7))
+        dx, dy = rng.normal(0, 0.12 * half, 2)
+        spot = np.exp(-((x[part] - cx - dx) ** 2 + (y[part] - cy - dy) ** 2) / 4.5)
+        frame[part] += rng.uniform(300, 980) * spot
+    return np.minimum(frame, 1023).astype(np.uint16)
+
+
+def speckles(seed: int = 0, size: int = 128, strehl: float = 0.4) -> NDArray[np.float32]:
+    """An image with a core, a ring and a halo, in counts."""
+    rng = np.random.default_rng(seed)
+    y, x = np.indices((size, size)) - size / 2
+    r = np.hypot(x, y) / 2.2 + 1e-6
+    core = (2 * np.sin(r) / r / (1 + r)) ** 2
+    halo = np.exp(-np.hypot(x, y) / 22) * rng.gamma(3.0, 1 / 3, (size, size))
+    return (6000 * (strehl * core + 0.02 * (1 - strehl) * halo) + rng.normal(3, 1, (size, size))).astype(
+        np.float32
+    )
+
+
+def counted(*microseconds: float) -> NDArray[np.float64]:
+    """Counts by bin of durations."""
+    counts = np.zeros(BINS)
+    for one in microseconds:
+        counts[bin_of(int(one * 1000))] += 1
+    return counts
+
+
+def running(**changes: Any) -> State:
+    """The state of a bench whose loop is closed and which we control."""
+    values: dict[str, Any] = {
+        "serial": 1,
+        "server_pid": 10,
+        "engine_pid": 11,
+        "system": "razor-shwfs",
+        "seed": 7,
+        "phase": Phase.LOOP,
+        "lease": LEASE,
+        "devices": DEVICES,
+        "rates": Rates(frame_hz=500.0, frames=123456, lost=2),
+        "light": Light(saturated=0.0004, peak=0.97),
+        "mirror": Mirror(rms=0.082, peak=0.412, clipped=0.0),
+        "latency": Latency(p50=312.0, p99=401.0, largest=880.0, jitter_p99=64.0),
+        "loop": LoopState(
+            closed=True,
+            matrix="escape",
+            gain=0.425,
+            leak=0.026,
+            dropped_modes=14,
+            modes=80,
+            residual_nm=44.0,
+            strehl=0.365,
+            strehl_sigma=0.004,
+        ),
+        "products": (
+            Product(
+                name="escape", kind="matrix", path="/runs/1/im.fits", summary="ESCAPE, 1000 frames, 94 modes"
+            ),
+            Product(name="docrime", kind="matrix", path="/runs/1/do.fits", summary="DO-CRIME, 94 modes"),
+        ),
+        "disk": Disk(folder="/runs", free_gb=512.3),
+    }
+    return State(**{**values, **changes})
+
+
+class ScriptedSource:
+    """Shows what the test puts into it."""
+
+    def __init__(self, state: State | None = None, geometry: Geometry | None = None) -> None:
+        self.connected = True
+        self.state = state or running()
+        self.places = geometry or shack_hartmann()
+        self.lines: list[LogLine] = []
+        self.offers: tuple[ProcedureEntry, ...] = ()
+        self.streams: dict[str, Sample] = {}
+        self.reads = 0
+
+    def change(self, **values: Any) -> None:
+        """Another state, with a number of its own."""
+        self.state = self.state.model_copy(update={**values, "serial": self.state.serial + 1})
+
+    def fail(self, reason: str = "no frames for 0.5 s") -> None:
+        """A fault that made the mirror safe."""
+        fault = Fault(reason=reason, at_utc="2026-11-21T21:00:00", way_out="look at the camera's cable")
+        lost = DEVICES[1].model_copy(update={"health": Health.LOST, "message": "unplugged"})
+        loop = self.state.loop.model_copy(update={"closed": False})
+        self.change(phase=Phase.FAULT, fault=fault, devices=(DEVICES[0], lost, DEVICES[2]), loop=loop)
+
+    def push(self, stream: str, data: NDArray[Any], **meta: float | str) -> None:
+        """The next entry of a stream."""
+        last = self.streams.get(stream)
+        now = time.monotonic_ns()
+        self.streams[stream] = Sample(0 if last is None else last.index + 1, now - 500_000, now, data, meta)
+
+    def push_all(self, seed: int = 0) -> None:
+        """An entry of every stream that the operator's panels read."""
+        rng = np.random.default_rng(seed)
+        n_slopes = 2 * sum(row.count("1") for row in self.places.valid)
+        n_act = sum(row.count("1") for row in self.places.layout) or len(self.places.places_m)
+        self.push("frames", spots(self.places, seed=seed), top=1023.0)
+        self.push("slopes", rng.normal(0, 0.4, n_slopes))
+        self.push("commands", rng.normal(0, 0.1, n_act))
+        self.push("modes", rng.normal(0, 20, self.places.n_modes))
+        self.push("psf", speckles(seed))
+        self.push("model_psf", speckles(seed, strehl=1.0))
+        latencies = rng.gamma(60, 5.2, 4000)
+        spacing = rng.normal(2000, 18, 4000)
+        self.push("latency_histogram", np.stack([counted(*latencies), counted(*spacing)]))
+        if self.places.places_m:
+            self.push("measured_positions", rng.normal(0, 4e-7, n_act))
+        line = LogLine(
+            number=len(self.lines),
+            at_utc=f"2026-11-21T21:{seed % 60:02d}:00.000",
+            logger="escape_hw.server",
+            level=("INFO", "WARNING", "ERROR")[seed % 3],
+            text=f"message {seed}: loop gain 0.425, residual 44 nm",
+        )
+        self.lines.append(line)
+
+    def latest(self, stream: str, after: int = -1) -> Sample | None:
+        """As a server would."""
+        self.reads += 1
+        sample = self.streams.get(stream)
+        return sample if sample is not None and sample.index != after else None
+
+    def geometry(self) -> Geometry:
+        """Where things stand."""
+        return self.places
+
+    def log_after(self, number: int) -> Sequence[LogLine]:
+        """Lines after a number."""
+        return [line for line in self.lines if line.number > number]
+
+    def procedures(self) -> Sequence[ProcedureEntry]:
+        """What can be started."""
+        return self.offers
+
+    def check(self, procedure: str, arguments: Arguments) -> Plan:
+        """A plan as long as was asked."""
+        frames = int(arguments.get("frames") or 1000)
+        return Plan(
+            name=procedure, arguments=dict(arguments), frames=frames, seconds=frames / 500, stroke=0.02
+        )
+
+
+class ScriptedControl:
+    """Notes every request; ``refuse`` makes it raise."""
+
+    client = CLIENT
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, Mapping[str, Any]]] = []
+        self.refuse = ""
+
+    def _note(self, verb: str, **arguments: Any) -> None:
+        self.asked.append((verb, arguments))
+        if self.refuse:
+            raise EscapeError(self.refuse)
+
+    @property
+    def verbs(self) -> list[str]:
+        """What was asked, in order."""
+        return [verb for verb, _ in self.asked]
+
+    def __getattr__(self, verb: str) -> Any:
+        if verb.startswith("_"):
+            raise AttributeError(verb)
+        return lambda *args, **kwargs: self._note(verb, **({"args": args} if args else {}), **kwargs)
+
+    def check(self, procedure: str, arguments: Arguments) -> Plan:
+        """A plan."""
+        self._note("check", procedure=procedure, arguments=arguments)
+        return ScriptedSource().check(procedure, arguments)

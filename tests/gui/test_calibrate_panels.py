@@ -1,0 +1,342 @@
+"""The panels of the Calibrate workspace on a source that the test scripts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import fake_results as fake
+import numpy as np
+import pytest
+from conftest import dispose, shown
+from PySide6.QtCore import QPoint, Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QPushButton
+from scripted import ScriptedControl, ScriptedSource
+
+from escape_gui.main_window import MainWindow
+from escape_gui.panels.gains import GainsPanel
+from escape_gui.panels.modes import LIVE, ModesPanel
+from escape_gui.panels.procedure import ProcedurePanel
+from escape_gui.panels.sprint import SprintPanel
+from escape_gui.session import Session
+from escape_gui.settings import Settings
+from escape_hw.api.registration import TO_PLAIN
+from escape_hw.io.documents import calibration_document
+from escape_hw.io.fits import save_matrix
+from escape_hw.remote.state import Ended, Finish, Parameter, Phase, ProcedureEntry, Product, Running
+
+OFFERS = (
+    ProcedureEntry(
+        name="escape",
+        title="ESCAPE",
+        help="Calibrates without a source.",
+        parameters=(
+            Parameter(
+                name="frames", kind="int", default=1000, unit="frame", low=1, high=1e6, help="How many."
+            ),
+            Parameter(name="snr", kind="float", low=0.01, help="Goal."),
+            Parameter(name="pokes", kind="choice", default="white", choices=("white", "shaped")),
+            Parameter(name="plain", kind="bool", default=False),
+            Parameter(name="closed_loop", kind="matrix"),
+        ),
+    ),
+    ProcedureEntry(
+        name="gains",
+        title="Optical gains",
+        help="Scale it.",
+        parameters=(Parameter(name="im", kind="matrix"),),
+    ),
+)
+MATRIX = fake.calibration("docrime-whitened", n=24, n_modes=30).matrix
+RUNNING = Running(
+    id=3, name="escape", arguments={}, stage="DO-CRIME", done=610, total=1000, remaining_s=252.0
+)
+
+
+@pytest.fixture
+def source() -> ScriptedSource:
+    source = ScriptedSource()
+    source.offers = OFFERS
+    source.change(phase=Phase.IDLE, products=())
+    return source
+
+
+@pytest.fixture
+def calibrate(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
+    kinds = (ProcedurePanel, ModesPanel, SprintPanel, GainsPanel)
+    window = shown(session, tmp_path / "gui.json", kinds, Settings(workspace="calibrate"))
+    window.resize(1600, 1000)
+    for dock in window.docks.values():
+        dock.show()
+    QApplication.processEvents()
+    yield window
+    dispose(window)
+
+
+def look(window: MainWindow) -> None:
+    QApplication.processEvents()
+    window.ticker.tick(everything=True)
+    QApplication.processEvents()
+    assert window.ticker.broken == {}
+
+
+def until(what: Callable[[], bool], window: MainWindow) -> None:
+    deadline = time.monotonic() + 30
+    while not what():
+        assert time.monotonic() < deadline
+        look(window)
+        time.sleep(0.005)
+
+
+def press(button: QPushButton) -> None:
+    QTest.mouseClick(button, Qt.MouseButton.LeftButton)
+
+
+def measure(source: ScriptedSource, share: float) -> None:
+    """The matrix after a share of its frames."""
+    sigma = MATRIX.sigma / np.sqrt(share)
+    source.push("valid", MATRIX.valid.astype(np.float32))
+    source.push("matrix_sigma", sigma, stage="DO-CRIME")
+    source.push("matrix", MATRIX.data, stage="DO-CRIME")
+
+
+# ---------------------------------------------------------------- mode maps
+def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
+    panel = calibrate.panels["modes"]
+    look(calibrate)
+    assert panel.is_empty
+    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    measure(source, 1e-4)
+    look(calibrate)
+    assert not panel.is_empty
+    assert panel.which.currentData() == LIVE
+    assert panel.which.currentText() == "DO-CRIME, as measured now"
+    pale = contrast(panel)
+    measure(source, 1.0)
+    look(calibrate)
+    assert contrast(panel) > 2 * pale
+    panel.fade.setChecked(False)
+    assert contrast(panel) > 2 * pale
+
+
+def contrast(panel: ModesPanel) -> float:
+    """How far the mosaic's colours lie from white."""
+    picture = panel.mosaic._image.image.astype(float)
+    return float(np.abs(picture[picture > 0] - 128).mean())
+
+
+def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
+    panel = calibrate.panels["modes"]
+    products = []
+    for method in ("push-pull", "escape"):
+        made = fake.calibration(method, n=24, n_modes=30)
+        path = save_matrix(tmp_path / f"{method}.fits", made, fake.ORIGIN)
+        products.append(Product(name=method, kind="matrix", path=str(path)))
+    source.change(products=tuple(products))
+    until(lambda: "ESCAPE" in panel.matrices, calibrate)
+    look(calibrate)
+    mosaic = panel.mosaic
+    top, left = mosaic._layout.corner(4)
+    place = mosaic._box.mapViewToScene(mosaic._box.mapToView(mosaic._box.rect().center()))
+    middle = mosaic._box.mapViewToScene(QPoint(left + 12, top + 12))
+    assert place is not None
+    QTest.mouseMove(mosaic._view.viewport(), middle.toPoint())
+    QTest.mouseClick(mosaic._view.viewport(), Qt.MouseButton.LeftButton, pos=middle.toPoint())
+    until(lambda: mosaic.mode == 4, calibrate)
+    assert panel.detail.isVisible()
+    assert panel.detail.titles == (
+        "push-pull", "DO-CRIME", "ESCAPE", "ESCAPE − push-pull", "Error of DO-CRIME", "SNR of DO-CRIME",
+    )  # fmt: skip
+    assert panel._words.text().startswith("mode 5  rms slope")
+    mosaic.setFocus()
+    QTest.keyClick(mosaic, Qt.Key.Key_Right)
+    assert mosaic.mode == 5
+    QTest.keyClick(mosaic, Qt.Key.Key_Escape)
+    assert not panel.detail.isVisible()
+    names = [array.name for array in panel.shown()]
+    assert names == ["matrix", "sigma"]
+
+
+def test_pages_turn(calibrate, source):
+    panel = calibrate.panels["modes"]
+    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    measure(source, 1.0)
+    look(calibrate)
+    panel.mosaic.setMaximumSize(240, 160)
+    look(calibrate)
+    page, pages = panel.mosaic.page
+    assert (page, pages > 1) == (0, True)
+    press(panel._on)
+    assert panel.mosaic.page[0] == 1
+    assert panel._pages.text() == f"page 2 of {pages}"
+    panel.mosaic.choose(29)
+    assert panel.mosaic.page[0] == pages - 1
+    assert not panel._on.isEnabled()
+
+
+# ---------------------------------------------------------------- SPRINT and gains
+def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
+    panel = calibrate.panels["sprint"]
+    estimate = fake.registration()
+    path = np.array([step.registration.to_array() for step in estimate.iterations])
+    norm = np.array([step.step_norm for step in estimate.iterations])
+    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.push("registration", path[:6] * TO_PLAIN)
+    source.push("registration_sigma", np.full(5, np.nan))
+    source.push("step_norm", norm[:6])
+    look(calibrate)
+    assert panel._pill.word == "running, 6 iterations"
+    source.push("registration", path * TO_PLAIN)
+    source.push("registration_sigma", estimate.sigma * TO_PLAIN)
+    source.push("step_norm", norm)
+    document = calibration_document(fake.calibration("escape"))
+    ended = Ended(id=3, name="escape", finish=Finish.DONE, document=document)
+    source.change(phase=Phase.IDLE, procedure=None, last=ended)
+    look(calibrate)
+    assert panel._pill.word == "converged, 18 iterations"
+    assert "±" in panel._values[0].text()
+    assert "tangential_scaling is consistent with zero" in panel._notes.text()
+    press(panel.units)
+    assert panel.plot.physical
+    table = panel.shown()[0].data
+    np.testing.assert_allclose(table[:, 2:], path, rtol=1e-6)
+
+
+def test_a_drift_is_followed(calibrate, source):
+    panel = calibrate.panels["sprint"]
+    track = np.zeros((30, 11))
+    track[:, 0] = np.arange(30)
+    track[:, 1] = 0.001 * np.arange(30)
+    source.push("registration_track", track)
+    look(calibrate)
+    assert panel.tabs.currentIndex() == 1
+    np.testing.assert_allclose(panel.shown()[-1].data[-1, 1], 2.9)
+
+
+def test_gains_appear_round_by_round(calibrate, source):
+    panel = calibrate.panels["gains"]
+    gains = fake.optical_gains(0.7)
+    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.push("gains", gains.value, stage="round 2")
+    source.push("gains_sigma", gains.sigma)
+    source.push("gains_smooth", gains.trend)
+    source.push("gains_rounds", np.stack([gains.best, 1.01 * gains.best]))
+    look(calibrate)
+    assert "median 0.700" in panel._legend.text()
+    assert "2 rounds" in panel._legend.text()
+    press_box(panel)
+    assert panel.shown()[0].data.shape == (20, 5)
+
+
+def press_box(panel: GainsPanel) -> None:
+    panel.rounds.click()
+    assert not panel.rounds.isChecked()
+
+
+# ---------------------------------------------------------------- procedures
+def test_from_the_form_to_the_start(calibrate, source, control):
+    panel = calibrate.panels["procedure"]
+    look(calibrate)
+    assert [panel.choice.itemText(k) for k in range(panel.choice.count())] == ["ESCAPE", "Optical gains"]
+    assert not panel.start.isEnabled()
+    panel.form.set_value("frames", "200")
+    panel.form.set_value("pokes", "shaped")
+    until(panel.start.isEnabled, calibrate)
+    arguments = {"frames": 200, "pokes": "shaped"}
+    assert ("check", {"procedure": "escape", "arguments": arguments}) in control.asked
+    assert "frames" in panel.plan.text()
+    assert "% of the stroke" in panel.plan.text()
+    press(panel.start)
+    until(lambda: any(verb == "start" for verb, _ in control.asked), calibrate)
+    assert ("start", {"args": ("escape",), **arguments}) in control.asked
+
+
+def test_a_form_that_is_wrong_starts_nothing(calibrate, control):
+    panel = calibrate.panels["procedure"]
+    look(calibrate)
+    until(panel.start.isEnabled, calibrate)
+    panel.form.set_value("frames", "zero")
+    assert not panel.start.isEnabled()
+    press(panel.check)
+    assert "'zero' is no number" in panel.plan.text()
+    look(calibrate)
+    assert not panel.start.isEnabled()
+    assert "not checked" in panel.start.toolTip()
+
+
+def test_a_refusal_is_told_beside_the_form(calibrate, control):
+    panel = calibrate.panels["procedure"]
+    control.refuse = "no light on the sensor"
+    look(calibrate)
+    until(lambda: "no light" in panel.plan.text(), calibrate)
+    assert not panel.start.isEnabled()
+    control.refuse = ""
+
+
+def test_a_procedure_is_watched_halted_and_stopped(calibrate, source, control):
+    panel = calibrate.panels["procedure"]
+    look(calibrate)
+    assert not panel.abort.isEnabled()
+    assert "no procedure runs" in panel.abort.toolTip()
+    measure(source, 1.0)
+    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    look(calibrate)
+    source.change()
+    look(calibrate)
+    assert panel.progress.text() == "DO-CRIME: 610 of 1000 frames, 4:12 min left"
+    assert "worst mode 1: SNR" in panel._metrics.text()
+    assert panel.bar.value() == 610
+    assert "a procedure runs" in panel.start.toolTip()
+    press(panel.pause)
+    until(lambda: ("pause", {}) in control.asked, calibrate)
+    source.change(procedure=RUNNING.model_copy(update={"paused": True}))
+    look(calibrate)
+    assert panel.pause.text() == "Go on"
+    press(panel.pause)
+    until(lambda: ("resume", {}) in control.asked, calibrate)
+    press(panel.abort)
+    until(lambda: ("abort", {}) in control.asked, calibrate)
+
+
+def test_the_result_stands_beside_the_one_before(calibrate, source):
+    panel = calibrate.panels["procedure"]
+    document = calibration_document(fake.calibration("escape"))
+    first = Ended(id=1, name="escape", finish=Finish.DONE, folder="/runs/1", document=document)
+    source.change(last=first)
+    look(calibrate)
+    assert panel.outcome.text() == "Done: escape"
+    assert "Δ" not in panel.numbers.text()
+    assert not panel.report.isVisible()
+    second = first.model_copy(update={"id": 2, "products": {"report": "/runs/2/report.html"}})
+    source.change(last=second)
+    look(calibrate)
+    assert "(Δ 0.00 ± " in panel.numbers.text()
+    assert panel.report.isVisible()
+
+
+def test_new_matrices_are_offered_to_the_form(calibrate, source):
+    panel = calibrate.panels["procedure"]
+    look(calibrate)
+    panel.choice.setCurrentIndex(1)
+    box = panel.form.fields["im"]
+    assert box.currentText() == "–"
+    names = ("first", "second")
+    source.change(products=tuple(Product(name=name, kind="matrix", path="/x.fits") for name in names))
+    look(calibrate)
+    assert box.currentText() == "second"
+    panel.form.set_value("im", "first")
+    source.change(products=(*source.state.products, Product(name="third", kind="matrix", path="/x.fits")))
+    look(calibrate)
+    assert box.currentText() == "first"
+
+
+def test_without_control_nothing_starts(session, source, control, calibrate):
+    source.change(lease=None)
+    look(calibrate)
+    panel = calibrate.panels["procedure"]
+    assert not panel.start.isEnabled()
+    assert "take control" in panel.start.toolTip()
+    assert panel.check.isEnabled()
+    assert isinstance(control, ScriptedControl)

@@ -1,0 +1,295 @@
+"""Every panel through what can happen to its source; and what single panels show of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QGuiApplication
+from pytestqt.qtbot import QtBot
+from scripted import DEVICES, ScriptedControl, ScriptedSource, running, secondary
+
+from escape_gui.main_window import MainWindow
+from escape_gui.panels import PANELS
+from escape_gui.panels.camera import CameraPanel
+from escape_gui.panels.devices import DevicesPanel, fact
+from escape_gui.panels.latency import LatencyPanel
+from escape_gui.panels.log import LogPanel
+from escape_gui.panels.loop import LoopPanel
+from escape_gui.panels.mirror import MirrorPanel
+from escape_gui.panels.panel import Panel
+from escape_gui.panels.performance import PerformancePanel
+from escape_gui.panels.psf import PsfPanel
+from escape_gui.session import Session
+from escape_gui.widgets.hold_button import HOLD_MS
+from escape_hw.errors import StorageError
+from escape_hw.remote.state import Health, Light, LoopState, Mirror, Phase, State
+
+P = TypeVar("P", bound=Panel)
+MakeWindow = Callable[..., MainWindow]
+
+
+def panel_of(window: MainWindow, kind: type[P]) -> P:
+    panel = window.panels[kind.name]
+    assert isinstance(panel, kind)
+    return panel
+
+
+@pytest.mark.parametrize("kind", PANELS, ids=lambda kind: kind.name)
+def test_each_panel_lives_through_everything(
+    kind: type[Panel], make_window: MakeWindow, source: ScriptedSource
+) -> None:
+    window = make_window((kind,))
+    dock, panel = window.docks[kind.name], window.panels[kind.name]
+
+    def look() -> Health:
+        window.ticker.tick(everything=True)
+        assert window.ticker.broken == {}
+        return panel.health
+
+    assert look() is Health.OK
+    assert not dock._pill.isVisible()
+    source.fail()
+    assert look() is Health.FAULT
+    assert dock._pill.word == "fault"
+    source.connected = False
+    assert look() is Health.LOST
+    assert dock._pill.word == "lost"
+    source.connected = True
+    source.state = running(engine_pid=99, serial=1000)
+    source.push_all(1)
+    assert look() is Health.OK
+    # Nothing at all, as before the first connection.
+    source.state, source.streams, source.lines = State(), {}, []
+    look()
+    assert panel.is_empty == bool(panel.empty) or kind.stale_after_s is None
+
+
+def test_frames_that_stop_are_called_stale(
+    window: MainWindow, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = panel_of(window, CameraPanel)
+    assert camera.health is Health.OK
+    camera._newest -= 2.0
+    window.ticker.tick(everything=True)
+    assert camera.health is Health.STALE
+    assert window.docks["camera"]._pill.word == "stale"
+    source.push_all(5)
+    window.ticker.tick(everything=True)
+    assert camera.health is Health.OK
+
+
+def test_every_panel_says_what_to_do_when_there_is_nothing() -> None:
+    for kind in PANELS:
+        assert kind.title
+        assert len(kind.help) > 40
+        assert kind.rate_hz <= 30
+
+
+def test_camera_counts_and_hatches_saturation(window: MainWindow, source: ScriptedSource) -> None:
+    camera = panel_of(window, CameraPanel)
+    frame = np.zeros((400, 400), np.uint16)
+    frame[7, 9] = 1023
+    source.push("frames", frame, top=1023.0)
+    source.change(light=Light(saturated=0.0321, peak=1.0))
+    camera._histogram_due = 0.0
+    window.ticker.tick(everything=True)
+    assert "3.21 %" in camera.saturation.text()
+    assert camera.picture._veil.isVisible()
+    assert np.argwhere(camera.picture._veil.image[..., 3]).tolist() == [[7, 9]]
+
+
+def test_camera_views(window: MainWindow, source: ScriptedSource) -> None:
+    camera = panel_of(window, CameraPanel)
+    kept = source.streams["frames"].data.astype(np.float32)
+    camera.choice.choose("arrows")
+    assert camera.quiver.isVisible()
+    n = len(source.places.outlines_px)
+    assert camera.quiver.getData()[0].size == 2 * n
+    camera.choice.choose("x | y")
+    maps = camera.signed.data
+    assert maps is not None
+    assert np.isfinite(maps).sum() == 2 * n
+    camera.choice.choose("change")
+    source.push_all(3)
+    window.ticker.tick(everything=True)
+    assert camera.signed.data is not None
+    assert np.array_equal(camera.signed.data, source.streams["frames"].data - kept)
+
+
+def test_cursor_says_place_and_value(window: MainWindow, source: ScriptedSource, qtbot: QtBot) -> None:
+    picture = panel_of(window, CameraPanel).picture
+    said: list[str] = []
+    picture.pointed.connect(said.append)
+    qtbot.keyClick(picture, Qt.Key.Key_Right)
+    value = source.streams["frames"].data[200, 201]
+    assert said[-1].split() == ["x", "201", "y", "200", str(value), "counts"]
+
+
+def test_mirror_of_a_secondary_shows_both(session: Session, make_window: MakeWindow) -> None:
+    source = ScriptedSource(geometry=secondary())
+    source.push_all()
+    session.use(source, None)
+    window = make_window((MirrorPanel,))
+    mirror = panel_of(window, MirrorPanel)
+    assert mirror.picture.data is not None
+    painted = mirror.picture.data[np.isfinite(mirror.picture.data)]
+    assert set(np.unique(painted)) == set(source.streams["commands"].data.astype(np.float32))
+    assert mirror.choice.buttons["measured"].isEnabled()
+    mirror.choice.choose("measured")
+    assert mirror.picture.unit == "µm"
+
+
+def test_mirror_tells_peak_and_clipping(window: MainWindow, source: ScriptedSource) -> None:
+    source.change(mirror=Mirror(rms=0.0812, peak=0.8, clipped=0.031))
+    window.show_workspace("align")
+    window.ticker.tick(everything=True)
+    readouts = panel_of(window, MirrorPanel).readouts
+    assert [readouts[name].text for name in ("rms", "peak", "clipped")] == ["0.0812", "0.8000", "3.10"]
+
+
+def test_loop_edit_check_apply(
+    window: MainWindow, source: ScriptedSource, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    loop = panel_of(window, LoopPanel)
+    assert not loop.apply_button.isEnabled()
+    loop.gain.setValue(0.5)
+    window.ticker.tick(everything=True)
+    assert control.asked == []
+    assert "press Check first" in loop.apply_button.toolTip()
+    loop.check_button.click()
+    assert loop.message.text() == "Apply: gain 0.425 → 0.5"
+    window.ticker.tick(everything=True)
+    loop.apply_button.click()
+    qtbot.waitUntil(lambda: loop.message.text() == "Done.")
+    assert control.asked == [("set_loop", {"gain": 0.5})]
+
+
+def test_loop_refuses_what_the_server_would(window: MainWindow, source: ScriptedSource) -> None:
+    loop = panel_of(window, LoopPanel)
+    loop.dropped_modes.setValue(94)
+    loop.gain.setValue(0.0)
+    loop.check()
+    assert "gain: Input should be greater than 0" in loop.message.text()
+    assert "94 of 94 leaves none to control" in loop.message.text()
+    window.ticker.tick(everything=True)
+    assert not loop.apply_button.isEnabled()
+
+
+def test_loop_form_keeps_an_edit_while_the_state_changes(window: MainWindow, source: ScriptedSource) -> None:
+    loop = panel_of(window, LoopPanel)
+    loop.leak.setValue(0.1)
+    source.change(loop=source.state.loop.model_copy(update={"gain": 0.6}))
+    window.ticker.tick(everything=True)
+    assert loop.current["gain"].text() == "0.6000"
+    assert (loop.leak.value(), loop.gain.value()) == (0.1, 0.425)
+    loop.reset_button.click()
+    assert (loop.leak.value(), loop.gain.value()) == (0.026, 0.6)
+
+
+def test_closing_the_loop_needs_a_held_button(
+    window: MainWindow, source: ScriptedSource, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    loop = panel_of(window, LoopPanel)
+    assert "it is closed" in loop.close_button.toolTip()
+    source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4, leak=0.02, dropped_modes=3, modes=80))
+    window.ticker.tick(everything=True)
+    qtbot.mouseClick(loop.close_button, Qt.MouseButton.LeftButton)
+    qtbot.wait(50)
+    assert control.asked == []
+    qtbot.mousePress(loop.close_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: bool(control.asked), timeout=20 * HOLD_MS)
+    qtbot.mouseRelease(loop.close_button, Qt.MouseButton.LeftButton)
+    assert control.asked == [("close_loop", {"args": ("escape", 0.4, 0.02, 3)})]
+
+
+def test_return_held_closes_the_loop_too(
+    window: MainWindow, source: ScriptedSource, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    button = panel_of(window, LoopPanel).close_button
+    source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4))
+    window.ticker.tick(everything=True)
+    qtbot.keyPress(button, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: control.verbs == ["close_loop"], timeout=20 * HOLD_MS)
+    qtbot.keyRelease(button, Qt.Key.Key_Return)
+
+
+def test_log_search_level_and_copy(window: MainWindow, source: ScriptedSource) -> None:
+    for k in range(1, 7):
+        source.push_all(k)
+    log = panel_of(window, LogPanel)
+    window.ticker.tick(everything=True)
+    assert len(log.text.toPlainText().splitlines()) == 7
+    log.level.setCurrentText("Warning")
+    assert len(log.text.toPlainText().splitlines()) == 4
+    log.search.setText("GAIN message 4")
+    assert log.text.toPlainText().split()[1] == "WARNING"
+    log.copy_button.click()
+    assert "message 4" in QGuiApplication.clipboard().text()
+
+
+def test_performance_has_gaps_where_the_loop_was_open(window: MainWindow, source: ScriptedSource) -> None:
+    panel = panel_of(window, PerformancePanel)
+    source.change(loop=source.state.loop.model_copy(update={"closed": False}))
+    window.ticker.tick(everything=True)
+    (table,) = panel.shown()
+    assert table.data.shape == (2, 3)
+    assert table.data[0, 1:] == pytest.approx([36.5, 44.0])
+    assert np.isnan(table.data[1, 1:]).all()
+
+
+def test_profiles_begin_at_the_strehl_ratio(make_window: MakeWindow, source: ScriptedSource) -> None:
+    y, x = np.indices((64, 64)) - 32.0
+    narrow = np.exp(-(x**2 + y**2) / 8)
+    wide = np.exp(-(x**2 + y**2) / 32) / 4
+    source.push("model_psf", 1000 * narrow)
+    source.push("psf", (50 + 3000 * wide).astype(np.uint16))
+    window = make_window((PsfPanel,))
+    profiles = {one.name: one.data for one in panel_of(window, PsfPanel).shown()}
+    assert profiles["psf_profile"][0] / profiles["model_psf_profile"][0] == pytest.approx(0.25, rel=0.01)
+
+
+def test_latencies_are_counted_where_they_lie(make_window: MakeWindow, source: ScriptedSource) -> None:
+    window = make_window((LatencyPanel,))
+    (table,) = panel_of(window, LatencyPanel).shown()
+    assert table.data[:, 1].sum() == 4000
+    middle = table.data[:, 0] @ table.data[:, 1] / 4000
+    assert middle == pytest.approx(60 * 5.2, rel=0.05)
+
+
+def test_devices_are_listed_with_units(window: MainWindow, source: ScriptedSource) -> None:
+    panel = panel_of(window, DevicesPanel)
+    window.show_workspace("align")
+    window.ticker.tick(everything=True)
+    assert list(panel._rows) == [device.name for device in DEVICES]
+    source.change(devices=DEVICES[:1])
+    window.ticker.tick(everything=True)
+    assert list(panel._rows) == ["dm"]
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ("temperature_c", 31.24, "temperature 31.2 °C"),
+        ("link", "USB 3", "link USB 3"),
+        ("unread", 4.0, "unread 4"),
+    ],
+)
+def test_facts_in_words(key: str, value: float | str, text: str) -> None:
+    assert fact(key, value) == text
+
+
+def test_a_full_disk_is_told_and_nothing_breaks(
+    window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, content: bytes) -> None:
+        raise StorageError(f"{path}: cannot be written (No space left on device)")
+
+    monkeypatch.setattr("escape_gui.exports.write_atomic", full)
+    window.save_to(tmp_path / "a.png", "png", window.panels["camera"])
+    assert "No space left" in window.toasts.notes[-1].text
+    assert list(tmp_path.glob("a*")) == []

@@ -1,0 +1,137 @@
+"""Runs and products in the window: opened, dropped, moved through."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import recorded_run
+from conftest import dispose
+from PySide6.QtCore import QMimeData, QPoint, QPointF, Qt, QUrl
+from PySide6.QtGui import QDragEnterEvent, QDropEvent
+from PySide6.QtWidgets import QApplication, QFileDialog
+
+from escape_gui.main_window import MainWindow
+from escape_gui.panels import PANELS
+from escape_gui.replay.source import ReplaySource
+from escape_gui.session import Session
+from escape_gui.settings import Settings
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded_run.make_run(tmp_path_factory.mktemp("recorded") / "run")
+
+
+@pytest.fixture
+def empty(tmp_path: Path) -> Iterator[MainWindow]:
+    """A window that nothing was opened in yet."""
+    session = Session()
+    window = MainWindow(session, Settings(workspace="operate"), None)
+    window.resize(1600, 1000)
+    window.show()
+    yield window
+    dispose(window)
+    session.close()
+    session.deleteLater()
+
+
+def until(what: Callable[[], bool], window: MainWindow) -> None:
+    deadline = time.monotonic() + 30
+    while not what():
+        assert time.monotonic() < deadline
+        QApplication.processEvents()
+        window.ticker.tick(everything=True)
+        assert window.ticker.broken == {}
+        time.sleep(0.005)
+
+
+def is_open(window: MainWindow) -> bool:
+    return isinstance(window.context.session.source, ReplaySource)
+
+
+def test_a_run_is_shown_by_every_panel(empty, folder):
+    empty.replay.open(folder)
+    until(lambda: is_open(empty), empty)
+    assert empty.workspace.name == "calibrate"
+    modes = empty.panels["modes"]
+    until(lambda: list(modes.matrices) == ["push-pull", "DO-CRIME", "ESCAPE"], empty)
+    for name in ("calibrate", "operate", "align"):
+        empty.show_workspace(name)
+        for _ in range(3):
+            until(lambda: True, empty)
+            QApplication.processEvents()
+    for panel in PANELS:
+        empty.docks[panel.name].show()
+    empty.ticker.tick(everything=True)
+    sprint, gains = empty.panels["sprint"], empty.panels["gains"]
+    assert sprint._pill.word == "converged, 18 iterations"
+    assert list(gains._curves) == ["ESCAPE", "DO-CRIME"]
+    assert not empty.panels["psf"].is_empty
+
+
+def test_nothing_can_be_commanded_and_the_reason_is_told(empty, folder):
+    empty.replay.open(folder)
+    until(lambda: is_open(empty), empty)
+    until(lambda: bool(empty.panels["procedure"].start.toolTip()), empty)
+    procedure = empty.panels["procedure"]
+    for button in (procedure.check, procedure.start, procedure.pause, procedure.abort):
+        assert not button.isEnabled()
+        assert "replayed" in button.toolTip()
+    assert "recording" in procedure._about.text()
+    assert procedure.outcome.text() == "Done: A run"
+
+
+def test_the_slider_goes_through_the_run(empty, folder):
+    empty.replay.open(folder)
+    until(lambda: is_open(empty), empty)
+    sprint, transport = empty.panels["sprint"], empty.replay.transport
+    until(lambda: sprint._course is not None and len(sprint._course.values) == 18, empty)
+    assert transport.isVisible()
+    transport.slider.setValue(transport.slider.maximum() // 2)
+    until(lambda: len(sprint._course.values) == 9, empty)
+    transport.slider.setValue(transport.slider.maximum() - 2)
+    transport.play.click()
+    until(lambda: not transport.play.isChecked(), empty)
+    until(lambda: len(sprint._course.values) == 18, empty)
+
+
+@pytest.mark.parametrize("name", ["", "escape.fits"])
+def test_what_is_dropped_is_opened(empty, folder, name):
+    data = QMimeData()
+    data.setUrls([QUrl.fromLocalFile(str(folder / name))])
+    hands = (Qt.DropAction.CopyAction, data, Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier)
+    for kind, place in ((QDragEnterEvent, QPoint(50, 50)), (QDropEvent, QPointF(50, 50))):
+        event = kind(place, *hands)
+        QApplication.sendEvent(empty, event)
+        assert event.isAccepted()
+    until(lambda: is_open(empty), empty)
+
+
+def test_what_cannot_be_read_is_told(empty, tmp_path, monkeypatch):
+    path = tmp_path / "im.fits"
+    path.write_bytes(b"no FITS")
+    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_: (str(path), ""))
+    told: list[str] = []
+    monkeypatch.setattr(empty.toasts, "tell", lambda _level, _title, text: told.append(text))
+    empty.actions_by_name["open_product"].trigger()
+    until(lambda: bool(told), empty)
+    assert "im.fits: not a FITS file" in told[0]
+    assert not is_open(empty)
+
+
+def test_a_bench_keeps_its_window(small_window, folder, monkeypatch):
+    """The safety buttons of a window on a bench must go on working."""
+    monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(folder))
+    small_window.actions_by_name["open_run"].trigger()
+    until(lambda: bool(small_window.replay.others), small_window)
+    assert not is_open(small_window)
+    (other,) = small_window.replay.others
+    assert is_open(other)
+    assert other.isVisible()
+    assert np.array_equal(
+        other.context.session.source.latest("valid").data > 0, recorded_run.calibration("escape").grid.valid
+    )

@@ -1,0 +1,123 @@
+"""A window on a real server, and the clicks of somebody who calibrates with it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from conftest import dispose
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QPushButton
+from serving import serving
+
+from escape_gui.app import Desk
+from escape_gui.main_window import MainWindow
+from escape_gui.panels.procedure import ProcedurePanel
+from escape_gui.session import Session
+from escape_gui.settings import Settings
+from escape_hw.remote.state import Ended, Phase
+
+#: Longest wait for a step; a calibration takes minutes on a busy machine.
+PATIENCE_S = 900.0
+
+
+class Operator:
+    """Clicks, and looks at what comes of it.
+
+    Parameters
+    ----------
+    window
+        On a server.
+    """
+
+    def __init__(self, window: MainWindow) -> None:
+        self.window = window
+        panel = window.panels["procedure"]
+        assert isinstance(panel, ProcedurePanel)
+        self.procedure = panel
+        #: What each visible panel said while procedures ran.
+        self.seen: dict[str, list[float]] = {"live_modes": [], "iterations": [], "gains": [], "abort": []}
+
+    def until(self, what: Callable[[], bool], why: str) -> None:
+        """Let the window live until something is so."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not what():
+            assert time.monotonic() < deadline, f"never happened: {why}"
+            QApplication.processEvents()
+            assert self.window.ticker.broken == {}
+            time.sleep(0.01)
+
+    def press(self, button: QPushButton) -> None:
+        """Click, as a hand does."""
+        assert button.isEnabled(), button.toolTip()
+        QTest.mouseClick(button, Qt.MouseButton.LeftButton)
+
+    def take_control(self) -> None:
+        """Wait until the bench is ready, and ask for it."""
+        session = self.window.context.session
+        self.until(lambda: session.source.state.phase is Phase.IDLE, "the engine is idle")
+        self.until(lambda: self.procedure._state.phase is Phase.IDLE, "the panel knows")
+        self.window.actions_by_name["take_control"].trigger()
+        self.until(lambda: session.may_write, "we have control")
+
+    def choose(self, name: str, **arguments: str) -> None:
+        """Fill in a procedure's form, and wait for its plan."""
+        form = self.procedure
+        self.until(lambda: form.choice.findData(name) >= 0, "procedures are offered")
+        form.choice.setCurrentIndex(form.choice.findData(name))
+        for key, text in arguments.items():
+            form.form.set_value(key, text)
+        self.until(form.start.isEnabled, f"{name} is planned: {form.plan.text()}")
+
+    def run(self, name: str, **arguments: str) -> Ended:
+        """Start a procedure by its button, watch it to its end."""
+        self.choose(name, **arguments)
+        source = self.window.context.session.source
+        before = source.state.last.id if source.state.last is not None else 0
+        self.press(self.procedure.start)
+        self.until(lambda: source.state.procedure is not None, "it runs")
+        self.until(lambda: self._watch() and _ended(source, before), "it ends")
+        last = source.state.last
+        assert last is not None
+        self.until(lambda: self.procedure._ended is not None and self.procedure._ended.id == last.id, "told")
+        return last
+
+    def _watch(self) -> bool:
+        panels, seen = self.window.panels, self.seen
+        if panels["modes"].which.currentData() == "as measured now":
+            seen["live_modes"].append(panels["modes"].mosaic.n_modes)
+        if (course := panels["sprint"]._course) is not None:
+            seen["iterations"].append(len(course.values))
+        seen["gains"].append(len(panels["gains"]._curves))
+        seen["abort"].append(self.procedure.abort.isEnabled())
+        return True
+
+
+def _ended(source: object, before: int) -> bool:
+    state = source.state  # type: ignore[attr-defined]
+    return state.procedure is None and state.last is not None and state.last.id != before
+
+
+@contextmanager
+def operating(system: str | Path, name: str, folder: Path, **settings: str) -> Iterator[Operator]:
+    """A server of a system, and the window as the command makes it."""
+    with serving(system, "--quiet", folder=folder) as served:
+        os.environ["XDG_RUNTIME_DIR"] = served.environment["XDG_RUNTIME_DIR"]
+        session = Session()
+        window = MainWindow(session, Settings(**{"workspace": "calibrate", **settings}), None)
+        desk = Desk(window, session, name, None)
+        window.resize(1280, 800)
+        window.ticker.start()
+        window.show()
+        try:
+            yield Operator(window)
+        finally:
+            dispose(window)
+            session.close()
+            session.deleteLater()
+            desk.close()
+            desk.deleteLater()

@@ -1,0 +1,138 @@
+"""kill -9 of engine and front: the mirror behind the real drivers ends flat, and nothing half is left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from serving import Served, Spy, serving, until_idle, wait_for
+from small_system import configuration
+
+from escape_hw.errors import CalibrationError, ServerGone
+from escape_hw.io.fits import load_matrix
+from escape_hw.remote.state import Phase
+from escape_hw.streams.segments import segments
+from escape_sim.devices import shared_bench
+from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build
+from escape_sim.stand_ins.bench_server import BenchServer
+
+#: On the increments of the real camera, and with a state kept often.
+OPTIONS = ("devices.wfs.region=[216,152,208,208]", "calibration.checkpoint_s=0.3")
+
+
+@pytest.fixture
+def bench() -> Iterator[tuple[BenchServer, Spy]]:
+    """The simulated bench, in this process, that the server's real drivers reach."""
+    try:
+        for name in LIBRARIES:
+            build(name)
+    except StandInUnavailable as reason:
+        pytest.skip(str(reason))
+    server = BenchServer(configuration(*OPTIONS))
+    spy = Spy(shared_bench(server.config, server.shared))
+    with server:
+        yield server, spy
+
+
+def on_metal(system: Path, server: BenchServer, folder: Path) -> AbstractContextManager[Served]:
+    options = [word for option in OPTIONS for word in ("--set", option)]
+    return serving(system, "--mode", "hardware", *options, folder=folder, more=server.environment)
+
+
+def whole(folder: Path) -> None:
+    """Every product that is there can be read; no temporary file is left."""
+    for path in (folder / "data").rglob("*.fits"):
+        load_matrix(path)
+
+
+def test_the_guardian_flattens_the_mirror_of_an_engine_that_was_killed(system, bench, tmp_path) -> None:
+    server, spy = bench
+    with on_metal(system, server, tmp_path) as served, served.connect(control=True) as client:
+        until_idle(client)
+        run = client.start("docrime", frames=10_000_000)
+        running = client.state.engine_pid
+        wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
+        os.kill(running, signal.SIGKILL)
+        with pytest.raises(
+            CalibrationError, match=r"ended with its engine: the engine .* died; the mirror is flat"
+        ):
+            run.wait(60)
+        assert spy.flat
+        assert client.state.phase is Phase.FAULT
+        assert not segments(pid=running)
+        whole(tmp_path)
+        # The accumulators were kept, and the next engine goes on with them.
+        client.clear_fault()
+        until_idle(client)
+        (state,) = tmp_path.rglob("run.state")
+        kept = load_state_frames(state)
+        result = client.calibrate("docrime", resume=str(state.parent), frames=kept + 500)
+        assert result.frames == kept + 500
+    assert spy.flat
+
+
+def load_state_frames(path: Path) -> int:
+    from escape_hw.io.state_file import load_state
+
+    return int(load_state(path).values["fed"])
+
+
+def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, tmp_path) -> None:
+    server, spy = bench
+    with on_metal(system, server, tmp_path) as served:
+        with served.connect(control=True) as client:
+            until_idle(client)
+            client.start("docrime", frames=10_000_000)
+            wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
+            served.kill()
+            seconds = wait_for(lambda: spy.flat, "the mirror is flat")
+            wait_for(lambda: not served.engines(), "engine and guardian end")
+            wait_for(lambda: not client.connected, "the client notices")
+            with pytest.raises(ServerGone):
+                client.start("docrime")
+        assert seconds < 30
+        # The engine had the time to keep what was measured.
+        (partial,) = tmp_path.rglob("im.partial.fits")
+        assert load_matrix(partial).result.partial
+        served.start()
+        with served.connect() as client:
+            notes = " / ".join(client.state.notes)
+        assert "did not end in order" in notes
+        assert "docrime" in notes
+        assert str(partial.parent) in notes
+
+
+@pytest.mark.slow
+def test_fifty_kills_at_random_moments_of_a_calibration(system, bench, tmp_path) -> None:
+    server, spy = bench
+    rng, found = np.random.default_rng(50), []
+    with on_metal(system, server, tmp_path) as served:
+        for number in range(50):
+            which = "engine" if number % 2 else "front"
+            with served.connect(control=True) as client:
+                if client.state.fault is not None:
+                    client.clear_fault()
+                until_idle(client)
+                client.start("docrime", frames=10_000_000)
+                time.sleep(rng.uniform(0, 4.0))
+                engine = client.state.engine_pid
+                if which == "engine":
+                    os.kill(engine, signal.SIGKILL)
+                    wait_for(lambda: client.state.fault is not None, "the fault is latched")
+                    assert "the mirror is flat" in client.state.fault.reason
+                else:
+                    served.kill()
+                    wait_for(lambda: not served.engines(), "engine and guardian end")
+                    served.start()
+            assert spy.last is None or spy.flat, (number, which)
+            assert not segments(pid=engine), (number, which)
+            whole(tmp_path)
+            found.append(which)
+            print(number, which, "flat", flush=True)
+    assert len(found) == 50

@@ -1,0 +1,275 @@
+"""Clients that misbehave: garbage, floods, half messages, death. They are refused, and nothing stops."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from serving import SYSTEM, Served, serving, until_idle, wait_for
+
+from escape_hw.errors import ConfigError, ServerGone
+from escape_hw.remote import keys
+from escape_hw.remote.address import resolve
+from escape_hw.remote.client import Connection, connect
+from escape_hw.remote.state import Phase
+
+PORT = 30000 + os.getpid() % 20000
+
+
+@pytest.fixture(scope="module")
+def served(system: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("served")
+    with serving(system, "--port", PORT, folder=folder) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def bench(served: Served) -> Iterator[Connection]:
+    with served.connect(control=True) as one:
+        until_idle(one)
+        yield one
+
+
+@pytest.fixture
+def raw(bench: Connection) -> Iterator[zmq.Socket[bytes]]:
+    """A socket that may say anything."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as one:
+        one.setsockopt(zmq.LINGER, 0)
+        one.connect(resolve(SYSTEM).requests)
+        yield one
+
+
+def answer(raw: zmq.Socket[bytes]) -> dict:
+    assert raw.poll(30_000), "no answer"
+    return json.loads(raw.recv_multipart()[-1])
+
+
+@given(parts=st.lists(st.binary(max_size=300), min_size=1, max_size=5))
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_garbage_is_refused_and_counted(raw: zmq.Socket[bytes], parts: list[bytes]) -> None:
+    raw.send_multipart(parts)
+    reply = answer(raw)
+    assert reply["ok"] is False
+    assert reply["error"]["type"] == "RequestRefused"
+
+
+@given(
+    document=st.recursive(
+        st.none() | st.booleans() | st.floats() | st.text(max_size=10) | st.sampled_from(["start", "hello"]),
+        lambda inner: (
+            st.lists(inner, max_size=3)
+            | st.dictionaries(
+                st.sampled_from(["verb", "client", "procedure", "arguments", "x"]), inner, max_size=4
+            )
+        ),
+        max_leaves=8,
+    )
+)
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_documents_that_are_no_requests_are_refused(raw: zmq.Socket[bytes], document: object) -> None:
+    raw.send_multipart([b"1", json.dumps(document).encode()])
+    assert answer(raw)["ok"] is False
+
+
+def test_what_is_too_large_is_refused_or_cut_off(raw: zmq.Socket[bytes], bench: Connection) -> None:
+    before = bench.state.refused
+    raw.send_multipart([b"1", b"x" * 100_000])
+    reply = answer(raw)
+    assert reply["error"]["message"].endswith("100000 bytes; a request has at most 65536")
+    raw.send_multipart([b"2", b"x" * 50_000_000])
+    # The connection was cut; the next request comes over a new one.
+    raw.send_multipart([b"3", b"{}"])
+    assert answer(raw)["ok"] is False
+    wait_for(lambda: bench.state.refused >= before + 2, "refusals are counted")
+    assert bench.state.fault is None
+
+
+def test_who_did_not_say_hello_is_not_heard(raw: zmq.Socket[bytes], bench: Connection) -> None:
+    request = {"verb": "open_loop", "client": bench.client}
+    raw.send_multipart([b"1", json.dumps(request).encode()])
+    assert "say hello first" in answer(raw)["error"]["message"]
+    hello = {"verb": "hello", "client": bench.client, "schema_version": 1, "name": "x", "host": "y", "pid": 1}
+    raw.send_multipart([b"2", json.dumps(hello).encode()])
+    assert "belongs to another connection" in answer(raw)["error"]["message"]
+    raw.send_multipart([b"3", json.dumps({**hello, "client": "0" * 8, "schema_version": 99}).encode()])
+    assert "this server speaks version 1, the client 99" in answer(raw)["error"]["message"]
+
+
+def test_slow_and_half_messages_on_a_plain_socket_stop_nothing(bench: Connection) -> None:
+    lines = []
+    for opening in (b"GET / HTTP/1.1\r\n\r\n", b"\xff\0\0\0\0\0\0\0\x01\x7f", b"\xff"):
+        one = socket.create_connection(("127.0.0.1", PORT))
+        one.sendall(opening)
+        lines.append(one)
+    for _ in range(5):
+        for one in lines:
+            try:
+                one.sendall(b"\x03")
+            except OSError:
+                continue  # cut off, as it should be
+        assert bench.check("docrime", {"frames": 500}).frames == 500
+    for one in lines:
+        one.close()
+
+
+def test_a_flood_leaves_the_server_to_others(raw: zmq.Socket[bytes], bench: Connection) -> None:
+    for _ in range(20_000):
+        raw.send_multipart([b"1", b"nonsense"])  # whose answers nobody takes
+    began = bench.state.serial
+    assert bench.check("docrime", {"frames": 500}).frames == 500
+    wait_for(lambda: bench.state.serial > began + 3, "states go on")
+
+
+CLIENT = """
+import sys, time
+from escape_hw.remote.client import connect
+with connect(sys.argv[1]) as bench:
+    frame, seen = -1, 0
+    while True:
+        sample = bench.latest("frames", frame)
+        if sample is not None:
+            frame, seen = sample.index, seen + 1
+            if seen == 3:
+                print("looking", flush=True)
+        time.sleep(0.005)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_client_that_dies_or_hangs_is_not_noticed_by_the_loop(
+    served: Served, bench: Connection, number: int
+) -> None:
+    if not bench.state.products:
+        bench.calibrate("docrime", frames=1000)
+    bench.close_loop(bench.state.products[-1].name)
+    with subprocess.Popen(
+        [sys.executable, "-c", CLIENT, SYSTEM], env=served.environment, stdout=subprocess.PIPE
+    ) as client:
+        assert client.stdout is not None
+        assert client.stdout.readline() == b"looking\n"
+        before = bench.state.rates.frames
+        client.send_signal(number)
+        wait_for(lambda: bench.state.rates.frames > before + 100, "the loop goes on")
+        began = time.monotonic()
+        with served.connect() as again:
+            again.latest("frames")
+            seconds = time.monotonic() - began
+        client.kill()
+    assert bench.state.loop.closed
+    assert bench.state.fault is None
+    assert seconds < 20, "to look again takes two seconds at most on an idle machine"
+    bench.open_loop()
+    wait_for(lambda: bench.state.phase is Phase.IDLE, "idle")
+
+
+def test_from_afar_the_samples_come_over_the_wire(bench: Connection) -> None:
+    with connect(f"tcp://127.0.0.1:{PORT}") as far:
+        wait_for(lambda: far.latest("frames") is not None, "a frame")
+        sample = far.latest("frames")
+        assert sample is not None
+        assert sample.data.shape == (200, 200)
+        assert sample.meta["top"] == 1023
+        assert far.geometry().n_modes == 30
+        with pytest.raises(ConfigError):
+            far.check("nothing")
+        wait_for(lambda: far.connected and far.state.serial > 1, "events")
+
+
+def test_nobody_is_found_where_no_server_is(served: Served) -> None:
+    with pytest.raises(
+        ServerGone, match=r"no server of 'elsewhere' runs here .*start one with 'escape serve"
+    ):
+        connect("elsewhere")
+    with pytest.raises(ConfigError, match="is no address"):
+        connect("http://127.0.0.1:80")
+    with pytest.raises(ServerGone, match="no answer to 'hello'"):
+        connect("tcp://127.0.0.1:9")
+
+
+@pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A home without keys."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    return tmp_path
+
+
+def test_other_machines_need_keys(system: Path, escape, environment, folders: Path) -> None:
+    own = {**environment, "XDG_CONFIG_HOME": str(folders / "config"), "XDG_RUNTIME_DIR": str(folders)}
+    call = [sys.executable, "-c", "from escape_hw.cli import main; main()"]
+    folders.chmod(0o700)
+
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([*call, *words], env=own, capture_output=True, text=True, timeout=120)
+
+    refused = run("serve", str(system), "--port", "40001", "--bind", "0.0.0.0")
+    assert refused.returncode == 2
+    assert "make them with 'escape keys make'" in refused.stderr
+    made = json.loads(run("keys", "make", "--json").stdout)
+    assert len(made["public"]) == 40
+    assert (Path(made["folder"]) / "own.secret").stat().st_mode & 0o777 == 0o600
+    assert run("keys", "make", "--json").stdout.count(made["public"]) == 1, "keys stay"
+    refused = run("serve", str(system), "--port", "40001", "--bind", "0.0.0.0")
+    assert "no client is let in; add one with 'escape keys allow NAME KEY'" in refused.stderr
+    assert run("keys", "allow", "me", "short").returncode == 2
+    assert run("keys", "allow", "../me", made["public"]).returncode == 2
+    assert run("keys", "allow", "me", made["public"]).returncode == 0
+    assert json.loads(run("keys", "list", "--json").stdout)["allowed"] == {"me": made["public"]}
+    assert run("keys", "forget", "me").returncode == 0
+    assert run("keys", "forget", "me").returncode == 2
+
+
+def test_without_an_allowed_key_a_client_gets_nothing(system: Path, folders: Path) -> None:
+    own, port = keys.make_keys(), PORT + 10
+    keys.allow("first", own.public.decode())
+    keys.trust("127.0.0.2", own.public.decode())
+    more = {"XDG_CONFIG_HOME": os.environ["XDG_CONFIG_HOME"]}
+    address = f"tcp://127.0.0.2:{port}"
+    with (
+        serving(system, "--port", port, "--bind", "0.0.0.0", folder=folders / "s", more=more) as served,
+        served.connect() as local,
+    ):
+        until_idle(local)
+        with connect(address) as far:
+            wait_for(lambda: far.latest("frames") is not None, "a frame")
+        stranger = zmq.curve_keypair()
+        for public, secret, server in (
+            (*stranger, own.public),  # a key that is not allowed
+            (own.public, own.secret, stranger[0]),  # the wrong server
+            (None, None, None),  # no key at all
+        ):
+            assert heard(address, public, secret, server) == 0
+        # Whom the operator lets in is in at once, and out again.
+        keys.allow("stranger", stranger[0].decode())
+        assert heard(address, *stranger, own.public) > 0
+        keys.forget("stranger")
+        assert heard(address, *stranger, own.public) == 0
+        assert local.state.fault is None
+
+
+def heard(address: str, public: bytes | None, secret: bytes | None, server: bytes | None) -> int:
+    """Messages that a client with these keys gets in a while, asking and listening."""
+    host, _, port = address.rpartition(":")
+    with zmq.Context() as context:
+        asking, listening = context.socket(zmq.DEALER), context.socket(zmq.SUB)
+        listening.setsockopt(zmq.SUBSCRIBE, b"")
+        for one, at in ((asking, address), (listening, f"{host}:{int(port) + 1}")):
+            one.setsockopt(zmq.LINGER, 0)
+            if public is not None:
+                one.curve_publickey, one.curve_secretkey, one.curve_serverkey = public, secret, server
+            one.connect(at)
+        asking.send_multipart([b"1", b"{}"])
+        found = sum(bool(one.poll(1500)) for one in (asking, listening))
+        asking.close()
+        listening.close()
+    return found

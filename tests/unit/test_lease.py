@@ -1,0 +1,98 @@
+"""One client may write; it must live, and nobody else can speak for it."""
+
+from __future__ import annotations
+
+import pytest
+
+from escape_hw.errors import LeaseHeld, RequestRefused
+from escape_hw.remote.requests import Hello
+from escape_hw.server.lease import MOST_CLIENTS, Client, LeaseBook
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def book(clock: Clock) -> LeaseBook:
+    return LeaseBook(5.0, clock)
+
+
+def comes(book: LeaseBook, number: int, route: bytes | None = None) -> Client:
+    client = f"{number:08x}-0000"
+    hello = Hello(client=client, schema_version=1, name=f"client {number}", host="here", pid=number)
+    route = b"r%d" % number if route is None else route
+    book.greet(hello, route)
+    return book.hear(client, route)
+
+
+def test_the_second_is_told_who_has_it(book: LeaseBook) -> None:
+    one, other = comes(book, 1), comes(book, 2)
+    assert book.acquire(one, False).name == "client 1"
+    with pytest.raises(LeaseHeld, match=r"client 1 on here \(process 1\) has had the right to write since"):
+        book.acquire(other, False)
+    book.require(one)
+    with pytest.raises(LeaseHeld):
+        book.require(other)
+    # Asked again, the holder keeps it.
+    assert book.acquire(one, False).name == "client 1"
+
+
+def test_it_is_taken_over_on_request_and_given_back(book: LeaseBook) -> None:
+    one, other = comes(book, 1), comes(book, 2)
+    book.acquire(one, False)
+    book.acquire(other, True)
+    book.release(one)  # what it has not, it cannot give back
+    assert book.lease is not None
+    assert book.lease.name == "client 2"
+    book.release(other)
+    assert book.lease is None
+    with pytest.raises(LeaseHeld, match="nobody has the right to write"):
+        book.require(one)
+
+
+def test_a_holder_that_is_silent_loses_it(book: LeaseBook, clock: Clock) -> None:
+    one = comes(book, 1)
+    book.acquire(one, False)
+    clock.now += 5.0
+    book.expire()
+    assert book.lease is not None
+    book.hear(one.hello.client, one.route)
+    clock.now += 5.1
+    book.expire()
+    assert book.lease is None
+    clock.now += 3.0
+    assert book.lost_for() == pytest.approx(3.0)
+    book.acquire(comes(book, 2), False)
+    assert book.lost_for() == 0.0
+
+
+def test_nobody_speaks_for_another(book: LeaseBook) -> None:
+    one = comes(book, 1)
+    book.acquire(one, False)
+    with pytest.raises(RequestRefused, match="belongs to another connection"):
+        comes(book, 1, b"somebody else")
+    with pytest.raises(RequestRefused, match="say hello first"):
+        book.hear(one.hello.client, b"somebody else")
+    with pytest.raises(RequestRefused, match="say hello first"):
+        book.hear("0000000f-0000", b"x")
+
+
+def test_too_many_are_refused_until_some_are_forgotten(book: LeaseBook, clock: Clock) -> None:
+    for number in range(MOST_CLIENTS):
+        comes(book, number)
+    assert book.count == MOST_CLIENTS
+    with pytest.raises(RequestRefused, match="clients are here already"):
+        comes(book, MOST_CLIENTS)
+    clock.now += 61
+    book.expire()
+    assert book.count == 0
+    comes(book, MOST_CLIENTS)

@@ -1,0 +1,133 @@
+"""A run folder or a product as a source for panels."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+import recorded_run
+
+from escape_gui.library import Library
+from escape_gui.replay.source import REASON, ReplaySource
+from escape_hw.api.registration import TO_PLAIN
+from escape_hw.errors import ConfigError, ProductError
+from escape_hw.remote.source import STREAMS
+from escape_hw.remote.state import Phase, Product
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return recorded_run.make_run(tmp_path_factory.mktemp("recorded") / "run")
+
+
+@pytest.fixture
+def library():
+    library = Library()
+    yield library
+    library.close()
+
+
+def read_all(library):
+    while library.reading:
+        pass
+    return library.shelf
+
+
+def test_a_run_fills_the_streams(folder):
+    source = ReplaySource(folder)
+    truth = recorded_run.calibration("escape")
+    held = {entry.name for entry in source.state.streams}
+    assert held <= set(STREAMS)
+    assert {"matrix", "valid", "registration", "gains", "psf", "model_psf", "commands"} <= held
+    np.testing.assert_array_equal(source.latest("matrix").data, truth.measured.data)
+    np.testing.assert_array_equal(source.latest("valid").data, truth.grid.valid)
+    last = source.latest("registration").data[-1] / TO_PLAIN
+    np.testing.assert_allclose(last, truth.registration.registration.to_array())
+    np.testing.assert_allclose(source.latest("registration_sigma").data / TO_PLAIN, truth.registration.sigma)
+    assert source.latest("gains_rounds").data.shape == (2, recorded_run.N_MODES)
+    assert source.latest("slopes") is None
+    geometry = source.geometry()
+    assert len(geometry.outlines_px) == truth.grid.n_valid
+    assert len(geometry.layout) == 11
+    state = source.state
+    assert (state.system, state.simulated, state.phase) == ("razor-shwfs", True, Phase.STOPPED)
+    assert state.last.document["converged"] is True
+    assert [one.name for one in state.products][-1] == "escape"
+    assert any("product escape" in line.text for line in source.log_after(-1))
+    assert source.log_after(10_000) == ()
+
+
+def test_a_run_goes_by_step_by_step(folder):
+    source = ReplaySource(folder)
+    seen = source.latest("registration").index
+    assert source.latest("registration", seen) is None
+    source.seek(0.5)
+    half = source.latest("registration", seen)
+    assert len(half.data) == 9
+    assert np.isnan(source.latest("registration_sigma").data).all()
+    assert len(source.latest("gains_rounds").data) == 1
+    assert len(source.latest("registration_track").data) == 25
+    source.seek(-3)
+    assert len(source.latest("registration").data) == 1
+    source.seek(7)
+    assert len(source.latest("registration", half.index).data) == source.latest("step_norm").data.size == 18
+
+
+def test_a_single_product_is_a_run_of_its_own(folder):
+    source = ReplaySource(folder / "escape.fits")
+    assert source.state.last.document["method"] == "escape"
+    assert source.latest("registration") is not None
+    assert ReplaySource(folder / "gains.fits").latest("gains").data.shape == (recorded_run.N_MODES,)
+    assert ReplaySource(folder / "loop.fits").state.loop.strehl == pytest.approx(0.62)
+
+
+def test_nothing_can_be_started(folder):
+    source = ReplaySource(folder)
+    assert source.procedures() == ()
+    with pytest.raises(ConfigError, match="recording"):
+        source.check("escape", {})
+    assert "recording" in REASON
+
+
+def test_what_is_no_run_is_refused(folder, tmp_path):
+    with pytest.raises(ProductError, match=r"result\.json"):
+        ReplaySource(tmp_path)
+    broken = tmp_path / "im.fits"
+    broken.write_bytes((folder / "escape.fits").read_bytes()[:-2880])
+    with pytest.raises(ProductError, match=r"im\.fits"):
+        ReplaySource(broken)
+
+
+def test_the_library_reads_each_matrix_once(folder, library):
+    source = ReplaySource(folder)
+    library.want(source.state.products)
+    shelf = read_all(library)
+    assert list(shelf.matrices) == ["push-pull", "DO-CRIME", "ESCAPE"]
+    assert list(shelf.gains) == ["ESCAPE", "DO-CRIME"]
+    library.want(source.state.products)
+    assert library.shelf is shelf
+
+
+def test_the_library_tells_what_it_cannot_read(folder, library, tmp_path):
+    damaged = tmp_path / "bad.fits"
+    shutil.copy(folder / "escape.fits", damaged)
+    damaged.write_bytes(damaged.read_bytes()[:-2880])
+    names = (("good", folder / "push_pull.fits"), ("bad", damaged), ("gone", tmp_path / "no.fits"))
+    library.want(tuple(Product(name=name, kind="matrix", path=str(path)) for name, path in names))
+    shelf = read_all(library)
+    assert list(shelf.matrices) == ["push-pull"]
+    assert set(shelf.troubles) == {"bad", "gone"}
+    assert "no.fits" in shelf.troubles["gone"]
+
+
+def test_a_product_written_again_is_read_again(folder, library, tmp_path):
+    path = tmp_path / "im.fits"
+    shutil.copy(folder / "push_pull.fits", path)
+    product = (Product(name="im", kind="matrix", path=str(path)),)
+    library.want(product)
+    assert list(read_all(library).matrices) == ["push-pull"]
+    path.unlink()
+    shutil.copyfile(folder / "docrime_whitened.fits", path)
+    library.want(product)
+    assert list(read_all(library).matrices) == ["DO-CRIME"]

@@ -1,0 +1,85 @@
+"""The watchdog's verdicts, on states as the engine tells them."""
+
+from __future__ import annotations
+
+import pytest
+
+from escape_hw.config.server_models import ServerSection
+from escape_hw.remote.state import Fault, LoopState, Mirror, Rates, State
+from escape_hw.server.watchdog import Verdict, Watchdog
+
+
+class Engine:
+    """Tells a state four times a second."""
+
+    def __init__(self) -> None:
+        self.now, self.frames = 0.0, 0
+        self.dog = Watchdog(ServerSection(), lambda: self.now)
+
+    def tell(
+        self, seconds: float, *, closed: bool = True, frames: int = 100, residual: float = 50.0,
+        clipped: float = 0.0, fault: Fault | None = None,
+    ) -> Verdict | None:  # fmt: skip
+        """So many seconds alike; the first verdict."""
+        for _ in range(round(4 * seconds)):
+            self.now += 0.25
+            self.frames += frames
+            state = State(
+                rates=Rates(frames=self.frames), mirror=Mirror(clipped=clipped), fault=fault,
+                loop=LoopState(closed=closed, residual_nm=residual),
+            )  # fmt: skip
+            if (verdict := self.dog.judge(state)) is not None:
+                return verdict
+        return None
+
+
+@pytest.fixture
+def engine() -> Engine:
+    return Engine()
+
+
+def test_a_good_loop_is_left_alone_for_an_hour(engine: Engine) -> None:
+    for _ in range(60):
+        assert engine.tell(50, residual=40) is None
+        # A gust, and some actuators at their limits for a moment.
+        assert engine.tell(9, residual=110, clipped=0.1) is None
+        assert engine.tell(0.8, clipped=0.9) is None
+
+
+def test_no_frames_in_closed_loop(engine: Engine) -> None:
+    assert engine.tell(5) is None
+    assert engine.tell(2, frames=0) is None
+    verdict = engine.tell(0.5, frames=0)
+    assert verdict is not None
+    assert verdict.reason.startswith("no frame for 2.2 s in closed loop (limit 2 s)")
+    assert "camera" in verdict.way_out
+
+
+def test_no_frames_while_nothing_is_closed_is_no_fault(engine: Engine) -> None:
+    assert engine.tell(600, closed=False, frames=0) is None
+    assert engine.tell(1.0) is None
+
+
+def test_saturated_actuators(engine: Engine) -> None:
+    assert engine.tell(5) is None
+    verdict = engine.tell(2, clipped=0.35)
+    assert verdict is not None
+    assert verdict.reason.startswith("35 % of the actuators at their limits for 1.2 s")
+
+
+def test_a_residual_that_grows(engine: Engine) -> None:
+    assert engine.tell(10, residual=50) is None
+    verdict = engine.tell(3, residual=300)
+    assert verdict is not None
+    assert "grew to 300 nm, 6.0 times the usual 50 nm" in verdict.reason
+
+
+def test_a_residual_before_the_loop_was_closed_does_not_count(engine: Engine) -> None:
+    assert engine.tell(10, residual=5) is None
+    assert engine.tell(1, closed=False, residual=0) is None
+    assert engine.tell(10, residual=300) is None
+
+
+def test_what_is_latched_is_not_judged_again(engine: Engine) -> None:
+    assert engine.tell(5) is None
+    assert engine.tell(60, frames=0, clipped=1.0, fault=Fault(reason="x", at_utc="")) is None

@@ -1,0 +1,96 @@
+"""The guardian beside an adaptive secondary: a floating shell is rested, a resting one let lie."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from asm_bench import emulator, port_of, wait_for
+
+from escape_hw.api.adaptive_secondary import ShellState
+from escape_hw.config.load import load_system
+from escape_hw.server.guardian import Incident, Watch
+from escape_hw.streams.segments import process_start
+
+#: What an engine does, as far as its guardian is concerned: holds the mirror and the pipe, and a shape.
+_ENGINE = """
+import sys, time
+import numpy as np
+from escape_hw.config.load import load_text
+from escape_drivers.asm_driver import make_asm
+mirror = make_asm("dm", load_text(open(sys.argv[1]).read()), {}).open()
+shape = np.zeros(336); shape[100] = 0.01
+mirror.send(shape)
+print("shaped", flush=True)
+sys.stdin.readline()
+mirror.close()
+import os
+os.write(int(sys.argv[2]), b"bye")
+"""
+
+
+def guarded(tmp_path: Path, port: int, end: str) -> Incident | None:
+    """Run an engine of that kind until it is killed or says goodbye; what its guardian wrote."""
+    words = [
+        "devices.dm.mode=hardware", f"devices.dm.options.port={port}", "devices.dm.options.reply_s=10",
+        "devices.dm.options.heartbeat_s=0.05",
+    ]  # fmt: skip
+    config = tmp_path / "maps.toml"
+    config.write_text(load_system("maps-nir", overrides=words).to_toml())
+    watched, held = os.pipe()
+    engine = subprocess.Popen(
+        [sys.executable, "-c", _ENGINE, str(config), str(held)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=(held,),
+    )  # fmt: skip
+    watch = Watch(
+        config_text=config.read_text(), incidents=str(tmp_path), pid=engine.pid,
+        started=process_start(engine.pid) or 0,
+    )  # fmt: skip
+    guardian = subprocess.Popen(
+        [sys.executable, "-m", "escape_hw.server.guardian", str(watched)],
+        stdin=subprocess.PIPE, text=True, pass_fds=(watched,),
+    )  # fmt: skip
+    os.close(held)
+    os.close(watched)
+    assert engine.stdout is not None
+    assert engine.stdout.readline() == "shaped\n"
+    if end == "kill":
+        engine.kill()
+        engine.communicate()
+        guardian.communicate(watch.model_dump_json(), timeout=120)
+    else:
+        engine.communicate("\n", timeout=60)
+        guardian.communicate(watch.model_dump_json(), timeout=120)
+    assert guardian.returncode == 0
+    found = list(tmp_path.glob("*.incident.json"))
+    return Incident.model_validate_json(found[0].read_bytes()) if found else None
+
+
+def test_a_floating_shell_is_flattened_and_rested(tmp_path: Path) -> None:
+    with emulator(hold=60, rest=120) as made:
+        incident = guarded(tmp_path, port_of(made), "kill")
+        assert incident is not None
+        assert incident.flat is True
+        assert incident.mirror == "the mirror is flat"
+        wait_for(lambda: made.body.shell.state is ShellState.RESTED, "the shell is rested")
+
+
+def test_a_shell_that_went_to_rest_by_itself_is_not_lifted(tmp_path: Path) -> None:
+    states = []
+    with emulator(hold=0.1, rest=0.2) as made:
+        port = port_of(made)
+        step = made.body.ask_state
+        made.body.ask_state = lambda wanted, now: (states.append(wanted), step(wanted, now))[1]
+        incident = guarded(tmp_path, port, "kill")
+        assert incident is not None
+        assert incident.flat is True
+        assert made.body.shell.state is ShellState.RESTED
+    lifted = states.index(ShellState.RUNNING)
+    assert ShellState.RUNNING not in states[lifted + 1 :]
+
+
+def test_after_a_goodbye_it_does_nothing(tmp_path: Path) -> None:
+    with emulator(hold=60, rest=120) as made:
+        assert guarded(tmp_path, port_of(made), "goodbye") is None

@@ -1,0 +1,112 @@
+"""A loop of the small bench, recorded, and carried to AOT and to milk and back from the command line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_system import SMALL
+from streams import published
+
+from escape_hw.api.procedure import run
+from escape_hw.bench import build_bench
+from escape_hw.calibration.push_pull import push_pull
+from escape_hw.cli import main
+from escape_hw.config.load import load_system
+from escape_hw.io.fits import load_matrix, save_matrix
+from escape_hw.io.interchange.milk_stream import MilkStream
+from escape_hw.io.provenance import Provenance
+from escape_hw.io.telemetry import load_telemetry
+
+SETS = [word for one in SMALL for word in ("--set", one)]
+Command = Callable[..., tuple[int, dict[str, Any]]]
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Run ``escape`` with ``--json``; exit code and document."""
+
+    def call(*words: object) -> tuple[int, dict[str, Any]]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main([*map(str, words), "--json"])
+        return int(ended.value.code or 0), json.loads(capsys.readouterr().out)
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def im(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A matrix of the small bench."""
+    config = load_system("razor-shwfs", overrides=SMALL)
+    with build_bench(config) as bench:
+        assert bench.screen is not None
+        bench.screen.set(inserted=False)
+        result = run(push_pull(bench, frames=4))
+    folder = tmp_path_factory.mktemp("im")
+    return save_matrix(folder / "im.fits", result, Provenance(config.to_toml(), "kl"))
+
+
+def test_a_recorded_loop_goes_to_aot_and_back(tmp_path: Path, im: Path, command: Command) -> None:
+    pytest.importorskip("aotpy", reason="needs aotpy: pip install 'escape-hw[interchange]'")
+    code, told = command(
+        "loop", "razor-shwfs", "--im", im, "--frames", 300, "--record", 200, "--no-strehl",
+        "--out", tmp_path / "loop", *SETS,
+    )  # fmt: skip
+    assert code == 0, told
+    record = load_telemetry(told["products"]["telemetry"]).result
+    assert record.slopes.shape == (200, load_matrix(im).matrix.n_slopes)
+    assert record.rate_hz == pytest.approx(500, rel=0.01)
+    # In closed loop the next command holds what the slopes say of the last.
+    assert np.abs(record.commands).max() > 1e-3
+    assert not np.array_equal(record.commands[-1], np.zeros(37)), "the flat shape after the end is no answer"
+    aot = tmp_path / "run.fits"
+    code, told = command("export", "aot", im, "--telemetry", told["products"]["telemetry"], "--out", aot)
+    assert code == 0, told
+    back, moves = tmp_path / "back.fits", tmp_path / "moves.fits"
+    code, told = command("import", "aot", aot, "razor-shwfs", "--out", back, "--telemetry", moves, *SETS)
+    assert code == 0, told
+    np.testing.assert_array_equal(load_matrix(back).matrix.data, load_matrix(im).matrix.data)
+    np.testing.assert_array_equal(load_telemetry(moves).result.slopes, record.slopes)
+    np.testing.assert_allclose(load_telemetry(moves).result.commands, record.commands, atol=1e-15)
+    code, told = command("show", moves)
+    assert (code, told["frames"]) == (0, 200)
+    code, told = command("import", "aot", aot, "razor-shwfs", "--out", back)
+    assert code == 2
+    assert "has 37 actuators, that of system 'razor-shwfs' 97" in told["error"]["message"]
+
+
+def test_a_matrix_goes_to_milk_and_streams_come_back(
+    tmp_path: Path, im: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
+    code, told = command("export", "milk", im, "razor")
+    assert code == 0, told
+    result = load_matrix(im).result
+    wfs, dm = MilkStream.open("razor_wfs"), MilkStream.open("razor_dm")
+    assert wfs.shape == (30, 24, 12)
+    assert dm.shape == (30, 7, 7)
+    mask = np.vstack([result.matrix.valid, result.matrix.valid])
+    np.testing.assert_array_equal(wfs.latest().data[:, mask].T, result.matrix.data)
+    wfs.close()
+    dm.close()
+    np.save(tmp_path / "array.npy", np.arange(6, dtype=np.float32).reshape(2, 3))
+    assert command("export", "milk", tmp_path / "array.npy", "little")[0] == 0
+    stream = MilkStream.open("little")
+    with published(stream, lambda number: np.full((2, 3), number)):
+        code, told = command("import", "milk", "little", "--frames", 5, "--out", tmp_path / "little.npz")
+    stream.close()
+    assert code == 0, told
+    with np.load(tmp_path / "little.npz") as found:
+        assert (np.diff(found["count"]) >= 1).all()
+        assert told["missed"] == np.ptp(found["count"]) + 1 - 5
+        np.testing.assert_array_equal(found["data"][1:, 0, 0], found["count"][1:] - 1)
+    code, told = command("import", "milk", "nobody", "--out", tmp_path / "x.npz")
+    assert code == 2
+    assert "MILK_SHM_DIR" in told["error"]["message"]
+    np.save(tmp_path / "text.npy", np.array(["a"]))
+    assert command("export", "milk", tmp_path / "text.npy", "words")[0] == 2

@@ -1,0 +1,170 @@
+"""Streams of pyRTC and of milk as cameras and mirrors: the contract, and what is their own."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import time
+from collections.abc import Iterator
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from streams import SHAPE, camera_config, create, mirror_config, published, ramp
+
+from escape_hw.config.load import load_system
+from escape_hw.config.models import SystemConfig
+from escape_hw.config.registry import device_factory
+from escape_hw.errors import ConfigError, DeviceError, FrameTimeout
+from escape_hw.testing import Check, Factory, parametrize_device_checks
+
+KINDS = ["milk", *(["pyrtc"] if importlib.util.find_spec("pyshmem") else [])]
+TAG = f"escape_test_{os.getpid()}"
+
+
+@cache
+def configuration() -> SystemConfig:
+    return load_system("razor-shwfs")
+
+
+def make(kind: str, key: str, stream: str = "", **options: Any) -> Any:
+    """A device on a stream, not open."""
+    if key == "wfs":
+        config = camera_config(configuration(), stream or f"{TAG}_camera")
+        return device_factory(f"{kind}-camera", hardware=True)(key, config, {})
+    config = mirror_config(configuration(), stream or f"{TAG}_mirror", **options)
+    return device_factory(f"{kind}-mirror", hardware=True)(key, config, {})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _streams(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """One running camera and one mirror of each kind."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MILK_SHM_DIR", str(tmp_path_factory.mktemp("shm")))
+        made: list[Any] = []
+        try:
+            running = []
+            for kind in KINDS:
+                camera = create(kind, f"{TAG}_camera", SHAPE, "u2")
+                mirror = create(kind, f"{TAG}_mirror", (97,), "f4")
+                made += [camera, mirror]
+                running.append(published(camera, ramp))
+                running[-1].__enter__()
+            yield
+        finally:
+            for one in running:
+                one.__exit__(None, None, None)
+            for stream in made:
+                stream.unlink()
+                stream.close()
+
+
+DEVICES: dict[str, Factory] = {
+    f"{kind}-{key}": partial(make, kind, key) for kind in KINDS for key in ("dm", "wfs")
+}
+
+
+@parametrize_device_checks(DEVICES)
+def test_contract(factory: Factory, check: Check) -> None:
+    check(factory)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_are_those_written_and_gaps_are_counted(kind: str) -> None:
+    with make(kind, "wfs") as camera:
+        first = camera.next_frame(2.0)
+        time.sleep(0.03)
+        second = camera.next_frame(2.0)
+        for frame in (first, second):
+            region = camera.settings.region
+            part = ramp(frame.index)[region.y : region.y + region.height, region.x : region.x + region.width]
+            np.testing.assert_array_equal(frame.data, part)
+        assert camera.status().lost == second.index - first.index - 1 > 0
+        assert camera.info.serial == f"stream {TAG}_camera"
+        assert not camera.info.simulated
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_rate_is_the_streams_own(kind: str) -> None:
+    with make(kind, "wfs") as camera:
+        assert camera.settings.frame_rate_hz == pytest.approx(250, rel=0.2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mirror_writes_its_commands_in_the_streams_units(kind: str) -> None:
+    name = f"{TAG}_map"
+    stream: Any = create(kind, name, (11, 11), "f4")
+    try:
+        command = np.linspace(-0.5, 0.5, 97)
+        with make(kind, "dm", name, scale=2.0, simulated=True) as dm:
+            before = stream.count
+            dm.send(command)
+            assert stream.count == before + 1
+            layout = configuration().devices.dm.actuator_map()
+            np.testing.assert_allclose(stream.latest().data[layout], 2 * command, rtol=1e-6)
+            assert not stream.latest().data[~layout].any()
+            assert dm.info.simulated
+        assert not stream.latest().data.any(), "closing must leave the mirror flat"
+    finally:
+        stream.unlink()
+        stream.close()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("key", ["wfs", "dm"])
+def test_what_does_not_fit_is_refused_by_name(kind: str, key: str) -> None:
+    with pytest.raises(DeviceError, match=r"not there|cannot be opened"):
+        make(kind, key, f"{TAG}_nobody").open()
+    stream: Any = create(kind, f"{TAG}_odd", (7, 5), "f4")
+    try:
+        with pytest.raises(DeviceError, match=r"7 pixels|shape \(7, 5\)"):
+            make(kind, key, f"{TAG}_odd").open()
+    finally:
+        stream.unlink()
+        stream.close()
+    with pytest.raises(ConfigError, match="names no stream"):
+        make(kind, key, " ").open()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_silent_stream_times_out_and_says_who_to_ask(kind: str) -> None:
+    name = f"{TAG}_silent"
+    stream: Any = create(kind, name, SHAPE, "u2")
+    try:
+        with (
+            make(kind, "wfs", name) as camera,
+            pytest.raises(FrameTimeout, match=f"who writes the stream '{name}'"),
+        ):
+            camera.next_frame(0.05)
+    finally:
+        stream.unlink()
+        stream.close()
+
+
+def test_signed_and_floating_streams_become_counts() -> None:
+    name = f"{TAG}_dark"
+    stream = create("milk", name, SHAPE, "i4")
+    try:
+        frame = np.full(SHAPE, -3)
+        frame[10, 20] = 5000
+        config = camera_config(configuration(), name)
+        config.devices.wfs.options["offset"] = 10.0
+        camera: Any = device_factory("milk-camera")("wfs", config, {})
+        with camera, published(stream, lambda _: frame):
+            got = camera.next_frame(2.0)
+            assert got.data[6, 12] == 1023
+            assert got.n_saturated == 1
+            assert (np.delete(got.data.ravel(), 6 * 32 + 12) == 7).all()
+    finally:
+        stream.close()
+
+
+def test_the_folder_of_images_is_milks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from escape_hw.io.interchange.milk_layout import shm_folder
+
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
+    assert shm_folder() == tmp_path
+    monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path / "nowhere"))
+    assert shm_folder() != tmp_path / "nowhere"
