@@ -42,7 +42,7 @@ def sweep_section(document: Mapping[str, Any]) -> str:
         )
         parts.append(html.figure("sweepall", figures_sweep.strehl_against(sweep), caption))
     if document["at_random"]:
-        what = "At the same random parameters, where both loops stayed closed:"
+        what = "At the same random parameters, where both loops were stable:"
         parts.append(html.notes([f"{what} {one['text']}" for one in document["at_random"]]))
     return html.section("Sweep", *parts)
 

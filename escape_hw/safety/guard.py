@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from escape_hw.errors import CommandRejected
-from escape_hw.safety.legal import legal
 from escape_hw.safety.limits import MirrorLimits
 
 #: Head-room for rounding, so that a command at a limit is not touched again.
@@ -98,6 +97,10 @@ class CommandGuard:
         n_enabled = int(self._enabled.sum())
         self._averaging = self._enabled / n_enabled if n_enabled else np.zeros(n_act)
         self.last = _frozen(np.zeros(n_act))
+        # Imported here: it brings a compiler along, which those who only read a configuration do without.
+        from escape_hw.safety.legal import legal
+
+        self._legal = legal
         # Stroke holds exactly, the other rules to within rounding; what is off is infinite.
         off, mean = math.inf, limits.max_mean is not None
         neighbours = limits.max_neighbour is not None
@@ -174,7 +177,7 @@ class CommandGuard:
 
     def obeys(self, shape: NDArray[np.float64]) -> bool:
         """True when ``shape`` obeys every rule, counted from the last shape sent."""
-        return bool(legal(shape, self.last, *self._rules))
+        return bool(self._legal(shape, self.last, *self._rules))
 
     def breach(self, shape: NDArray[np.float64]) -> str | None:
         """The first rule that ``shape`` breaks by itself (slew apart), in words, or ``None``."""

@@ -56,7 +56,7 @@ class SweepResult:
     """Everything a sweep found.
 
     ``comparisons`` are between arms at their own best parameters, ``at_random`` between arms at the same
-    random ones, where both loops stayed closed; ``importance`` counts diverged loops with a Strehl ratio
+    random ones, where both loops were stable; ``importance`` counts diverged loops with a Strehl ratio
     of 0, ``importance_closed`` leaves them out.
     """
 
@@ -96,7 +96,7 @@ def conclude(sweep: Sweep, run: SweepRun, margin: float = MARGIN) -> SweepResult
             best[arm.label] = _best(final)
     pairs = list(_pairs(sweep.arms))
     final_of = _by_air(r for r in run.records if r.slot.stage == FINAL)
-    drawn_of = _by_air(r for r in run.records if r.slot.stage == EXPLORE and r.merit > 0)
+    drawn_of = _by_air(r for r in run.records if r.slot.stage == EXPLORE and r.outcome["stable"])
     same = _same_parameters(run.records)
     return SweepResult(
         sweep, run, margin, best,

@@ -227,7 +227,7 @@ def _with_workers(
                     _land(sweep, store, claim, future)
                     left.discard(claim.slot)
                     flight.in_a_row = 0
-            if died:
+            if died or (flight.of and workers.gone):
                 _again(sweep, workers, flight)
             store.beat()
             if report.due():

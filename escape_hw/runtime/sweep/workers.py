@@ -43,6 +43,11 @@ class Workers(Protocol):
         """Whether an ended future says nothing of its trial: who ran it has died."""
         ...
 
+    @property
+    def gone(self) -> bool:
+        """Whether nobody is left who could end a future."""
+        ...
+
     def heal(self) -> None:
         """Replace what has died; futures from before are worthless."""
         ...
@@ -90,6 +95,11 @@ class LocalWorkers:
     def lost(self, future: Future[dict[str, Any]]) -> bool:
         """See :class:`Workers`."""
         return future.cancelled() or isinstance(future.exception(), BrokenProcessPool)
+
+    @property
+    def gone(self) -> bool:
+        """See :class:`Workers`; a pool that breaks ends its futures itself."""
+        return False
 
     def heal(self) -> None:
         """See :class:`Workers`."""
@@ -161,16 +171,27 @@ class DaskWorkers:
         """Run a trial."""
         if self._executor is None:
             raise RuntimeError("the workers are closed")
-        return self._executor.submit(run_trial, task)
+        try:
+            return self._executor.submit(run_trial, task)
+        except self._dask.client.ClosedClientError as error:
+            future: Future[dict[str, Any]] = Future()
+            future.set_exception(error)
+            return future
 
     def lost(self, future: Future[dict[str, Any]]) -> bool:
         """See :class:`Workers`."""
         if future.cancelled():
             return True
-        error = future.exception()
-        if isinstance(error, self._dask.KilledWorker | self._dask.comm.CommClosedError):
-            return True
-        return isinstance(error, CancelledError) or type(error).__name__ == "FutureCancelledError"
+        gone = (
+            self._dask.KilledWorker, self._dask.comm.CommClosedError, self._dask.client.ClosedClientError,
+            self._dask.client.FutureCancelledError, CancelledError,
+        )  # fmt: skip
+        return isinstance(future.exception(), gone)
+
+    @property
+    def gone(self) -> bool:
+        """See :class:`Workers`."""
+        return self._client is None or self._client.status in ("closing", "closed")
 
     def heal(self) -> None:
         """See :class:`Workers`."""
