@@ -67,6 +67,8 @@ def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         operator.settle(1.5)
         QTest.mouseRelease(loop.close_button, Qt.MouseButton.LeftButton)
         operator.until(lambda: source.source.state.phase is Phase.LOOP, "the loop is closed")
+        # The log names folders of this machine.
+        panels["log"].search.setText("loop")
         operator.settle(30.0)
         picture(operator, "operate")
         window.actions_by_name["open_loop"].trigger()
