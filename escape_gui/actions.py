@@ -91,7 +91,7 @@ ACTIONS: tuple[Action, ...] = (
         "&File",
         "Save panel as &picture…",
         "Save the panel with the focus as PNG.",
-        lambda w: w.save_panel("png"),
+        lambda w: w.saver.panel("png"),
         ("Ctrl+S",),
     ),
     Action(
@@ -99,7 +99,7 @@ ACTIONS: tuple[Action, ...] = (
         "&File",
         "Save panel as &table…",
         "Save the numbers of the panel with the focus as CSV.",
-        lambda w: w.save_panel("csv"),
+        lambda w: w.saver.panel("csv"),
         ("Ctrl+Alt+S",),
     ),
     Action(
@@ -107,7 +107,7 @@ ACTIONS: tuple[Action, ...] = (
         "&File",
         "Save panel as &FITS…",
         "Save the arrays of the panel with the focus as FITS.",
-        lambda w: w.save_panel("fits"),
+        lambda w: w.saver.panel("fits"),
         ("Ctrl+Shift+S",),
     ),
     Action(
@@ -115,7 +115,7 @@ ACTIONS: tuple[Action, ...] = (
         "&File",
         "Save &window as picture…",
         "Save the whole window as PNG.",
-        lambda w: w.save_window(),
+        lambda w: w.saver.window(),
         ("Ctrl+Shift+P",),
     ),
     Action(

@@ -21,11 +21,12 @@ from escape_gui.settings import Settings, load_settings, settings_file
 from escape_gui.widgets.status_pill import Level
 from escape_hw.config.load import load_system
 from escape_hw.remote.address import find_listing, servers
+from escape_hw.remote.state import Phase
 
 log = logging.getLogger(__name__)
 #: What is served when nothing is named and no server runs.
 DEFAULT_SYSTEM = "razor-shwfs"
-#: Milliseconds from the first state to the picture, and how long to wait for one at most.
+#: Milliseconds from an engine that is ready to the picture, and how long to wait for one at most.
 _PICTURE_AFTER_MS, _PICTURE_AT_LAST_MS = 4000, 60_000
 
 
@@ -150,10 +151,18 @@ def _server(system: str, address: str) -> tuple[str, OwnServer | None]:
 
 def _picture(window: MainWindow, session: Session, path: Path) -> None:
     """Take the picture when something is to be seen, and close the window."""
+    waiting = QTimer(window)
 
     def take() -> None:
         save_png(path, window)
         window.close()
 
-    session.changed.connect(lambda: QTimer.singleShot(_PICTURE_AFTER_MS, take))
+    def look() -> None:
+        source = session.source
+        if source.connected and source.state.phase is not Phase.STARTING:
+            waiting.stop()
+            QTimer.singleShot(_PICTURE_AFTER_MS, take)
+
+    waiting.timeout.connect(look)
+    waiting.start(200)
     QTimer.singleShot(_PICTURE_AT_LAST_MS, take)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import logging
 from collections.abc import Callable, Sequence
-from datetime import datetime
 from pathlib import Path
 
 from PySide6.QtCore import QByteArray, Qt
@@ -13,7 +12,6 @@ from PySide6.QtGui import QAction, QCloseEvent, QKeySequence
 from PySide6.QtWidgets import (
     QApplication,
     QDockWidget,
-    QFileDialog,
     QLabel,
     QMainWindow,
     QMenuBar,
@@ -23,7 +21,6 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from escape_gui import exports
 from escape_gui.actions import ACTIONS, MENUS
 from escape_gui.band import Band
 from escape_gui.dock import Dock
@@ -34,6 +31,7 @@ from escape_gui.news import News
 from escape_gui.panels import PANELS
 from escape_gui.panels.panel import Context, Panel
 from escape_gui.replay.desk import ReplayDesk
+from escape_gui.saver import Saver
 from escape_gui.session import Control, Session
 from escape_gui.settings import Settings, save_settings
 from escape_gui.situation import Situation
@@ -43,7 +41,7 @@ from escape_gui.widgets.overlay import Overlay
 from escape_gui.widgets.status_pill import Level
 from escape_gui.widgets.toasts import Toasts
 from escape_gui.workspaces import WORKSPACES, arrange, workspace
-from escape_hw.errors import EscapeError, StorageError
+from escape_hw.errors import StorageError
 
 log = logging.getLogger(__name__)
 #: Version of the arrangement Qt stores; layouts of another one are dropped.
@@ -76,6 +74,7 @@ class MainWindow(QMainWindow):
         self._settings, self._store = settings, store
         self.context = Context(Theme(settings.theme, settings.font_scale), session)
         self.context.theme.apply()
+        self.context.theme.changed.connect(self._fit_tabs)
         self.setDockNestingEnabled(True)
         self.setDockOptions(
             QMainWindow.DockOption.AnimatedDocks
@@ -96,14 +95,13 @@ class MainWindow(QMainWindow):
         self.toasts = Toasts(self, self.context.theme)
         self.overlay = Overlay(self, self.context.theme)
         self.news = News(self.toasts)
+        self.saver: Saver = Saver(self)
         self.ticker = Ticker(session, self.panels.values(), self.refresh)
         self.replay: ReplayDesk = ReplayDesk(
             self, lambda: MainWindow(Session(), settings.model_copy(deep=True), None, panels)
         )
         session.failed.connect(lambda what, why: self.toasts.tell(Level.BAD, f"Could not {what}", why))
-        session.waiting_changed.connect(
-            lambda n: self._note("busy", f"{n} request(s) under way" if n else "")
-        )
+        session.waiting_changed.connect(lambda n: self.note("busy", f"{n} request(s) under way" if n else ""))
         self.workspace = workspace(settings.workspace)
         self._restore()
 
@@ -125,15 +123,21 @@ class MainWindow(QMainWindow):
         tabs.setAccessibleName("Workspaces")
         tabs.setExpanding(False)
         tabs.setDrawBase(False)
+        tabs.setUsesScrollButtons(False)
         for one in WORKSPACES:
             tabs.setTabToolTip(tabs.addTab(one.title), f"{one.purpose}.")
         tabs.tabBarClicked.connect(lambda k: self.show_workspace(WORKSPACES[k].name) if k >= 0 else None)
         tabs.currentChanged.connect(lambda k: self.show_workspace(WORKSPACES[k].name))
         return tabs
 
+    def _fit_tabs(self) -> None:
+        """Another look has wider or narrower words."""
+        self.tabs.setMinimumWidth(self.tabs.sizeHint().width())
+        self.tabs.updateGeometry()
+
     def _make_dock(self, panel: Panel) -> Dock:
         dock = Dock(panel, self.context.theme, self)
-        dock.save_wanted.connect(lambda name, kind: self.save_panel(kind, self.panels[name]))
+        dock.save_wanted.connect(lambda name, kind: self.saver.panel(kind, self.panels[name]))
         dock.help_wanted.connect(lambda name: self.show_panel_help(self.panels[name]))
         return dock
 
@@ -175,6 +179,9 @@ class MainWindow(QMainWindow):
             arrange(self, docks, self.workspace)
         # A layout of a larger window must not make this one larger.
         self.resize(size)
+        for above in (self.toasts, self.overlay):
+            # Docks that were shown anew lie over everything.
+            above.raise_()
 
     def show_workspace(self, name: str) -> None:
         """Change to another workspace, each as it was left."""
@@ -231,14 +238,15 @@ class MainWindow(QMainWindow):
             dock.show_health()
         self.news.look(state, connected=now.connected)
         written = state.telemetry
-        self._note(
+        self.note(
             "recording",
             f"recording {written.written} frames, {written.dropped} dropped" if written.recording else "",
         )
-        self._note("disk", f"{state.disk.free_gb:.1f} GB free" if state.disk.folder else "")
+        self.note("disk", f"{state.disk.free_gb:.1f} GB free" if state.disk.folder else "")
         self.setWindowTitle(f"ESCAPE · {state.system}" if state.system else "ESCAPE")
 
-    def _note(self, name: str, text: str) -> None:
+    def note(self, name: str, text: str) -> None:
+        """Change a note in the status bar: busy, saved, recording, disk."""
         self._notes[name].setText(text)
 
     # ------------------------------------------------------------ what actions do
@@ -293,47 +301,6 @@ class MainWindow(QMainWindow):
             self.toggle_key_map()
         else:
             self.overlay.open(panel.title, page(panel), markdown=True)
-
-    def save_panel(self, kind: str, panel: Panel | None = None) -> None:
-        """Ask where, then save a panel as ``png``, ``csv`` or ``fits``."""
-        panel = panel or self.panel_in_focus()
-        if panel is None:
-            self.toasts.tell(Level.WARN, "Which panel?", "Click a panel first, or use the ⤓ in its title.")
-            return
-        path = self._ask_path(panel.name, kind)
-        if path is not None:
-            self.save_to(path, kind, panel)
-
-    def save_window(self) -> None:
-        """Ask where, then save the whole window as a picture."""
-        path = self._ask_path("window", "png")
-        if path is not None:
-            self._tell_saved(lambda: exports.save_png(path, self))
-
-    def save_to(self, path: Path, kind: str, panel: Panel) -> None:
-        """Save a panel; says where, or why not."""
-        if kind == "png":
-            self._tell_saved(lambda: exports.save_png(path, panel))
-        elif kind == "csv":
-            self._tell_saved(lambda: exports.save_csv(path, panel))
-        else:
-            state = self.context.session.source.state
-            self._tell_saved(lambda: exports.save_fits(path, panel, state))
-
-    def _tell_saved(self, save: Callable[[], tuple[Path, ...]]) -> None:
-        try:
-            written = save()
-        except EscapeError as error:
-            self.toasts.tell(Level.BAD, "Not saved", str(error))
-            return
-        self._note("saved", f"saved {written[-1].name}")
-        self.toasts.tell(Level.GOOD, "Saved", "\n".join(str(path) for path in written))
-
-    def _ask_path(self, name: str, kind: str) -> Path | None:
-        moment = datetime.now().strftime("%Y-%m-%d_%H%M%S")
-        proposal = str(Path.home() / f"escape_{name}_{moment}.{kind}")
-        chosen, _ = QFileDialog.getSaveFileName(self, f"Save {name}", proposal, f"*.{kind}")
-        return Path(chosen) if chosen else None
 
     def closeEvent(self, event: QCloseEvent) -> None:
         """Remember the layout; the server goes on."""

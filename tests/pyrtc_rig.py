@@ -13,7 +13,10 @@ import numpy as np
 import pytest
 
 os.environ["PYRTC_LOG_LEVEL"] = "ERROR"
-pytest.importorskip("pyrtc", reason="needs pyRTC: pip install 'escape-hw[interchange-pyrtc]'")
+#: What to do where it is absent.
+NEEDED = "needs pyRTC: pip install 'escape-hw[interchange-pyrtc]'"
+
+pytest.importorskip("pyrtc", reason=NEEDED)
 yaml = pytest.importorskip("yaml")
 
 from pyrtc.loop import Loop  # noqa: E402

@@ -30,6 +30,7 @@ _UNITS = {
     "_ms": ("ms", 2),
     "_s": ("s", 3),
     "_mm": ("mm", 2),
+    "_um": ("µm", 2),
 }
 
 
@@ -111,7 +112,7 @@ class _Row(QFrame):
         role = ROLES.get(device.name, device.name)
         self._name.setText(role)
         self._pill.show_condition(LEVELS.get(device.health, Level.QUIET), device.health.value)
-        twin = "simulated" if device.simulated else "hardware"
+        twin = "" if device.model.startswith("simulated") else "simulated" if device.simulated else "hardware"
         self._model.setText(
             " · ".join(part for part in (device.model or device.kind, device.serial, twin) if part)
         )

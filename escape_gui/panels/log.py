@@ -58,16 +58,25 @@ class LogPanel(Panel):
         self.body.addWidget(self.text, 1)
         self._lines: deque[LogLine] = deque(maxlen=KEPT)
         self._number = -1
+        self._following = True
+        self.text.verticalScrollBar().actionTriggered.connect(self._scrolled)
         self.restyle()
 
     def tick(self, source: Source) -> None:
         """New lines, all at once."""
         new = source.log_after(self._number)
-        if not new:
-            return
-        self._number = new[-1].number
-        self._lines.extend(new)
-        self._append([line for line in new if self._wanted(line)])
+        if new:
+            self._number = new[-1].number
+            self._lines.extend(new)
+            self._append([line for line in new if self._wanted(line)])
+        if self._following:
+            bar = self.text.verticalScrollBar()
+            bar.setValue(bar.maximum())
+
+    def _scrolled(self) -> None:
+        """Whoever scrolls back reads; at the end the newest lines are followed again."""
+        bar = self.text.verticalScrollBar()
+        self._following = bar.sliderPosition() >= bar.maximum()
 
     def _wanted(self, line: LogLine) -> bool:
         if line.level in LEVELS and LEVELS.index(line.level) < self.level.currentIndex():
@@ -78,11 +87,7 @@ class LogPanel(Panel):
     def _append(self, lines: list[LogLine]) -> None:
         if not lines:
             return
-        bar = self.text.verticalScrollBar()
-        at_end = bar.value() >= bar.maximum() - 2
         self.text.appendHtml("<br>".join(self._html(line) for line in lines))
-        if at_end:
-            bar.setValue(bar.maximum())
 
     def _html(self, line: LogLine) -> str:
         colours = self.context.theme.colours

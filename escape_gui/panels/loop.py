@@ -90,9 +90,11 @@ class LoopPanel(Panel):
         for row, (name, words) in enumerate(FIELDS.items(), 1):
             caption = QLabel(words)
             caption.setBuddy(self.editors[name])
-            form.addWidget(caption, row, 0)
-            form.addWidget(self.current[name], row, 1)
-            form.addWidget(self.editors[name], row, 2)
+            form.addWidget(caption, 2 * row, 0)
+            # Names of matrices are long: the choice stands below.
+            wide = name == "matrix"
+            form.addWidget(self.current[name], 2 * row, 1, 1, 2 if wide else 1)
+            form.addWidget(self.editors[name], 2 * row + wide, 1 if wide else 2, 1, 2 if wide else 1)
             self.editors[name].setToolTip(_TIPS[name])
             self.editors[name].setAccessibleName(f"{words} wanted")
         form.setColumnStretch(2, 1)
@@ -145,8 +147,11 @@ class LoopPanel(Panel):
         self.matrix.addItems(matrices)
         for k, name in enumerate(matrices):
             self.matrix.setItemData(k, summaries[name], Qt.ItemDataRole.ToolTipRole)
-        if wanted in matrices:
+        if self._edited and wanted in matrices:
             self.matrix.setCurrentText(wanted)
+        else:
+            # The newest is what one has just calibrated for.
+            self.matrix.setCurrentIndex(len(matrices) - 1)
 
     def tick(self, source: Source) -> None:
         """Buttons are possible or say why not."""
@@ -246,8 +251,9 @@ class LoopPanel(Panel):
         for label in self.current.values():
             label.setFont(mono)
         for name, editor in self.editors.items():
-            editor.setMaximumWidth(self.context.theme.pixels(180))
-            if name != "matrix":
+            wide = name == "matrix"
+            editor.setMaximumWidth(self.context.theme.pixels(360 if wide else 180))
+            if not wide:
                 editor.setFont(mono)
 
 

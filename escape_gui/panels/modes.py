@@ -34,13 +34,11 @@ from escape_hw.report.content import METHOD_LABELS
 #: How the matrix that is being measured is called in the list.
 LIVE = "as measured now"
 #: What stands below the maps until something else is to be said.
-_HOW = "Each pair: x slopes left, y slopes right. Click a mode to see it in every matrix."
+_HOW = "Pairs: x slopes, y slopes. Click a mode for every matrix."
 #: Matrices that the detail has room for.
 _MOST = 4
 #: Shares of mosaic and detail, and the width from which on they stand beside each other.
 _SHARES, _WIDE = (550, 450), 900
-#: Least width of one pair of maps in the detail.
-_TILE = 150
 
 
 class ModesPanel(Panel):
@@ -222,7 +220,7 @@ class ModesPanel(Panel):
         if spot is None:
             self._words.setText(self._about(self.mosaic.mode) if self.mosaic.mode >= 0 else _HOW)
             return
-        place = f"{spot.part} slope {spot.value:+.3g}, row {spot.row + 1}, column {spot.column + 1}"
+        place = f"{spot.part} {spot.value:+.3g} at ({spot.column + 1}, {spot.row + 1})"
         self._words.setText(f"{self._about(spot.mode)}  {place}")
 
     def _say_page(self, page: int, pages: int) -> None:
@@ -247,8 +245,6 @@ class ModesPanel(Panel):
         if self.splitter.orientation() != way:
             self.splitter.setOrientation(way)
             self.splitter.setSizes([_SHARES[0], _SHARES[1]])
-        across = self.width() // (2 if wide else 1) // self.context.theme.pixels(_TILE)
-        self.detail.use_columns(max(2, min(across, _MOST)))
 
     def clear(self) -> None:
         """Forget the matrix of another source."""

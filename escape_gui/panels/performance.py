@@ -61,7 +61,8 @@ class PerformancePanel(Panel):
         if self.is_empty:
             return
         strehl = np.nan if loop.strehl is None or not loop.closed else 100 * loop.strehl
-        residual = loop.residual_nm if loop.closed else np.nan
+        # None was measured yet in the moment of closing.
+        residual = loop.residual_nm if loop.closed and loop.residual_nm > 0 else np.nan
         self._history["strehl"].add(now, strehl)
         self._history["residual"].add(now, residual)
         sigma = "" if loop.strehl_sigma is None else f" ± {100 * loop.strehl_sigma:.1f}"

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt, QTimer, QUrl
-from PySide6.QtGui import QDesktopServices
+from PySide6.QtGui import QDesktopServices, QResizeEvent
 from PySide6.QtWidgets import (
     QComboBox,
     QFrame,
@@ -51,6 +51,7 @@ class ProcedurePanel(Panel):
         super().__init__(context)
         self._entries: dict[str, ProcedureEntry] = {}
         self._plan: Plan | None = None
+        self._plan_level = "muted"
         self._checking: Arguments | None = None
         self._state = State()
         self._ended: Ended | None = None
@@ -128,7 +129,8 @@ class ProcedurePanel(Panel):
             for one in found:
                 self.choice.addItem(one.title, one.name)
             self._choose()
-        elif not self._entries:
+        self.form.setVisible(bool(self._entries))
+        if not self._entries:
             _put(self._about, "" if self.context.session.commands else NOTHING)
         self._enable()
 
@@ -146,6 +148,8 @@ class ProcedurePanel(Panel):
         _put(self.progress, "" if running is None else words.progress_line(running))
         _put(self._metrics, "" if running is None else self._watched(running.metrics))
         self.pause.setText("Go on" if running is not None and running.paused else "Pause")
+        # While something runs, what came of the last one only takes its room.
+        self._outcome.setVisible(self._ended is not None and running is None)
         if state.last is not None and (self._ended is None or state.last.id != self._ended.id):
             self._show_ended(state.last)
 
@@ -202,7 +206,11 @@ class ProcedurePanel(Panel):
 
     def _say_plan(self, text: str, level: str = "muted") -> None:
         _put(self.plan, text)
-        self.plan.setStyleSheet(f"color: {self.context.theme.colour(level).name()};")
+        self._plan_level = level
+        self._colour_plan()
+
+    def _colour_plan(self) -> None:
+        self.plan.setStyleSheet(f"color: {self.context.theme.colour(self._plan_level).name()};")
 
     # ------------------------------------------------------------ requests
     def ask_plan(self) -> None:
@@ -277,18 +285,31 @@ class ProcedurePanel(Panel):
         if path and Path(path).exists():
             QDesktopServices.openUrl(QUrl.fromLocalFile(path))
 
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Words wrap anew."""
+        super().resizeEvent(event)
+        for label in (self._about, self.plan, self.progress, self._metrics):
+            _fit(label)
+
     def restyle(self) -> None:
         """Numbers in letters that do not jitter."""
         theme = self.context.theme
         for label in (self.progress, self._metrics, self.numbers):
             label.setFont(theme.font(0.95, mono=True))
         self._about.setStyleSheet(f"color: {theme.colour('muted').name()};")
+        self._colour_plan()
 
 
 def _put(label: QLabel, text: str) -> None:
     """Words that take no room while there are none."""
     label.setText(text)
     label.setVisible(bool(text))
+    _fit(label)
+
+
+def _fit(label: QLabel) -> None:
+    """Lines that wrap ask for their height only where somebody gives it to them."""
+    label.setMinimumHeight(max(0, label.heightForWidth(label.width())) if label.text() else 0)
 
 
 def _words() -> QLabel:

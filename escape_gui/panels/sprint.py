@@ -45,6 +45,7 @@ class SprintPanel(Panel):
         self._data: dict[str, NDArray[Any]] = {}
         self._document: Mapping[str, Any] = {}
         self._running = self._dirty = False
+        self._told = -1
         self._course: Course | None = None
         self.plot, self.drift = ConvergencePlot(context.theme), DriftPlot(context.theme)
         self.tabs = QTabWidget()
@@ -90,16 +91,24 @@ class SprintPanel(Panel):
 
     # ------------------------------------------------------------ data
     def take_state(self, state: State) -> None:
-        """Whether it converged, and what there is to know of it, stands in the run's result."""
-        running = state.procedure is not None
-        document = state.last.document if state.last is not None and not running else {}
-        if running != self._running or document is not self._document:
-            self._running, self._document, self._dirty = running, document, True
+        """Whether it converged, and what there is to know of it, stands in the run's result.
+
+        A run that fits no registration says nothing of it: the verdict on the one shown stays.
+        """
+        self._running = state.procedure is not None
+        last = state.last
+        if last is None or last.id == self._told or self._running:
+            return
+        self._told = last.id
+        if last.document.get("converged") is not None or last.document.get("track"):
+            self._document, self._dirty = last.document, True
 
     def take_sample(self, stream: str, sample: Sample) -> None:
         """Another iteration, or another second of tracking."""
         self._data[stream] = sample.data
         self._dirty = True
+        if self._running:
+            self._document = {}
         if stream == "registration_track" and "registration" not in self._data:
             self.tabs.setCurrentIndex(1)
 
@@ -145,7 +154,7 @@ class SprintPanel(Panel):
     def clear(self) -> None:
         """Forget the fit of another source."""
         self._data.clear()
-        self._course, self._document = None, {}
+        self._course, self._document, self._told = None, {}, -1
         self.plot.show_course(None)
         self.drift.show_drift(Drift.of(np.zeros((0, 11))))
         self.tabs.setCurrentIndex(0)

@@ -64,6 +64,7 @@ class ReplaySource:
         self._serial = 1
         self._log = _log_lines(self.run.log_text)
         self._opened_ns = time.monotonic_ns()
+        self._state = self._describe()
 
     @property
     def connected(self) -> bool:
@@ -84,6 +85,7 @@ class ReplaySource:
         """Show the run as it was after this share of it."""
         self._position = min(1.0, max(0.0, position))
         self._serial += 1
+        self._state = self._describe()
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
         """See :class:`~escape_hw.remote.source.Source`."""
@@ -98,6 +100,9 @@ class ReplaySource:
     @property
     def state(self) -> State:
         """What the run says of itself, in the words of a server."""
+        return self._state
+
+    def _describe(self) -> State:
         run, document = self.run, self.run.document
         finish = Finish.ABORTED if run.partial() else Finish.DONE
         name = str(document.get("title") or document.get("command", ""))

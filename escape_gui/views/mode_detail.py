@@ -131,7 +131,7 @@ def _errors(label: str, matrix: InteractionMatrix, mode: int) -> list[Tile]:
         ),
         Tile(
             f"SNR of {label}",
-            f"median {middle:.2g}",
+            f"median {middle:.3g}",
             pair(matrix.valid, ratio),
             (0.0, _enough(2 * middle, _SNR_LIMITS)),
             False,

@@ -65,6 +65,7 @@ class ArgumentForm(QWidget):
             field.setAccessibleDescription(words.hint(one))
             self.fields[one.name] = field
             row = QHBoxLayout()
+            row.setSpacing(8)
             row.addWidget(field, 1)
             if one.unit:
                 row.addWidget(QLabel(one.unit))

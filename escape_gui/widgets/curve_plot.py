@@ -40,7 +40,7 @@ def style_axis(
 
 def add_plot(grid: pg.GraphicsLayoutWidget, row: int = 0) -> pg.PlotItem:
     """A plot in a row of a grid, without menus and hands."""
-    plot = grid.addPlot(row=row, col=0)
+    plot = grid.addPlot(row=row, col=0, enableMenu=False)
     own_menu(plot)
     plot.hideButtons()
     plot.setMouseEnabled(x=False, y=False)

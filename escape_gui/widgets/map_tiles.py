@@ -7,13 +7,36 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtCore import QRect, QSize, Qt
-from PySide6.QtGui import QImage, QPainter, QPaintEvent
+from PySide6.QtGui import QImage, QPainter, QPaintEvent, QResizeEvent
 from PySide6.QtWidgets import QGridLayout, QLabel, QSizePolicy, QVBoxLayout, QWidget
 
 from escape_gui.theme import Theme
 from escape_gui.views.mode_detail import Tile
 from escape_gui.views.mode_mosaic import indices
 from escape_gui.widgets.colour_scale import SIGNED, SIZE, table
+
+#: Height of a line of a title, at normal letter size.
+_LINE = 14
+
+
+def best_columns(count: int, width: float, height: float, title: float) -> int:
+    """Columns that make pictures twice as wide as high, below titles, largest; at least two.
+
+    Parameters
+    ----------
+    count
+        Number of pictures.
+    width, height
+        Of all of them together, in pixels.
+    title
+        Height of a title, in pixels.
+    """
+
+    def size(columns: int) -> float:
+        rows = -(-max(count, 1) // columns)
+        return min(width / columns / 2, height / rows - title)
+
+    return max(range(2, max(count, 2) + 1), key=size)
 
 
 class MapPicture(QWidget):
@@ -57,13 +80,11 @@ class MapTiles(QWidget):
     ----------
     theme
         Colours and fonts.
-    columns
-        Tiles beside each other.
     """
 
-    def __init__(self, theme: Theme, columns: int = 2) -> None:
+    def __init__(self, theme: Theme) -> None:
         super().__init__()
-        self._theme, self._columns = theme, columns
+        self._theme, self._columns = theme, 2
         self._tiles: tuple[Tile, ...] = ()
         self._made: list[tuple[QWidget, QLabel, MapPicture]] = []
         self._grid = QGridLayout(self)
@@ -76,8 +97,15 @@ class MapTiles(QWidget):
         """What is shown."""
         return tuple(one.title for one in self._tiles)
 
-    def use_columns(self, columns: int) -> None:
-        """So many beside each other."""
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Arrange them anew."""
+        super().resizeEvent(event)
+        self._arrange()
+
+    def _arrange(self) -> None:
+        """As many beside each other as make the pictures largest."""
+        title = 4 * self._theme.pixels(_LINE)
+        columns = best_columns(len(self._tiles), self.width(), self.height(), title)
         if columns != self._columns:
             self._columns = columns
             for number, (holder, _, _) in enumerate(self._made):
@@ -93,6 +121,7 @@ class MapTiles(QWidget):
             if number < len(self._tiles):
                 title.setText(self._title(self._tiles[number]))
                 picture.show_tile(self._tiles[number])
+        self._arrange()
 
     def _make(self) -> None:
         holder, title, picture = QWidget(), QLabel(), MapPicture()
@@ -110,7 +139,7 @@ class MapTiles(QWidget):
 
     def _title(self, tile: Tile) -> str:
         low, high = tile.limits
-        scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:.3g}"
+        scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:.4g}"
         muted = self._theme.colours.muted
         return f"<b>{tile.title}</b><br><span style='color:{muted}'>{tile.note}<br>colours {scale}</span>"
 

@@ -7,6 +7,22 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from threadpoolctl import threadpool_limits
 
+_alone = True
+
+
+def share_cores() -> None:
+    """Say that this process is one of as many as there are cores: helper threads would only be in the way.
+
+    Holds for the rest of the process. What was built before keeps its threads.
+    """
+    global _alone
+    _alone = False
+
+
+def helper_threads() -> bool:
+    """Whether threads beside the calling one are welcome; see :func:`share_cores`."""
+    return _alone
+
 
 def hold_to_one_thread() -> threadpool_limits:
     """Hold the linear-algebra libraries to one thread.

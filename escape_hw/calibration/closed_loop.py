@@ -174,6 +174,11 @@ def _science_notes(bench: Bench, science: Camera, record: LoopRecord, seconds: f
     # The first frame or two after closing do not count.
     expected = int((seconds - CLOSING_S) * rate) - 2
     notes = []
+    if record.science.clipped:
+        notes.append(
+            f"the image's peak is saturated in {record.science.clipped} of {count} frames of {science.name}: "
+            "the Strehl ratios are too low; expose for a shorter time"
+        )
     if count < expected / 2:
         notes.append(f"only {count} of about {expected} frames came from {science.name}")
     if count < LEAST and not record.diverged:

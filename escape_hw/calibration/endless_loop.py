@@ -8,6 +8,7 @@ import time
 from array import array
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from escape_hw.calibration.sensor_setup import prepare_sensor
 from escape_hw.errors import Aborted, CalibrationError, CommandRejected, FrameTimeout
 from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.streams.loop_timing import Timing
+from escape_hw.streams.realtime import prompt
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +70,10 @@ def keep_closed(
 ) -> Procedure[LoopEnd]:
     """Close the loop and keep it closed until ``orders`` say to open it, or something is wrong.
 
-    The mirror ends flat in any case. The procedure reports without an end: its ``total`` is 0. Metrics:
+    The mirror ends flat in any case. On devices that are no twins the loop's thread asks for real-time
+    priority, and the log says what the system refused.
+
+    The procedure reports without an end: its ``total`` is 0. Metrics:
     ``residual_nm``, ``gain``, ``leak``, ``dropped_modes``, ``clipped`` (share of the actuators), ``lost``,
     ``latency_p50``, ``latency_p99``, ``latency_max``, ``jitter_p99`` (microseconds, last second), and with
     a model PSF ``strehl`` and ``strehl_sigma``. Arrays: ``residual``, and once a second
@@ -95,6 +100,11 @@ def keep_closed(
         A device failed or was lost.
     """
     return (yield from _Keeper(bench, orders, model_psf).run())
+
+
+def _punctual(bench: Bench) -> AbstractContextManager[tuple[str, ...]]:
+    """Priority for the loop's thread; a twin computes all the time and would starve the computer."""
+    return nullcontext(()) if bench.simulated else prompt()
 
 
 class _Keeper:
@@ -130,7 +140,9 @@ class _Keeper:
             bench.science.stop()
         stretch = max(1, round(_STEP_S * bench.wfs.settings.frame_rate_hz))
         report = Reporter("closed loop", 0)
-        with ThreadPoolExecutor(1, thread_name_prefix="running Strehl") as pool:
+        with ThreadPoolExecutor(1, thread_name_prefix="running Strehl") as pool, _punctual(bench) as refused:
+            for reason in refused:
+                log.warning("frames may be answered late: %s", reason)
             try:
                 while not self.orders.opened and not fault:
                     fault = yield from self._stretch(stretch, report)

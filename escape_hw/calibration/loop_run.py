@@ -16,8 +16,10 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.sensor import SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, next_frame, reachable
+from escape_hw.pipeline.command_shape import shaper
 from escape_hw.pipeline.controller import Controller
 from escape_hw.pipeline.frame_stack import FrameStack
+from escape_hw.pipeline.strehl import peak_is_clipped
 from escape_hw.streams.loop_timing import LoopTiming
 
 #: Seconds after closing during which the science frames do not count.
@@ -114,7 +116,7 @@ class RunningLoop:
     ) -> None:
         self.bench, self.control, self.slopes_of, self.record = bench, control, slopes_of, LoopRecord()
         self.timing = LoopTiming()
-        self._m2c, self._to_modes = np.ascontiguousarray(m2c), np.linalg.pinv(m2c)
+        self._shape_of, self._to_modes = shaper(m2c), np.linalg.pinv(m2c)
         self._light = LightWatch(bench.wfs.name, slopes_of.grid)
         self._science = bench.science if science else None
         self._closing = int(CLOSING_S * bench.wfs.settings.frame_rate_hz)
@@ -122,7 +124,6 @@ class RunningLoop:
         self._nm = 2e9 * bench.dm.info.stroke_m
         self._slopes = np.zeros(slopes_of.grid.n_slopes, np.float32)
         self._total, self._none = np.zeros(m2c.shape[1]), np.zeros(m2c.shape[1])
-        self._shape = np.zeros(m2c.shape[0])
         self._none.flags.writeable = False
         self._saturated = 0
         self._tap = bench.taps.residual
@@ -174,7 +175,7 @@ class RunningLoop:
             if self._science is not None and record.frames > self._closing:
                 image = self._science.poll()
                 if image is not None and record.frames > self._closing + 2:
-                    record.science.add(image.data)
+                    record.science.add(image.data, clipped=peak_is_clipped(image))
             if report.step():
                 yield report.now({"residual": _newest(record.residual)}, residual_nm=record.residual[-1])
         return record
@@ -184,7 +185,7 @@ class RunningLoop:
         record, began = self.record, time.perf_counter_ns()
         self.slopes_of(frame.data, None, self._slopes)
         np.add(self.control(self._slopes), poke, out=self._total)
-        shape = np.dot(self._m2c, self._total, out=self._shape)
+        shape = self._shape_of(self._total)
         sent, over = self._sent(shape, whole)
         ended = time.perf_counter_ns()
         record.latency.append(ended - began)

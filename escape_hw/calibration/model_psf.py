@@ -10,7 +10,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import some_frames
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.design_psf import design_psf
-from escape_hw.pipeline.strehl import has_light, without_background
+from escape_hw.pipeline.strehl import has_light, peak_is_clipped, without_background
 
 
 def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32]]:
@@ -22,7 +22,7 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
     Raises
     ------
     CalibrationError
-        The system has no science camera, or it sees no light.
+        The system has no science camera, it sees no light, or the image's peak is saturated.
     """
     some_frames(frames)
     science = bench.science
@@ -38,14 +38,21 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
     wait = bench.config.devices.science.timeout_s if bench.config.devices.science else 1.0
     report = Reporter("model PSF", frames)
     science.next_frame(wait)
-    total = np.zeros((), np.float64)
+    total, clipped = np.zeros((), np.float64), 0
     try:
         for done in range(frames):
-            total = total + science.next_frame(wait).data
+            frame = science.next_frame(wait)
+            clipped += peak_is_clipped(frame)
+            total = total + frame.data
             if report.due():
                 yield report(done + 1)
     finally:
         science.stop()
+    if clipped:
+        raise CalibrationError(
+            f"{science.name}: the peak of the model PSF is saturated in {clipped} of {frames} frames; expose "
+            "for a shorter time or dim the source"
+        )
     image = without_background(total / frames).astype(np.float32)
     if not has_light(image):
         raise CalibrationError(

@@ -29,6 +29,7 @@ from escape_hw.cli import (
     serve,
     sprint,
     streams,
+    sweep,
     systems,
     track,
     udev,
@@ -51,6 +52,7 @@ app.command("sprint")(sprint.sprint)
 app.command("gains")(gains.gains)
 app.command("loop")(loop.loop)
 app.command("track")(track.track)
+app.command("sweep")(sweep.sweep)
 app.command("serve")(serve.serve)
 app.add_typer(keys.app, name="keys")
 app.add_typer(reproduce.app, name="reproduce")

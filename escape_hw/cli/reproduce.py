@@ -111,6 +111,10 @@ def everything(
         float,
         typer.Option("--share", min=0.001, max=1.0, help="Share of the frames: 0.1 to see that it works."),
     ] = 1.0,
+    sweeps: Annotated[
+        list[Path] | None,
+        typer.Option("--sweep", metavar="RUN", help="A finished sweep to show beside; repeatable."),
+    ] = None,
     set: options.Set = None,
     seed: options.Seed = None,
     json: options.Json = False,
@@ -121,9 +125,11 @@ def everything(
         from escape_hw.cli.views import checks_view
         from escape_hw.io import documents
         from escape_hw.report.index import write_index
-        from escape_hw.runtime.paper import chosen
+        from escape_hw.report.paper_results import write_results
+        from escape_hw.runtime.paper import chosen, sweep_runs
 
         parts: dict[str, Any] = {}
+        swept = sweep_runs(sweeps or [])
         try:
             for case in chosen(only):
                 one.tell(f"{case.kind}: {case.title}")
@@ -133,6 +139,8 @@ def everything(
         finally:
             if parts:
                 one.show(f"index: {write_index(out, parts)}")
+                folders = {kind: Path(part["folder"]) for kind, part in parts.items()}
+                one.show(f"results: {write_results(out, {**folders, **swept})}")
         met = all(check["met"] for part in parts.values() for check in part["criteria"])
         simulated = any(part["simulated"] for part in parts.values())
         head = documents.head("reproduce all", None, simulated, seed)

@@ -17,7 +17,7 @@ import typer
 from rich.console import Console, RenderableType
 
 from escape_hw.cli.interrupts import Interrupts
-from escape_hw.errors import Aborted, EscapeError, StorageError
+from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError
 
 if TYPE_CHECKING:
     from escape_hw.api.procedure import Procedure
@@ -196,6 +196,7 @@ class Session:
         """The system, open; closed at the end whatever happens, the mirror flat."""
         from escape_hw.runtime.system import open_system
 
+        self._refuse_served(choice)
         opened = open_system(choice.system, set=choice.set, seed=choice.seed, mode=choice.mode)
         self.was_opened = True
         try:
@@ -206,6 +207,27 @@ class Session:
                     self.interrupts.begin_closing()
         finally:
             self.interrupts.end_closing()
+
+    def _refuse_served(self, choice: Choice) -> None:
+        """Raise when a server holds the hardware that is to be opened.
+
+        Raises
+        ------
+        ConfigError
+            Says which, and the ways out.
+        """
+        from escape_hw.remote.address import find_listing
+
+        config = self.configured(choice)
+        if config.simulated:
+            return
+        name = config.system.name
+        found = find_listing(name)
+        if found is not None and found.alive:
+            raise ConfigError(
+                f"'{name}' is served by process {found.pid}, which holds its devices; "
+                f'work through it (escape_hw.connect("{name}"), escape gui), or stop it first'
+            )
 
     def fail(self, error: BaseException) -> int:
         """Tell what went wrong; returns the exit code."""

@@ -20,7 +20,7 @@ class ServerSection(Section):
         10.0,
         ge=2,
         le=600,
-        description="an engine that says nothing for so long is ended, the mirror flattened",
+        description="an engine that says nothing for so long, its mirror not flat, is ended",
     )
     no_frames_s: float = Field(2.0, ge=0.2, le=600, description="longest time without a frame in closed loop")
     saturated_share: float = Field(

@@ -170,6 +170,13 @@ class TwinConfig(Section):
     """The simulated bench."""
 
     substeps: int = Field(2, ge=1, le=50, description="steps of the mirror's motion simulated per exposure")
+    run_seed: int | None = Field(
+        None,
+        ge=0,
+        le=2**63 - 1,
+        description="seed of what differs from run to run (air, noise, timing) on the bench that system.seed "
+        "makes; absent: system.seed",
+    )
     paced: bool = Field(False, description="true: run in real time; false: as fast as the computer can")
     loss_probability: float = Field(0.0, ge=0, le=0.5, description="probability that a frame is lost")
     latency_s: float = Field(0.0, ge=0, le=1, description="time from sending a command to its start, seconds")

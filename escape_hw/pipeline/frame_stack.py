@@ -25,12 +25,13 @@ class FrameStack:
         self._kept: list[NDArray[np.float32]] = []
         self._sum: NDArray[np.float32] | None = None
         self._summed = 0
-        #: Frames taken.
-        self.count = 0
+        #: Frames taken, and those of them whose brightest spot was cut off.
+        self.count = self.clipped = 0
 
-    def add(self, image: NDArray[np.integer]) -> None:
-        """Take one frame ``(rows, columns)``."""
+    def add(self, image: NDArray[np.integer], *, clipped: bool = False) -> None:
+        """Take one frame ``(rows, columns)``; ``clipped`` says that its brightest spot was cut off."""
         self.count += 1
+        self.clipped += clipped
         self._sum = image.astype(np.float32) if self._sum is None else self._sum + image
         self._summed += 1
         if self._summed < self._each:

@@ -6,11 +6,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from escape_hw.pipeline.packed_matrix import LARGE, PackedMatrix
+
 
 @njit(cache=True, nogil=True)
 def _step(matrix, slopes, keep, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
     """One step, compiled as a whole: in small systems calls cost more than arithmetic."""
     np.dot(matrix, slopes, residual)
+    for k in range(state.size):
+        state[k] = keep * state[k] - gains[k] * residual[k]
+
+
+@njit(cache=True, nogil=True)
+def _integrate(keep, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
     for k in range(state.size):
         state[k] = keep * state[k] - gains[k] * residual[k]
 
@@ -53,7 +61,7 @@ class LeakyIntegrator:
     ) -> None:
         if not 0 <= leak <= 1:
             raise ValueError(f"leak is {leak}; it must lie in [0, 1]")
-        self._matrix = np.ascontiguousarray(reconstructor, np.float32)
+        self._put(np.ascontiguousarray(reconstructor, np.float32))
         self._keep = np.float32(1 - leak)
         n_modes = self._matrix.shape[0]
         self._gains = np.zeros(n_modes, np.float32)
@@ -102,14 +110,22 @@ class LeakyIntegrator:
                 f"the new reconstructor has shape {reconstructor.shape}, the one in use "
                 f"{self._matrix.shape}; another basis or grid needs a new integrator"
             )
-        self._matrix = np.array(reconstructor, np.float32, order="C")
+        self._put(np.array(reconstructor, np.float32, order="C"))
+
+    def _put(self, matrix: NDArray[np.float32]) -> None:
+        """Take a reconstructor into use, in the form that is fastest."""
+        self._matrix, self._packed = matrix, PackedMatrix.of(matrix) if matrix.nbytes > LARGE else None
 
     def __call__(self, slopes: NDArray[np.float32]) -> NDArray[np.float32]:
         """Next modal command ``(n_modes,)`` from slopes ``(n_slopes,)``; also sets ``residual``.
 
         The command and ``residual`` are the same arrays at every call; copy what is to be kept.
         """
-        _step(self._matrix, slopes, self._keep, self._gains, self.residual, self.state)
+        if self._packed is None:
+            _step(self._matrix, slopes, self._keep, self._gains, self.residual, self.state)
+        else:
+            self._packed.product(slopes, self.residual)
+            _integrate(self._keep, self._gains, self.residual, self.state)
         return self.state
 
     def applied(self, modes: NDArray[np.floating]) -> None:

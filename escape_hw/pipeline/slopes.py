@@ -48,19 +48,21 @@ def windows(centres_px: NDArray[np.float64], pitch_px: float, shape: tuple[int, 
 
 
 @njit(inline="always")
-def _counted(frame, gain, offset, at):  # type: ignore[no-untyped-def]  # pragma: no cover
-    value = np.float32(frame[at]) * gain[at] - offset[at]
+def _counted(frame, gain, offset, at, own):  # type: ignore[no-untyped-def]  # pragma: no cover
+    value = np.float32(frame[at]) * gain[own] - offset[own]
     return value if value > np.float32(0) else np.float32(0)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def centres_of_gravity(frame, gain, offset, places, weights, zero_points, slopes, flux):  # type: ignore[no-untyped-def]  # pragma: no cover
+def centres_of_gravity(frame, gain, offset, per_pixel, places, weights, zero_points, slopes, flux):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Thresholded centre of gravity of every window, minus centre and reference.
 
-    Each pixel counts as ``max(frame * gain - offset, 0)``. A window without light above the
-    threshold yields slope 0 and flux 0. ``places (n, 3)`` holds each window's first row, number of
-    rows and first column, ``weights (n, 2, width)`` its mask and its lever along x, ``zero_points
-    (2 n,)`` what to subtract. Fills ``slopes (2 n,)`` (all x, then all y) and ``flux (n,)``.
+    Each pixel counts as ``max(frame * gain - offset, 0)``. With ``per_pixel`` 1 gain and offset are of the
+    frame's shape; with 0 they hold ``(width,)`` equal numbers, and do not fill the processor's cache. A
+    window without light above the threshold yields slope 0 and flux 0. ``places (n, 3)`` holds each
+    window's first row, number of rows and first column, ``weights (n, 2, width)`` its mask and its lever
+    along x, ``zero_points (2 n,)`` what to subtract. Fills ``slopes (2 n,)`` (all x, then all y) and
+    ``flux (n,)``.
 
     Three things make it fast. All windows are read equally wide, a whole number of vectors, and
     their weights are zero where they end. Four rows go through the inner loop together, for its
@@ -88,10 +90,10 @@ def centres_of_gravity(frame, gain, offset, places, weights, zero_points, slopes
             block = zero
             turn = zero
             for j in range(width):
-                v0 = _counted(pixels, scale, cut, at + j)
-                v1 = _counted(pixels, scale, cut, at1 + j)
-                v2 = _counted(pixels, scale, cut, at2 + j)
-                v3 = _counted(pixels, scale, cut, at3 + j)
+                v0 = _counted(pixels, scale, cut, at + j, per_pixel * at + j)
+                v1 = _counted(pixels, scale, cut, at1 + j, per_pixel * at1 + j)
+                v2 = _counted(pixels, scale, cut, at2 + j, per_pixel * at2 + j)
+                v3 = _counted(pixels, scale, cut, at3 + j, per_pixel * at3 + j)
                 column = v0 + v1 + v2 + v3
                 block += column * weight[keep + j]
                 first += column * weight[lever + j]
@@ -103,7 +105,7 @@ def centres_of_gravity(frame, gain, offset, places, weights, zero_points, slopes
         while i < rows:
             line = zero
             for j in range(width):
-                value = _counted(pixels, scale, cut, at + j)
+                value = _counted(pixels, scale, cut, at + j, per_pixel * at + j)
                 line += value * weight[keep + j]
                 first += value * weight[lever + j]
             total += line
@@ -166,6 +168,10 @@ class SlopeExtractor(FrameSlopes[SubApertureGrid]):
         inside = (at >= left[:, None]) & (at < right[:, None])
         lever = np.where(inside, at - centres[:, :1], 0.0)
         self._weights = np.ascontiguousarray(np.stack([inside, lever], axis=1), np.float32)
+        alike = np.ptp(self._gain) == 0 and np.ptp(self._offset) == 0
+        self._per_pixel = np.uint64(0 if alike else 1)
+        self._scale = self._gain[0, :width].copy() if alike else self._gain
+        self._cut = self._offset[0, :width].copy() if alike else self._offset
         x, y = self.grid.references_px.T.astype(float)
         self._zero_points = np.concatenate([x, y + centres[:, 1] - top]).astype(np.float32)
 
@@ -173,5 +179,6 @@ class SlopeExtractor(FrameSlopes[SubApertureGrid]):
         self, frame: NDArray[np.uint16], slopes: NDArray[np.float32], light: NDArray[np.float32]
     ) -> None:
         centres_of_gravity(
-            frame, self._gain, self._offset, self._places, self._weights, self._zero_points, slopes, light
-        )
+            frame, self._scale, self._cut, self._per_pixel, self._places, self._weights, self._zero_points,
+            slopes, light,
+        )  # fmt: skip

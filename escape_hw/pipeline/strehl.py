@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from escape_hw.api.frames import Frame
 from escape_hw.api.results import Measured, StrehlEstimate
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.standard_error import standard_error
@@ -33,6 +34,23 @@ def has_light(image: NDArray[np.floating]) -> bool:
     rim = image[_rim(image.shape)]
     # Of the 16,384 pixels of a dark image the brightest stands out by about four times the scatter.
     return bool(np.max(image) - np.median(rim) > 10 * np.std(rim))
+
+
+def peak_is_clipped(frame: Frame) -> bool:
+    """Whether pixels of a frame are saturated within the encircled energy's radius of the brightest one.
+
+    A cut-off peak makes every Strehl ratio wrong; a hot pixel far away does not.
+    """
+    if not frame.n_saturated:
+        return False
+    # The light as it falls on some pixels together: a hot pixel alone does not lead astray.
+    smooth = ndimage.gaussian_filter(frame.data.astype(np.float32), 1.0)
+    row, column = np.unravel_index(np.argmax(smooth), smooth.shape)
+    y, x = np.ogrid[: frame.data.shape[0], : frame.data.shape[1]]
+    near = np.hypot(y - row, x - column) <= RADIUS_PX
+    top = frame.data.max()
+    # At least two: neighbours of a clipped peak are nearly as bright.
+    return bool(np.count_nonzero(frame.data[near] == top) > 1)
 
 
 def centre_of(image: NDArray[np.float64]) -> tuple[float, float]:

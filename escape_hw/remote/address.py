@@ -21,7 +21,7 @@ from escape_hw.streams.segments import process_start
 _LONGEST_SOCKET = 100
 _TCP = re.compile(r"tcp://(?P<host>[^/:]+|\[[0-9a-fA-F:]+\]):(?P<port>\d{1,5})")
 #: Addresses that stay on this machine.
-_LOOPBACK = ("127.", "localhost", "[::1]")
+_LOOPBACK = re.compile(r"127\.\d+\.\d+\.\d+|localhost|\[::1\]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ def tcp_endpoint(host: str, port: int) -> Endpoint:
 
 def is_loopback(host: str) -> bool:
     """Whether an address stays on this machine."""
-    return host.startswith(_LOOPBACK)
+    return _LOOPBACK.fullmatch(host) is not None
 
 
 def resolve(name: str) -> Endpoint:

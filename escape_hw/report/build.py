@@ -20,6 +20,7 @@ from escape_hw.report import (
     tables,
 )
 from escape_hw.report.content import RunContent, read_run
+from escape_hw.report.sweep_section import sweep_section
 
 REPORT = "report.html"
 
@@ -76,6 +77,7 @@ def render(run: RunContent) -> str:
         _registration(run),
         _gains(run),
         _loops(run),
+        sweep_section(document),
         _track(run),
         _matrices(run),
         _sky_time(run),

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from escape_hw.api.procedure import Procedure
 from escape_hw.bench import Bench
 from escape_hw.errors import ConfigError
+from escape_hw.io.run_folder import read_result
 from escape_hw.runtime.reproduce import PAPER_CASE, reproduce_shwfs, reproduce_table1
 from escape_hw.runtime.reproduce_keep import keep_maps, keep_pywfs, keep_shwfs, keep_table1
 from escape_hw.runtime.reproduce_maps import reproduce_maps
@@ -90,3 +92,23 @@ def chosen(kinds: Sequence[str] | None) -> list[PaperCase]:
         if kind not in CASES:
             raise ConfigError(f"the paper's result '{kind}' is unknown; it is one of {', '.join(CASES)}")
     return [case for kind, case in CASES.items() if not kinds or kind in kinds]
+
+
+def sweep_runs(folders: Sequence[Path]) -> dict[str, Path]:
+    """Sweeps by the name that the paper's table knows them by: ``sweep-shwfs``, ``sweep-pywfs``.
+
+    Raises
+    ------
+    ProductError
+        One is no run folder.
+    ConfigError
+        One is no sweep, or of another system than the paper's.
+    """
+    found = {}
+    for folder in folders:
+        document = read_result(folder)
+        system = str(document.get("system"))
+        if "sweep" not in document or system not in ("razor-shwfs", "razor-pywfs"):
+            raise ConfigError(f"--sweep {folder}: not a sweep of razor-shwfs or razor-pywfs")
+        found[f"sweep-{system.removeprefix('razor-')}"] = folder
+    return found

@@ -86,7 +86,7 @@ def reproduce_shwfs(
     require_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
     result = Comparison()
     try:
-        yield from _calibrate(bench, frames, result)
+        yield from three_matrices(bench, frames, result)
         if not result.partial:
             yield from _close_loops(bench, loop_frames, result)
         if plants and not result.partial:
@@ -103,7 +103,18 @@ def reproduce_shwfs(
     return result
 
 
-def _calibrate(bench: Bench, frames: int, result: Comparison) -> Procedure[None]:
+def three_matrices(bench: Bench, frames: int, result: Comparison) -> Procedure[None]:
+    """Add the calibrations "push-pull", "DO-CRIME" and "ESCAPE", the latter two from the same frames.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    frames
+        Frames of the DO-CRIME measurement.
+    result
+        Takes the calibrations; ``partial`` is set when one of them was stopped.
+    """
     baseline = yield from calibrate_by(bench, "push-pull")
     result.calibrations["push-pull"] = baseline
     result.partial = baseline.partial

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import Bench
@@ -55,7 +58,7 @@ def reproduce_pywfs(
     require_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
     result = Comparison()
     try:
-        yield from _matrices(bench, frames, result)
+        yield from shared_geometry_matrices(bench, frames, result)
         if not result.partial:
             yield from _gains_and_loops(bench, closed_frames, loop_frames, result)
     except Aborted:
@@ -63,7 +66,11 @@ def reproduce_pywfs(
     return result
 
 
-def _matrices(bench: Bench, frames: int, result: Comparison) -> Procedure[None]:
+def shared_geometry_matrices(bench: Bench, frames: int, result: Comparison) -> Procedure[None]:
+    """Add the calibrations "push-pull", "DO-CRIME" and "ESCAPE" with the geometry of the last for all.
+
+    See :func:`~escape_hw.runtime.reproduce.three_matrices`.
+    """
     found = yield from calibrate_by(bench, "escape", frames=frames)
     measured, result.partial = measured_part(found), found.partial
     if found.partial:
@@ -77,32 +84,60 @@ def _matrices(bench: Bench, frames: int, result: Comparison) -> Procedure[None]:
     result.calibrations["ESCAPE"] = found
 
 
+def find_gains(
+    bench: Bench, frames: int, result: Comparison, *, accuracy: float = 0.01
+) -> Procedure[tuple[CalibrationResult, NDArray[np.float32]]]:
+    """Add the optical gains of all matrices, found in closed loop on ESCAPE's.
+
+    Parameters
+    ----------
+    bench
+        An open bench with a science camera.
+    frames
+        Frames per round at most.
+    result
+        With the matrices; takes the gains, and ``partial`` when they were stopped.
+    accuracy
+        Relative standard error of the gains to go on for.
+
+    Returns
+    -------
+    rescaled : CalibrationResult
+        ESCAPE's, scaled.
+    model : ndarray of float32, ``(rows, columns)``
+        The model PSF.
+    """
+    from escape_hw.calibration.gain_bootstrap import bootstrap_gains
+
+    model = yield from model_psf(bench)
+    beside = {label: one.matrix for label, one in result.calibrations.items() if label != "ESCAPE"}
+    run = yield from bootstrap_gains(
+        bench, result.calibrations["ESCAPE"], beside=beside, frames=frames, accuracy=accuracy, model_psf=model
+    )
+    result.gains, result.partial = run.result, run.result.partial
+    return run.rescaled, model
+
+
 def _gains_and_loops(
     bench: Bench, closed_frames: int, loop_frames: int, result: Comparison
 ) -> Procedure[None]:
     from escape_hw.calibration.docrime_closed import docrime_closed_loop
-    from escape_hw.calibration.gain_bootstrap import bootstrap_gains
 
-    model = yield from model_psf(bench)
     known = dict(result.calibrations)
-    beside = {label: one.matrix for label, one in known.items() if label != "ESCAPE"}
-    run = yield from bootstrap_gains(
-        bench, known["ESCAPE"], beside=beside, frames=closed_frames, model_psf=model
-    )
-    result.gains, result.partial = run.result, run.result.partial
+    rescaled, model = yield from find_gains(bench, closed_frames, result)
     if result.partial:
         return
-    closed = yield from docrime_closed_loop(bench, run.rescaled, frames=closed_frames, poke=CLOSED_POKE)
+    closed = yield from docrime_closed_loop(bench, rescaled, frames=closed_frames, poke=CLOSED_POKE)
     result.calibrations["DO-CRIME closed"], result.partial = closed, closed.partial
     if closed.partial:
         return
-    for label, calibration in _to_close(known, result):
+    for label, calibration in with_and_without_gains(known, result):
         yield from close_at_best(bench, label, calibration, loop_frames, model, result)
         if result.partial:
             return
 
 
-def _to_close(
+def with_and_without_gains(
     known: dict[str, CalibrationResult], result: Comparison
 ) -> Iterator[tuple[str, CalibrationResult]]:
     """Each matrix as it is, and scaled by its optical gains."""

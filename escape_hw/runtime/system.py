@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from escape_hw.calibration.gain_bootstrap import GainsRun
     from escape_hw.calibration.sensor_setup import SensorSetup
     from escape_hw.calibration.stopping import Target
+    from escape_hw.runtime.sweep.result import SweepResult
 
 T = TypeVar("T")
 
@@ -362,6 +364,64 @@ class System(Bench):
             self, calibration, poke=poke, accuracy=accuracy, frames=frames, model_psf=model_psf
         )
         return self.run(procedure, progress=progress)
+
+    def sweep(
+        self,
+        matrices: Mapping[str, CalibrationResult],
+        folder: str | os.PathLike[str],
+        *,
+        vary: Sequence[str] = (),
+        trials: int = 200,
+        frames: int = 400,
+        sampler: str = "random",
+        margin: float = 0.01,
+        workers: int = 2,
+        scheduler: str | None = None,
+        storage: str | None = None,
+        progress: bool = False,
+    ) -> SweepResult:
+        """Compare matrices, each at its own best parameters, on the same air.
+
+        On twins every loop has a twin of its own, in parallel processes; on hardware the loops run on this
+        bench one after the other. Called again with the same folder it goes on where it was.
+
+        Parameters
+        ----------
+        matrices
+            Calibrations by name; the first is the one that the others are compared with.
+        folder
+            Where the matrices and, by default, the trials are kept.
+        vary
+            ``"gain=0.1:1"``, ``"leak=1e-3:0.1:log"``, ``"twin.latency_s=0:2e-3"`` ...; gain, leak and dropped
+            modes have usual ranges on twins and none on hardware.
+        trials
+            Loops with drawn parameters, over all matrices.
+        frames
+            Frames of each loop.
+        sampler
+            ``"random"``, the same draws for every matrix, or ``"tpe"``.
+        margin
+            Difference in the Strehl ratio that does not matter.
+        workers, scheduler
+            Processes, or the address of a Dask scheduler.
+        storage
+            SQLAlchemy's URL of the study; SQLite in the folder by default.
+        progress
+            Show a bar with the time left.
+
+        Raises
+        ------
+        ConfigError
+            Optuna is not installed, a range means nothing, or hardware without limits.
+        CalibrationError
+            No loop with one of the matrices stays closed.
+        """
+        from escape_hw.runtime.sweep.ask import sweep_of
+
+        asked = {"trials": trials, "frames": frames, "sampler": sampler, "margin": margin, "storage": storage}
+        return sweep_of(
+            self, matrices, Path(folder), vary, asked, workers=workers, scheduler=scheduler, progress=progress
+        )
 
     def track(
         self,

@@ -97,6 +97,23 @@ class CommandGuard:
         n_enabled = int(self._enabled.sum())
         self._averaging = self._enabled / n_enabled if n_enabled else np.zeros(n_act)
         self.last = _frozen(np.zeros(n_act))
+        # Imported here: it brings a compiler along, which those who only read a configuration do without.
+        from escape_hw.safety.legal import legal
+
+        self._legal = legal
+        # Stroke holds exactly, the other rules to within rounding; what is off is infinite.
+        off, mean = math.inf, limits.max_mean is not None
+        neighbours = limits.max_neighbour is not None
+        none = np.empty(0, dtype=np.intp)
+        self._rules = (
+            self._disabled,
+            self._averaging if mean else np.empty(0),
+            self._one if neighbours else none,
+            self._other if neighbours else none,
+            limits.max_stroke,
+            *(off if limit is None else limit + _ULP
+              for limit in (limits.max_slew, limits.max_mean, limits.max_neighbour)),
+        )  # fmt: skip
 
     def validate(self, command: ArrayLike) -> NDArray[np.float64]:
         """Check type, shape and finiteness.
@@ -160,10 +177,7 @@ class CommandGuard:
 
     def obeys(self, shape: NDArray[np.float64]) -> bool:
         """True when ``shape`` obeys every rule, counted from the last shape sent."""
-        if self.breach(shape) is not None:
-            return False
-        slew = self.limits.max_slew
-        return slew is None or _peak(shape - self.last) <= slew + _ULP
+        return bool(self._legal(shape, self.last, *self._rules))
 
     def breach(self, shape: NDArray[np.float64]) -> str | None:
         """The first rule that ``shape`` breaks by itself (slew apart), in words, or ``None``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import signal
 import socket
@@ -247,8 +248,8 @@ class Engine:
                 update={
                     "stage": progress.stage, "done": progress.done, "total": progress.total,
                     "unit": progress.unit, "elapsed_s": progress.elapsed_s,
-                    "remaining_s": left if left == left else None,
-                    "metrics": {k: float(v) for k, v in progress.metrics.items() if v == v},
+                    "remaining_s": left if math.isfinite(left) else None,
+                    "metrics": {k: float(v) for k, v in progress.metrics.items() if math.isfinite(v)},
                 }
             )  # fmt: skip
             self.channel.post({"progress": board.running.model_dump(mode="json")})

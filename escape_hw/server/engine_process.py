@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 #: Seconds that an engine has to end in order: a partial result is saved meanwhile.
 ENDING_S = 60.0
+#: Seconds that an engine may be silent while its mirror is flat.
+PATIENCE_S = 120.0
 _ENGINE, _GUARDIAN = "escape_hw.server.engine", "escape_hw.server.guardian"
 
 

@@ -101,7 +101,7 @@ class Pulse:
     def state(self) -> State:
         """The state as far as the engine knows it."""
         board, bench, publisher = self._board, self._bench, self._publisher
-        loop = board.loop
+        loop, residual = board.loop, publisher.residual_nm
         frame = publisher.frame
         light = {} if frame is None or not bench.wfs.is_open else {
             "light": light_of(frame, bench.wfs.info.full_scale)
@@ -114,8 +114,9 @@ class Pulse:
             loop=LoopState(
                 closed=board.closed, matrix=loop.matrix, gain=loop.gain, leak=loop.leak,
                 dropped_modes=loop.dropped_modes, modes=bench.config.basis.n_modes,
-                residual_nm=publisher.residual_nm if board.closed else 0.0,
-                strehl=board.loop_metrics.get("strehl"), strehl_sigma=board.loop_metrics.get("strehl_sigma"),
+                residual_nm=residual if board.closed and math.isfinite(residual) else 0.0,
+                strehl=_known(board.loop_metrics, "strehl"),
+                strehl_sigma=_known(board.loop_metrics, "strehl_sigma"),
             ),
             procedure=board.running, last=board.last, products=self._shelf.products,
             telemetry=self._telemetry(), disk=self._disk(), streams=publisher.entries,
@@ -158,3 +159,8 @@ def _latency(metrics: Mapping[str, float]) -> Latency:
     names = {"p50": "latency_p50", "p99": "latency_p99", "largest": "latency_max", "jitter_p99": "jitter_p99"}
     known = {key: metrics.get(name, math.nan) for key, name in names.items()}
     return Latency(**{key: value for key, value in known.items() if math.isfinite(value)})
+
+
+def _known(metrics: Mapping[str, float], name: str) -> float | None:
+    value = metrics.get(name, math.nan)
+    return value if math.isfinite(value) else None

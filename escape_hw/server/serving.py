@@ -99,9 +99,8 @@ class Serving:
 
     def run(self, stop: Stop, runs: Path, reads: tuple[Path, ...] = ()) -> None:
         """Serve until told to stop."""
-        front = Front(self._config, self._door, runs, reads)
         list_server(self.listing)
-        front.run(stop)
+        Front(self._config, self._door, runs, reads).run(stop)
 
     def __enter__(self) -> Self:
         return self

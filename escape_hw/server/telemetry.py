@@ -47,7 +47,9 @@ class Switch:
         if on and self._process is None:
             self._begin()
         elif not on and self._process is not None:
-            process, self._process = self._process, None
+            process = self._process
+            self._last = self.state().model_copy(update={"recording": False})
+            self._process = None
             end = process.stop()
             self._last = Telemetry(path=str(process.folder), written=end.written, dropped=end.dropped)
             log.info("recorded %d entries in %s, %d dropped", end.written, process.folder, end.dropped)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.threads import helper_threads
 from escape_sim.turbulent_layer import TurbulentLayer
 from escape_sim.von_karman import TurbulenceSource
 
@@ -25,6 +26,10 @@ _PUPILS_ACROSS = 8
 def screen_pixels(n: int) -> int:
     """Pixels across the screens for a pupil of ``n`` pixels, a power of two."""
     return max(_LEAST_PIXELS, 1 << math.ceil(math.log2(_PUPILS_ACROSS * n)))
+
+
+def _worker() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="atmosphere")
 
 
 class Atmosphere:
@@ -58,7 +63,7 @@ class Atmosphere:
     ) -> None:
         n = lit.shape[0]
         source = TurbulenceSource(screen_pixels(n), pixel_m, air.r0_m, air.outer_scale_m, n + 3)
-        worker = ThreadPoolExecutor(1, thread_name_prefix="atmosphere") if background else None
+        worker = _worker() if background and helper_threads() else None
         self.layers: list[TurbulentLayer] = []
         for number, (fraction, speed, direction) in enumerate(
             zip(air.fraction, air.speed_m_s, air.direction_deg, strict=True)

@@ -131,6 +131,10 @@ class Detector:
         self._noise = rng.standard_normal(max(self.POOL, 2 * size), dtype=np.float32)
         self._tables = poisson_tables() if read_noise_e < COUNTING_NOISE_E else None
 
+    def draw_from(self, rng: np.random.Generator) -> None:
+        """Go on with another source of randomness; the pixels stay what they are."""
+        self._rng = rng
+
     def expose(
         self, intensity: NDArray[np.float32], photons: float, sky_e: float = 0.0
     ) -> tuple[NDArray[np.uint16], int]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 #: Side of the phase plates in pixels and distance of the pupil from their axis.
 _PLATE_PIXELS = 2048
 _PLATE_RADIUS_M = 28e-3
+#: Plates kept by a process, 16 MB each.
+_PLATES_KEPT = 3
 
 
 class PhasePlates:
@@ -68,12 +71,21 @@ class PhasePlates:
             screen = self._config.devices.screen
             if screen is None:
                 raise ConfigError(f"system {self._config.system.name!r} has no [devices.screen] section")
-            key = (*self._seed.spawn_key, self.number)
-            rng = np.random.default_rng(np.random.SeedSequence(self._seed.entropy, spawn_key=key))
             pixel = self._pupil.pixel_m
-            phase = von_karman_screen(
-                _PLATE_PIXELS, pixel, screen.screens_r0_m[self.number], screen.outer_scale_m, rng
-            )
-            opd = phase * np.float32(self._config.system.wavelength_m / (2 * np.pi))
+            opd = _engraved(
+                self._seed.entropy, (*self._seed.spawn_key, self.number), pixel,
+                screen.screens_r0_m[self.number], screen.outer_scale_m, self._config.system.wavelength_m,
+            )  # fmt: skip
             self._plates[self.number] = RotatingScreen(opd, pixel, _PLATE_RADIUS_M, self._pupil.lit)
         return self._plates[self.number]
+
+
+@lru_cache(maxsize=_PLATES_KEPT)
+def _engraved(
+    entropy: Any, key: tuple[int, ...], pixel_m: float, r0_m: float, outer_scale_m: float, wavelength_m: float
+) -> NDArray[np.float32]:
+    """The optical path of a plate in metres; who opens the same bench again need not draw it again."""
+    rng = np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=key))
+    phase = von_karman_screen(_PLATE_PIXELS, pixel_m, r0_m, outer_scale_m, rng)
+    phase *= np.float32(wavelength_m / (2 * np.pi))
+    return phase

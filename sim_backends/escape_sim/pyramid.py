@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.threads import helper_threads
 from escape_sim.fourier_filter import good_length, is_good
 from escape_sim.modulation import Modulation
 from escape_sim.prism import Prism
@@ -95,7 +96,7 @@ class PyramidOptics:
         self._kernels = self._make_kernels(n, grid * samples, method)
         self._field = np.empty((n, n), np.complex64)
         self._power = np.empty((WORKERS, *self._kernels[0].shape), np.float32)
-        self._helpers = ThreadPoolExecutor(WORKERS - 1, "pyramid")
+        self._helpers = ThreadPoolExecutor(WORKERS - 1, "pyramid") if helper_threads() else None
         self.modulation = modulation
 
     @property
@@ -144,10 +145,14 @@ class PyramidOptics:
             self.amplitude.ravel(),
             self._field.view(np.float32).reshape(-1, 2),
         )
-        others = [self._helpers.submit(self._share, k) for k in range(1, WORKERS)]
-        self._share(0)
-        for other in others:
-            other.result()
+        if self._helpers is None:
+            for k in range(WORKERS):
+                self._share(k)
+        else:
+            others = [self._helpers.submit(self._share, k) for k in range(1, WORKERS)]
+            self._share(0)
+            for other in others:
+                other.result()
         for power in self._power:
             self._window.add(power, out)
         return out

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: Keeps the streams of a run apart from those of the bench of the same number.
+_RUN_KEY = 0x52554E
 #: How far a paced bench may lag behind the wall clock and still hurry to catch up, in seconds.
 _CATCH_UP_S = 0.05
 
@@ -47,6 +49,11 @@ class SimBench:
         self.config = config
         streams = np.random.SeedSequence(config.system.seed).spawn(8)
         plates, hidden, latency, frames, wfs_noise, science_noise, sky, dirt = streams
+        self._run: np.random.SeedSequence | None = None
+        if config.twin.run_seed is not None:
+            # The detectors' pixels belong to the bench; only what they draw afterwards is the run's.
+            self._run = np.random.SeedSequence(config.twin.run_seed, spawn_key=(_RUN_KEY,))
+            plates, latency, frames, sky = self._run.spawn(4)
         self.latency_rng, self.frame_rng = np.random.default_rng(latency), np.random.default_rng(frames)
         truth = np.random.default_rng(hidden)
         self.pupil = soiled_pupil(config, np.random.default_rng(dirt))
@@ -79,6 +86,10 @@ class SimBench:
             twin.wfs.full_well_e, twin.wfs.read_noise_e, twin.wfs.dark_e, twin.wfs.background,
             twin.wfs.fixed_pattern, np.random.default_rng(wfs_noise), twin.wfs.excess_noise,
         )  # fmt: skip
+        self._refresh(self.wfs_detector, 0)
+        if self._run is not None:
+            phases = np.random.default_rng(self._own(2))
+            self._vibration_phase = phases.uniform(0, 2 * np.pi, self._vibration_phase.shape)
         self._science_rng = np.random.default_rng(science_noise)
         self._exposures: _Exposures | None = None
         self.plates = PhasePlates(config, self.pupil, plates)
@@ -215,10 +226,23 @@ class SimBench:
         science, twin = self.config.devices.science, self.config.twin.science
         if science is None:
             raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
-        return Detector(
+        detector = Detector(
             shape, science.bit_depth, twin.full_well_e, twin.read_noise_e, twin.dark_e,
             twin.background, twin.fixed_pattern, self._science_rng, twin.excess_noise,
         )  # fmt: skip
+        self._refresh(detector, 1)
+        return detector
+
+    def _own(self, key: int) -> np.random.SeedSequence:
+        """A stream of this run."""
+        if self._run is None:
+            raise RuntimeError("this run has no seed of its own")
+        return np.random.SeedSequence(self._run.entropy, spawn_key=(*self._run.spawn_key, 100 + key))
+
+    def _refresh(self, detector: Detector, key: int) -> None:
+        """Give a detector noise of the run's own, where the run has a seed."""
+        if self._run is not None:
+            detector.draw_from(np.random.default_rng(self._own(key)))
 
     # ------------------------------------------------------------------ science camera
     def watch(self, plane: FocalPlane, exposure_s: float, period_s: float) -> None:

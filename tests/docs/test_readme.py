@@ -16,7 +16,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 LONG = (
     "escape reproduce shwfs", "escape reproduce table1", "escape reproduce pywfs",
     "escape reproduce maps", "escape reproduce sky-time", "escape report run",
-    "escape calibrate razor-pywfs", "escape gains razor-pywfs",
+    "escape calibrate razor-pywfs", "escape gains razor-pywfs", "escape sweep", "escape reproduce all",
 )  # fmt: skip
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from small_bench import assert_flat, faulty
 
+from escape_hw.calibration import endless_loop
 from escape_hw.calibration.docrime_closed import docrime_closed_loop
 from escape_hw.calibration.endless_loop import keep_closed
 from escape_hw.calibration.loop_orders import LoopOrders
@@ -201,3 +203,23 @@ def test_a_measurement_goes_on_from_the_loops_own_matrix(bench, good):
     assert_flat(bench)
     assert result.grid.n_valid == good.grid.n_valid
     assert np.array_equal(result.matrix.m2c, good.matrix.m2c)
+
+
+def test_a_real_loop_asks_for_priority_and_says_what_was_refused(bench, good, monkeypatch, caplog):
+    asked = []
+
+    @contextmanager
+    def refusing():
+        asked.append("in")
+        yield ("no real-time priority: Operation not permitted",)
+        asked.append("out")
+
+    monkeypatch.setattr(endless_loop, "prompt", refusing)
+    kept(bench, good, end=30)
+    assert asked == []
+    monkeypatch.setattr(type(bench), "simulated", False)
+    found = bench.run(keep_closed(bench, orders := LoopOrders(bench, good.run.result)),
+                      observers=(Operator(bench, orders, end=30),))  # fmt: skip
+    assert found.fault == ""
+    assert asked == ["in", "out"]
+    assert "frames may be answered late: no real-time priority" in caplog.text

@@ -22,6 +22,7 @@ from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.panels.sprint import SprintPanel
 from escape_gui.session import Session
 from escape_gui.settings import Settings
+from escape_gui.widgets.map_tiles import best_columns
 from escape_hw.api.registration import TO_PLAIN
 from escape_hw.io.documents import calibration_document
 from escape_hw.io.fits import save_matrix
@@ -159,6 +160,11 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     assert names == ["matrix", "sigma"]
 
 
+@pytest.mark.parametrize(("width", "height", "columns"), [(900, 260, 6), (480, 300, 3), (500, 1200, 2)])
+def test_tiles_use_their_room(width, height, columns):
+    assert best_columns(6, width, height, 56) == columns
+
+
 def test_pages_turn(calibrate, source):
     panel = calibrate.panels["modes"]
     source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
@@ -198,6 +204,10 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     assert panel._pill.word == "converged, 18 iterations"
     assert "±" in panel._values[0].text()
     assert "tangential_scaling is consistent with zero" in panel._notes.text()
+    other = Ended(id=4, name="push-pull", finish=Finish.DONE, document={"converged": None})
+    source.change(last=other)
+    look(calibrate)
+    assert panel._pill.word == "converged, 18 iterations"
     press(panel.units)
     assert panel.plot.physical
     table = panel.shown()[0].data

@@ -33,6 +33,12 @@ P = TypeVar("P", bound=Panel)
 MakeWindow = Callable[..., MainWindow]
 
 
+@pytest.fixture
+def window(make_window: MakeWindow) -> MainWindow:
+    """A window of the panels that are looked at here together."""
+    return make_window((DevicesPanel, CameraPanel, MirrorPanel, LoopPanel, PerformancePanel, LogPanel))
+
+
 def panel_of(window: MainWindow, kind: type[P]) -> P:
     panel = window.panels[kind.name]
     assert isinstance(panel, kind)
@@ -290,6 +296,6 @@ def test_a_full_disk_is_told_and_nothing_breaks(
         raise StorageError(f"{path}: cannot be written (No space left on device)")
 
     monkeypatch.setattr("escape_gui.exports.write_atomic", full)
-    window.save_to(tmp_path / "a.png", "png", window.panels["camera"])
+    window.saver.panel_to(tmp_path / "a.png", "png", window.panels["camera"])
     assert "No space left" in window.toasts.notes[-1].text
     assert list(tmp_path.glob("a*")) == []

@@ -53,7 +53,7 @@ def small(tmp_path: Path) -> Path:
 
 
 def test_escape_through_the_buttons(small: Path, tmp_path: Path) -> None:
-    with operating(small, "razor-shwfs", tmp_path) as operator:
+    with operating(small, tmp_path) as operator:
         operator.take_control()
         calibrated(operator, operator.run("escape", frames="3000"))
         # Again, and stopped on the way: what was measured is kept.
@@ -69,15 +69,15 @@ def test_escape_through_the_buttons(small: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_escape_on_the_shack_hartmann_bench(tmp_path: Path) -> None:
-    with operating("razor-shwfs", "razor-shwfs", tmp_path) as operator:
+    with operating("razor-shwfs", tmp_path) as operator:
         operator.take_control()
-        calibrated(operator, operator.run("escape", frames="1000"))
+        calibrated(operator, operator.run("escape", frames="4000"))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_escape_and_gains_on_the_pyramid_bench(tmp_path: Path) -> None:
-    with operating("razor-pywfs", "razor-pywfs", tmp_path) as operator:
+    with operating("razor-pywfs", tmp_path) as operator:
         operator.take_control()
         calibrated(operator, operator.run("escape", frames="1500"))
         ended = operator.run("gains", frames="600", accuracy="0.2", strehl="False")

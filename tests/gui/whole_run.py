@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import serving
 from conftest import dispose
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
-from serving import serving
 
 from escape_gui.app import Desk
 from escape_gui.main_window import MainWindow
@@ -80,11 +80,21 @@ class Operator:
         before = source.state.last.id if source.state.last is not None else 0
         self.press(self.procedure.start)
         self.until(lambda: source.state.procedure is not None, "it runs")
-        self.until(lambda: self._watch() and _ended(source, before), "it ends")
+        self.until(lambda: self._watch() and self.ended(before), "it ends")
         last = source.state.last
         assert last is not None
         self.until(lambda: self.procedure._ended is not None and self.procedure._ended.id == last.id, "told")
         return last
+
+    def ended(self, before: int) -> bool:
+        """Whether a procedure has ended since the one with that number."""
+        state = self.window.context.session.source.state
+        return state.procedure is None and state.last is not None and state.last.id != before
+
+    def settle(self, seconds: float) -> None:
+        """Let the window live for a while."""
+        until = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() > until, "time goes by")
 
     def _watch(self) -> bool:
         panels, seen = self.window.panels, self.seen
@@ -97,19 +107,14 @@ class Operator:
         return True
 
 
-def _ended(source: object, before: int) -> bool:
-    state = source.state  # type: ignore[attr-defined]
-    return state.procedure is None and state.last is not None and state.last.id != before
-
-
 @contextmanager
-def operating(system: str | Path, name: str, folder: Path, **settings: str) -> Iterator[Operator]:
+def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Operator]:
     """A server of a system, and the window as the command makes it."""
-    with serving(system, "--quiet", folder=folder) as served:
+    with serving.serving(system, "--quiet", folder=folder) as served:
         os.environ["XDG_RUNTIME_DIR"] = served.environment["XDG_RUNTIME_DIR"]
         session = Session()
         window = MainWindow(session, Settings(**{"workspace": "calibrate", **settings}), None)
-        desk = Desk(window, session, name, None)
+        desk = Desk(window, session, serving.SYSTEM, None)
         window.resize(1280, 800)
         window.ticker.start()
         window.show()

@@ -7,8 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from sensor_frames import WAVELENGTH, pupil_amplitude
 
+from escape_hw.api.frames import Frame
 from escape_hw.errors import CalibrationError
-from escape_hw.pipeline.strehl import centre_of, centred, encircled, ratios, strehl
+from escape_hw.pipeline.strehl import centre_of, centred, encircled, peak_is_clipped, ratios, strehl
 from escape_sim.psf import FocalPlane
 
 N = 96
@@ -59,6 +60,40 @@ def test_small_aberrations_obey_marechal(plane, model, sigma):
     # Averaged over realisations: exp(-sigma^2) is exact only for Gaussian phase.
     found = np.mean([ratios(plane.image(aberration(sigma, seed)), model) for seed in range(8)], axis=0)
     assert found[:2] == pytest.approx(np.full(2, np.exp(-(sigma**2))), abs=0.1 * sigma**2 + 1e-3)
+
+
+@pytest.mark.parametrize("sigma", [0.2, 0.5, 1.0, 1.5])
+def test_defocus_of_a_round_pupil_follows_its_exact_formula(sigma):
+    # phi = sqrt(3) sigma (2 rho^2 - 1) integrates to sin(a) / a with a = sqrt(3) sigma (Born & Wolf 9.1).
+    n = 192
+    plane = FocalPlane(pupil_amplitude(n), n, WAVELENGTH, 6.0, (160, 160))
+    line = (np.arange(n) - (n - 1) / 2) / (n / 2)
+    a = np.sqrt(3) * sigma
+    opd = a * (2 * (line[:, None] ** 2 + line[None, :] ** 2) - 1) * WAVELENGTH / (2 * np.pi)
+    still, blurred = plane.image(np.zeros((n, n), np.float32)), plane.image(opd.astype(np.float32))
+    middle = (80, 80)
+    assert blurred[middle] / still[middle] == pytest.approx((np.sin(a) / a) ** 2, rel=0.02)
+    if sigma < 1:
+        # Where the brightest spot still is the middle, the estimators find it there.
+        peak, otf, _ = ratios(blurred, still)
+        assert peak == pytest.approx((np.sin(a) / a) ** 2, rel=0.03)
+        assert otf == pytest.approx((np.sin(a) / a) ** 2, rel=0.03)
+
+
+def test_a_cut_off_peak_is_noticed_and_a_hot_pixel_is_not(plane):
+    counts = np.minimum(plane.image(np.zeros((N, N), np.float32)) * 1e6, 1e9)
+    counts = counts / counts.max() * 3000 + 10
+    good = counts.astype(np.uint16)
+    assert not peak_is_clipped(Frame(good, 0, 0, 0, 0))
+    hot = good.copy()
+    hot[5, 9] = 4095
+    assert not peak_is_clipped(Frame(hot, 0, 0, 0, 1))
+    cut = np.minimum(good, 1500)
+    saturated = int((cut == 1500).sum())
+    assert saturated > 1
+    assert peak_is_clipped(Frame(cut, 0, 0, 0, saturated))
+    # That is why: half of the peak gone is half of the first ratio gone.
+    assert ratios(cut.astype(float), good.astype(float))[0] < 0.7
 
 
 def test_all_three_agree_when_the_light_goes_far_away(plane, model):

@@ -169,15 +169,19 @@ def test_a_failed_run_says_why_and_the_server_goes_on(bench: Connection) -> None
 
 
 def test_products_come_from_the_folders_of_the_server_only(
-    bench: Connection, im: Path, tmp_path: Path, matrix: str
+    bench: Connection, matrix: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(ProductError, match=r"this server reads from .* only"):
-        bench.load_product(im)
-    (own,) = (one.path for one in bench.state.products if one.name == matrix)
+    (own,) = (Path(one.path) for one in bench.state.products if one.name == matrix)
     product = bench.load_product(own, name="again")
     assert (product.name, product.kind) == ("again", "matrix")
-    with pytest.raises(ProductError, match="reads from"):
-        bench.load_product(Path(own).parent / ".." / ".." / ".." / ".." / ".." / "etc" / "passwd")
+    elsewhere = tmp_path / "im.fits"
+    elsewhere.write_bytes(own.read_bytes())
+    with pytest.raises(ProductError, match=r"this server reads from .* only"):
+        bench.load_product(elsewhere)
+    (own.parent / "link.fits").symlink_to(elsewhere)
+    for way_out in (own.parent / "link.fits", own.parent.joinpath(*[".."] * 9, "etc", "passwd")):
+        with pytest.raises(ProductError, match="reads from"):
+            bench.load_product(way_out)
 
 
 def test_who_only_watches_writes_nothing_but_may_always_stop(served: Served, bench: Connection) -> None:

@@ -204,31 +204,6 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_other_machines_need_keys(system: Path, escape, environment, folders: Path) -> None:
-    own = {**environment, "XDG_CONFIG_HOME": str(folders / "config"), "XDG_RUNTIME_DIR": str(folders)}
-    call = [sys.executable, "-c", "from escape_hw.cli import main; main()"]
-    folders.chmod(0o700)
-
-    def run(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([*call, *words], env=own, capture_output=True, text=True, timeout=120)
-
-    refused = run("serve", str(system), "--port", "40001", "--bind", "0.0.0.0")
-    assert refused.returncode == 2
-    assert "make them with 'escape keys make'" in refused.stderr
-    made = json.loads(run("keys", "make", "--json").stdout)
-    assert len(made["public"]) == 40
-    assert (Path(made["folder"]) / "own.secret").stat().st_mode & 0o777 == 0o600
-    assert run("keys", "make", "--json").stdout.count(made["public"]) == 1, "keys stay"
-    refused = run("serve", str(system), "--port", "40001", "--bind", "0.0.0.0")
-    assert "no client is let in; add one with 'escape keys allow NAME KEY'" in refused.stderr
-    assert run("keys", "allow", "me", "short").returncode == 2
-    assert run("keys", "allow", "../me", made["public"]).returncode == 2
-    assert run("keys", "allow", "me", made["public"]).returncode == 0
-    assert json.loads(run("keys", "list", "--json").stdout)["allowed"] == {"me": made["public"]}
-    assert run("keys", "forget", "me").returncode == 0
-    assert run("keys", "forget", "me").returncode == 2
-
-
 def test_without_an_allowed_key_a_client_gets_nothing(system: Path, folders: Path) -> None:
     own, port = keys.make_keys(), PORT + 10
     keys.allow("first", own.public.decode())
@@ -251,7 +226,7 @@ def test_without_an_allowed_key_a_client_gets_nothing(system: Path, folders: Pat
             assert heard(address, public, secret, server) == 0
         # Whom the operator lets in is in at once, and out again.
         keys.allow("stranger", stranger[0].decode())
-        assert heard(address, *stranger, own.public) > 0
+        wait_for(lambda: heard(address, *stranger, own.public) > 0, "the stranger is let in")
         keys.forget("stranger")
         assert heard(address, *stranger, own.public) == 0
         assert local.state.fault is None
@@ -269,7 +244,10 @@ def heard(address: str, public: bytes | None, secret: bytes | None, server: byte
                 one.curve_publickey, one.curve_secretkey, one.curve_serverkey = public, secret, server
             one.connect(at)
         asking.send_multipart([b"1", b"{}"])
-        found = sum(bool(one.poll(1500)) for one in (asking, listening))
+        poller = zmq.Poller()
+        poller.register(asking, zmq.POLLIN)
+        poller.register(listening, zmq.POLLIN)
+        found = len(poller.poll(1000))
         asking.close()
         listening.close()
     return found

@@ -385,5 +385,5 @@ def test_schema_carries_ranges_and_refuses_unknown_keys() -> None:
     assert loop["properties"]["gain"]["exclusiveMinimum"] == 0
     assert loop["properties"]["gain"]["maximum"] == 2
     assert loop["additionalProperties"] is False
-    # A bench has no telescope, and tracks as everybody does.
-    assert set(schema["properties"]) == {*tomllib.loads(RAZOR), "telescope", "tracking"}
+    # A bench has no telescope, and tracks and serves as everybody does.
+    assert set(schema["properties"]) == {*tomllib.loads(RAZOR), "telescope", "tracking", "server"}

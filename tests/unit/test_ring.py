@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from escape_hw.errors import StorageError
-from escape_hw.streams import ring, segments
+from escape_hw.streams import ring_reader, segments
 from escape_hw.streams.ring import RingReader, RingWriter
 from escape_hw.streams.segments import StreamGone, segment_name
 
@@ -113,7 +113,7 @@ def test_a_reader_that_is_overtaken_while_it_copies_takes_the_newest(
 
     with RingReader(writer.name) as reader:
         writer.write(np.full(100, 0), 0)
-        monkeypatch.setattr(ring, "math", types.SimpleNamespace(prod=overtaken))
+        monkeypatch.setattr(ring_reader, "math", types.SimpleNamespace(prod=overtaken))
         sample = reader.latest()
         assert sample is not None
         # The first two copies were overwritten; during the third one slot more was written.

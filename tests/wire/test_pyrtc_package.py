@@ -8,14 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from interchange_cases import FACTS, SHAPE, lenslets, pyramid, target
-from pyrtc import calibration as theirs
-from pyrtc.component_loading import resolve_class_symbol
-from pyrtc.slopes_process import (
-    SlopesProcess,
-    compute_slopes_shwfs_optim_numba,
-    shwfs_subaperture_coords,
-)
-from pyrtc_rig import rig, sections, within
+from pyrtc_rig import NEEDED, rig, sections, within
 from small_system import SMALL
 
 from escape_hw.api.sensor import SubApertureGrid
@@ -26,6 +19,13 @@ from escape_hw.io.interchange.pyrtc_lenslets import PyrtcLenslets
 from escape_hw.io.interchange.pyrtc_pupils import PyrtcPupils
 from escape_hw.io.interchange.pyrtc_read import PyrtcConfig, import_matrix
 from escape_hw.io.interchange.pyrtc_write import FrameFacts, export_matrix
+
+theirs = pytest.importorskip("pyrtc.calibration", reason=NEEDED)
+resolve_class_symbol = pytest.importorskip("pyrtc.component_loading").resolve_class_symbol
+their_slopes = pytest.importorskip("pyrtc.slopes_process")
+SlopesProcess = their_slopes.SlopesProcess
+compute_slopes_shwfs_optim_numba = their_slopes.compute_slopes_shwfs_optim_numba
+shwfs_subaperture_coords = their_slopes.shwfs_subaperture_coords
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 

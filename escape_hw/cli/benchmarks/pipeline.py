@@ -119,7 +119,8 @@ def _integrator(n_modes: int, n_slopes: int) -> BenchmarkRow:
     if peer is not None:
         ours.applied(start)
         worst = float(np.abs(ours(slopes) - peer()).max() / np.abs(start).max())
-        note = f"largest difference {worst:.1e}" if worst < 1e-5 else f"DISAGREES by {worst:.1e}"
+        # Large reconstructors are held in 16 bits.
+        note = f"largest difference {worst:.1e}" if worst < 1e-4 else f"DISAGREES by {worst:.1e}"
     ours_s, peer_s = alternate(lambda: ours(slopes), peer)
     return BenchmarkRow(
         f"pipeline: integrator {n_modes} x {n_slopes}",

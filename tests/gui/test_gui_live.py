@@ -1,0 +1,144 @@
+"""The way to a server: what takes time is fetched by a thread, and a lost server is found again."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from pytestqt.qtbot import QtBot
+from scripted import ScriptedSource, running
+
+from escape_gui import live
+from escape_gui.live import Attachment, LiveSource
+from escape_hw.errors import ServerGone
+from escape_hw.remote.source import Sample
+from escape_hw.remote.state import Geometry, ProcedureEntry
+
+
+class FakeConnection(ScriptedSource):
+    """A connection that notes from which thread it is asked what takes time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.push_all()
+        self.offers = (ProcedureEntry(name="escape", title="ESCAPE", help=""),)
+        self.askers: set[threading.Thread] = set()
+        self.closed = False
+
+    def geometry(self) -> Geometry:
+        self.askers.add(threading.current_thread())
+        return super().geometry()
+
+    def latest(self, stream: str, after: int = -1) -> Sample | None:
+        self.askers.add(threading.current_thread())
+        return super().latest(stream, after)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Network:
+    """Answers ``connect``; ``reachable`` says whether anybody is there."""
+
+    def __init__(self) -> None:
+        self.reachable = True
+        self.made: list[FakeConnection] = []
+
+    def connect(self, address: str, **_: object) -> FakeConnection:
+        if not self.reachable:
+            raise ServerGone(f"no server of '{address}' runs here")
+        self.made.append(FakeConnection())
+        return self.made[-1]
+
+
+@pytest.fixture
+def network(monkeypatch: pytest.MonkeyPatch) -> Network:
+    network = Network()
+    monkeypatch.setattr(live, "connect", network.connect)
+    monkeypatch.setattr(live, "_DEAD_S", 0.3)
+    monkeypatch.setattr(live, "_RETRY_S", 0.02)
+    monkeypatch.setattr(live, "_HERE_S", 0.02)
+    return network
+
+
+@pytest.fixture
+def found() -> list[LiveSource]:
+    return []
+
+
+def attach(address: str, found: list[LiveSource]) -> Iterator[Attachment]:
+    attachment = Attachment(address)
+    attachment.attached.connect(found.append)
+    attachment.start()
+    yield attachment
+    attachment.close()
+    attachment.deleteLater()
+
+
+@pytest.fixture
+def here(network: Network, found: list[LiveSource]) -> Iterator[Attachment]:
+    yield from attach("razor-shwfs", found)
+
+
+@pytest.fixture
+def afar(network: Network, found: list[LiveSource]) -> Iterator[Attachment]:
+    yield from attach("tcp://bench:5555", found)
+
+
+def test_what_takes_time_is_asked_by_the_thread(
+    here: Attachment, found: list[LiveSource], network: Network, qtbot: QtBot
+) -> None:
+    qtbot.waitUntil(lambda: bool(found) and bool(found[0].procedures()))
+    source = found[0]
+    places = source.geometry()
+    assert places == network.made[0].places
+    assert threading.current_thread() not in network.made[0].askers
+    # On this machine streams are read where they lie.
+    assert source.latest("frames") is not None
+    assert threading.current_thread() in network.made[0].askers
+    assert source.geometry() is places
+
+
+def test_streams_from_afar_never_stop_the_window(
+    afar: Attachment, found: list[LiveSource], network: Network, qtbot: QtBot
+) -> None:
+    qtbot.waitUntil(lambda: bool(found))
+    source = found[0]
+    assert source.latest("psf") is None
+    qtbot.waitUntil(lambda: source.latest("psf") is not None)
+    first = source.latest("psf")
+    assert first is not None
+    assert source.latest("psf", first.index) is None
+    network.made[0].push("psf", np.ones((2, 2)))
+    qtbot.waitUntil(lambda: source.latest("psf", first.index) is not None)
+    assert threading.current_thread() not in network.made[0].askers
+
+
+def test_a_server_that_came_back_is_found(
+    here: Attachment, found: list[LiveSource], network: Network, qtbot: QtBot
+) -> None:
+    qtbot.waitUntil(lambda: len(found) == 1)
+    reasons: list[str] = []
+    here.failing.connect(reasons.append)
+    network.reachable = False
+    network.made[0].connected = False
+    qtbot.waitUntil(lambda: bool(reasons))
+    time.sleep(0.1)
+    assert reasons == ["no server of 'razor-shwfs' runs here"]
+    network.reachable = True
+    qtbot.waitUntil(lambda: len(found) == 2)
+    assert found[1].connected
+    here.drop(found[0])
+    qtbot.waitUntil(lambda: network.made[0].closed)
+
+
+def test_hanging_up_closes_the_connection(network: Network, found: list[LiveSource], qtbot: QtBot) -> None:
+    for attachment in attach("razor-shwfs", found):
+        qtbot.waitUntil(lambda: bool(found))
+        network.made[0].state = running(serial=5)
+        assert found[0].state.serial == 5
+        assert attachment.address == "razor-shwfs"
+    assert network.made[0].closed

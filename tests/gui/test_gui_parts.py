@@ -1,0 +1,250 @@
+"""Theme, settings, requests, maps, and the way to a server: what stands behind the widgets."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pytestqt.qtbot import QtBot
+from scripted import ScriptedControl, disc, rows_of, secondary
+
+from escape_gui.loop_form import LoopEdit
+from escape_gui.maps import GAP, ActuatorMap, mask_of, slope_maps
+from escape_gui.radial import RadialProfile
+from escape_gui.session import Commands
+from escape_gui.settings import Settings, load_settings, save_settings
+from escape_gui.theme import PALETTES, SCALES, Colours, Theme, contrast
+from escape_gui.widgets.quiver import outline_points
+from escape_gui.widgets.strip_chart import History
+from escape_hw.cli.app import run
+from escape_hw.remote.state import Geometry, LoopState
+
+SURFACES = ("window", "panel", "field")
+TEXTS = ("text", "muted", "accent", "good", "warn", "bad")
+PAIRS = (
+    ("on_accent", "accent"),
+    ("on_simulated", "simulated"),
+    ("on_hardware", "hardware"),
+    ("on_stop", "stop"),
+    ("text", "button"),
+)
+
+
+@pytest.mark.parametrize("colours", PALETTES.values(), ids=PALETTES.keys())
+def test_every_text_can_be_read(colours: Colours) -> None:
+    pairs = [(text, surface) for text in TEXTS for surface in SURFACES]
+    poor = {
+        (front, back): round(contrast(getattr(colours, front), getattr(colours, back)), 2)
+        for front, back in (*pairs, *PAIRS)
+        if contrast(getattr(colours, front), getattr(colours, back)) < 4.5
+    }
+    assert poor == {}
+
+
+@pytest.mark.parametrize("colours", PALETTES.values(), ids=PALETTES.keys())
+def test_curves_stand_out_from_their_ground(colours: Colours) -> None:
+    assert min(contrast(colour, colours.field) for colour in colours.series) >= 3.0
+
+
+def test_contrast_is_that_of_the_guidelines() -> None:
+    assert contrast("#000000", "#ffffff") == pytest.approx(21.0)
+    assert contrast("#777777", "#ffffff") == pytest.approx(4.48, abs=0.01)
+
+
+def test_letters_grow_in_steps_and_stop(qtbot: QtBot) -> None:
+    theme = Theme()
+    for _ in range(20):
+        theme.step_scale(+1)
+    assert theme.scale == SCALES[-1]
+    assert theme.pixels(10) == round(10 * SCALES[-1])
+    theme.step_scale(0)
+    assert theme.scale == 1.0
+
+
+# ---------------------------------------------------------------- settings
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "cannot be read"),
+        ("[]", "not a table"),
+        ('{"font_scael": 1.2}', "did you mean 'font_scale'"),
+        ('{"font_scale": 9}', "setting 'font_scale' is ignored"),
+        ('{"theme": "pink"}', "setting 'theme' is ignored"),
+    ],
+)
+def test_damaged_settings_never_stop_the_start(tmp_path: Path, content: str, said: str) -> None:
+    path = tmp_path / "gui.json"
+    path.write_text(content)
+    settings, (warning,) = load_settings(path)
+    assert settings == Settings()
+    assert said in warning
+    assert str(path) in warning
+
+
+def test_sound_settings_survive_beside_damaged_ones(tmp_path: Path) -> None:
+    path = tmp_path / "gui.json"
+    path.write_text(json.dumps({"theme": "light", "font_scale": "large"}))
+    settings, warnings = load_settings(path)
+    assert settings.theme == "light"
+    assert len(warnings) == 1
+    save_settings(path, settings)
+    assert load_settings(path) == (settings, ())
+
+
+def test_without_a_file_there_is_nothing_to_warn_of(tmp_path: Path) -> None:
+    assert load_settings(tmp_path / "none.json") == (Settings(), ())
+
+
+# ---------------------------------------------------------------- requests
+@pytest.fixture
+def commands(control: ScriptedControl):
+    commands = Commands(control)
+    yield commands
+    commands.close()
+    commands.deleteLater()
+
+
+def test_answers_come_back_into_the_windows_thread(commands: Commands, qtbot: QtBot) -> None:
+    threads: list[threading.Thread] = []
+    asked = threading.current_thread()
+
+    def call(server: object) -> str:
+        threads.append(threading.current_thread())
+        return "done"
+
+    def then(answer: str) -> None:
+        threads.append(threading.current_thread())
+        assert answer == "done"
+
+    commands.ask("try", call, then)
+    qtbot.waitUntil(lambda: len(threads) == 2)
+    assert threads[0] is not asked
+    assert threads[1] is asked
+
+
+def test_safety_does_not_wait_behind_a_slow_question(
+    commands: Commands, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    go_on = threading.Event()
+    commands.ask("check", lambda server: go_on.wait(20))
+    commands.ask("flatten", lambda server: server.flatten(), urgent=True)
+    qtbot.waitUntil(lambda: control.verbs == ["flatten"])
+    assert not go_on.is_set()
+    go_on.set()
+
+
+def test_a_failure_reaches_whoever_asked(commands: Commands, control: ScriptedControl, qtbot: QtBot) -> None:
+    control.refuse = "the loop is open"
+    heard: list[str] = []
+    with qtbot.waitSignal(commands.failed) as told:
+        commands.ask("change the loop", lambda server: server.set_loop(gain=0.5), otherwise=heard.append)
+    assert told.args == ["change the loop", "the loop is open"]
+    assert heard == ["the loop is open"]
+
+
+def test_answers_after_the_end_are_dropped(control: ScriptedControl, qtbot: QtBot) -> None:
+    commands = Commands(control)
+    go_on, heard = threading.Event(), []
+    commands.ask("slow", lambda server: go_on.wait(20), heard.append)
+    go_on.set()
+    commands.close()
+    commands.ask("late", lambda server: server.flatten(), heard.append)
+    qtbot.wait(50)
+    assert heard == []
+    assert control.asked == []
+    commands.deleteLater()
+
+
+# ---------------------------------------------------------------- pictures
+def test_slopes_become_two_maps() -> None:
+    valid = disc(5)
+    n = int(valid.sum())
+    maps = slope_maps(np.arange(2.0 * n), valid)
+    assert maps.shape == (5, 10 + GAP)
+    assert maps[:, :5][valid].tolist() == list(range(n))
+    assert maps[:, 5 + GAP :][valid].tolist() == list(range(n, 2 * n))
+    assert int(np.isfinite(maps).sum()) == 2 * n
+
+
+def test_geometry_without_a_sensor_has_an_empty_mask() -> None:
+    assert mask_of(()).size == 0
+
+
+def test_actuators_on_a_grid_have_a_square_each() -> None:
+    mask = disc(11, 1.03)
+    chart = ActuatorMap(Geometry(layout=rows_of(mask)))
+    values = np.arange(chart.n_act, dtype=float)
+    assert chart.n_act == int(mask.sum())
+    picture = chart.picture(values)
+    assert picture[mask].tolist() == values.tolist()
+    assert np.isnan(picture[~mask]).all()
+
+
+def test_actuators_without_a_grid_stand_at_their_places() -> None:
+    places = secondary().places_m
+    chart = ActuatorMap(Geometry(places_m=places))
+    picture = chart.picture(np.array([x for x, _ in places]))
+    # Values rise to the right as the places do, and every actuator is to be seen.
+    rows, columns = np.nonzero(np.isfinite(picture))
+    assert np.corrcoef(columns, picture[rows, columns])[0, 1] > 0.99
+    assert set(np.unique(chart.numbers)) == {-1, *range(len(places))}
+
+
+def test_radial_profile_of_a_cone() -> None:
+    y, x = np.indices((41, 41)) - 20.0
+    profile = RadialProfile((41, 41), (20, 20))(np.hypot(x, y))
+    assert profile.size == 20
+    assert profile[0] == 0
+    assert np.abs(profile - np.arange(20)).max() < 0.3
+
+
+def test_outlines_of_lenslets_are_squares_and_of_pupils_circles() -> None:
+    squares = outline_points([(float(x), 0.0, 2.0) for x in range(20)])
+    assert np.nanmax(np.abs(squares[1])) == pytest.approx(2.0)
+    assert np.isnan(squares[0]).sum() == 20
+    circle = outline_points([(0.0, 0.0, 3.0)])
+    assert np.hypot(*circle[:, :-1]) == pytest.approx(3.0)
+
+
+def test_history_forgets_the_oldest() -> None:
+    history = History(4)
+    for k in range(11):
+        history.add(float(k), 10.0 * k)
+    times, values = history.arrays
+    assert times.tolist() == [7, 8, 9, 10]
+    assert values.tolist() == [70, 80, 90, 100]
+    history.clear()
+    assert history.arrays[0].size == 0
+
+
+def test_what_an_edit_changes() -> None:
+    loop = LoopState(matrix="escape", gain=0.4, leak=0.02, dropped_modes=3, modes=80)
+    assert LoopEdit("escape", 0.4, 0.02, 3).changed(loop) == {}
+    edit = LoopEdit("docrime", 0.4, 0.02, 5)
+    assert edit.changed(loop) == {"matrix": "docrime", "dropped_modes": 5}
+    assert edit.in_words(loop) == "matrix escape → docrime, dropped modes 3 → 5"
+    assert edit.problems(loop) == ()
+    assert LoopEdit("escape", 0.4, 0.02, 83).problems(loop) != ()
+
+
+# ---------------------------------------------------------------- the command
+def test_a_system_and_an_address_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run(["gui", "razor-shwfs", "--connect", "tcp://bench:5555"])
+    assert ended.value.code == 2
+    assert "not both" in capsys.readouterr().err
+
+
+def test_qt_keeps_its_references() -> None:
+    """PySide6 6.12.0 on Python < 3.12 drops one with every signal, and aborts within some thousands."""
+    code = (
+        "from PySide6.QtCore import QObject, Signal\n"
+        "class Bell(QObject):\n    rung = Signal(bool)\n"
+        "bell = Bell()\nfor _ in range(5000): bell.rung.emit(True)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 0

@@ -1,0 +1,71 @@
+"""Makes the pictures of the operator's tutorial: ``pytest -m screenshots``, on a machine with time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import serving
+from PIL import Image
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from whole_run import Operator, operating
+
+from escape_hw.remote.state import Phase
+
+FIGURES = Path(__file__).parents[2] / "docs" / "figures" / "gui"
+
+pytestmark = [pytest.mark.screenshots, pytest.mark.timeout(1800)]
+
+
+def picture(operator: Operator, name: str) -> None:
+    """Save the window with few colours: a page of pictures loads quickly."""
+    for note in tuple(operator.window.toasts.notes):
+        note.shut.click()
+    operator.settle(1.0)
+    FIGURES.mkdir(exist_ok=True)
+    path = FIGURES / f"{name}.png"
+    assert operator.window.grab().save(str(path))
+    with Image.open(path) as image:
+        few = image.convert("RGB").quantize(128)
+    few.save(path, optimize=True)
+
+
+def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving, "SYSTEM", "razor-shwfs")
+    with operating("razor-shwfs", tmp_path) as operator:
+        window = operator.window
+        panels, source = window.panels, window.context.session
+        operator.take_control()
+        operator.run("sensor")
+        window.show_workspace("align")
+        operator.settle(3.0)
+        picture(operator, "align")
+
+        window.show_workspace("calibrate")
+        operator.choose("escape", frames="2000")
+        picture(operator, "plan")
+        before = source.source.state.last.id
+        operator.press(operator.procedure.start)
+        operator.until(lambda: panels["modes"].which.currentData() == "as measured now", "maps fill in")
+        picture(operator, "measuring")
+        operator.until(lambda: operator.ended(before), "it ends")
+        operator.run("push-pull", frames="1")
+        operator.until(lambda: "push-pull" in panels["modes"].matrices, "the baseline is shown")
+        panels["modes"].mosaic.choose(9)
+        picture(operator, "detail")
+
+        operator.run("model-psf")
+        window.show_workspace("operate")
+        loop = panels["loop"]
+        held = [one.name for one in source.source.state.products if one.name.startswith("escape")]
+        loop.matrix.setCurrentText(min(held, key=len))
+        loop.matrix.activated.emit(loop.matrix.currentIndex())
+        QTest.mousePress(loop.close_button, Qt.MouseButton.LeftButton)
+        operator.settle(1.5)
+        QTest.mouseRelease(loop.close_button, Qt.MouseButton.LeftButton)
+        operator.until(lambda: source.source.state.phase is Phase.LOOP, "the loop is closed")
+        operator.settle(30.0)
+        picture(operator, "operate")
+        window.actions_by_name["open_loop"].trigger()
+        operator.until(lambda: not source.source.state.loop.closed, "the loop is open")

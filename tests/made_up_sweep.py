@@ -1,0 +1,35 @@
+"""A sweep whose loops are made up, so that what must be concluded from them is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from escape_hw.runtime.sweep.plan import EXPLORE, FINAL, Arm, Design, Slot
+from escape_hw.runtime.sweep.run import Sweep, SweepRun
+from escape_hw.runtime.sweep.space import parse_parameter
+from escape_hw.runtime.sweep.store import Record
+
+SWEPT = Sweep(
+    "",
+    (Arm("push-pull", False, __file__, ""), Arm("ESCAPE", False, __file__, "")),  # type: ignore[arg-type]
+    tuple(parse_parameter(text) for text in ("gain=0.1:1", "leak=0.01", "dropped_modes=0:9")),
+    Design(80),
+    400,
+    1,
+)
+
+
+def made_up(difference: float) -> SweepRun:
+    """Loops whose Strehl ratio is known: a hill in the gain, air in common, and a difference."""
+    rng, records = np.random.default_rng(1), []
+    for stage, count in ((EXPLORE, 40), (FINAL, 24)):
+        for index in range(count):
+            air = rng.normal(0, 0.03)
+            gain = float(rng.uniform(0.1, 1.0)) if stage == EXPLORE else 0.5
+            for arm, offset in (("push-pull", 0.0), ("ESCAPE", difference)):
+                merit = 0.5 + air - (gain - 0.5) ** 2 + offset + rng.normal(0, 0.004)
+                ways = {way: {"value": merit, "sigma": 0.01} for way in ("peak", "otf", "encircled")}
+                outcome = {"strehl": ways, "stable": True, "diverged": False}
+                values = {"gain": gain, "leak": 0.01, "dropped_modes": 3}
+                records.append(Record(Slot(stage, arm, index), values, outcome, merit))
+    return SweepRun(records)

@@ -1,0 +1,107 @@
+"""Keys: made once, readable by nobody else, asked for before anything listens to other machines."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+import pytest
+
+from escape_hw.errors import ConfigError, StorageError
+from escape_hw.remote import keys
+from escape_hw.remote.address import find_listing, is_loopback, resolve, servers
+
+OTHER = "X8nS7Q1AbBe5qEMxbWkJSWPHmZc84UmvUYdVdpc1"
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A home without keys and servers."""
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path
+
+
+def test_keys_are_made_once_and_are_the_users_own(document) -> None:
+    code, made, _ = document("keys", "make")
+    assert code == 0
+    assert len(made["public"]) == 40
+    for path in Path(made["folder"]).iterdir():
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert document("keys", "make")[1]["public"] == made["public"]
+    assert document("keys", "make", "--replace")[1]["public"] != made["public"]
+
+
+def test_a_secret_key_that_others_may_read_is_not_used() -> None:
+    keys.make_keys()
+    (keys.keys_folder() / "own.secret").chmod(0o644)
+    with pytest.raises(StorageError, match="others may read it; make new keys"):
+        keys.own_keys()
+
+
+def test_other_addresses_than_the_loopback_need_keys_and_somebody_to_let_in(escape, document) -> None:
+    serve = ("serve", "razor-shwfs", "--port", 40001, "--bind", "0.0.0.0")
+    code, _, said = escape(*serve)
+    assert code == 2
+    assert "make them with 'escape keys make'" in said
+    document("keys", "make")
+    code, _, said = escape(*serve)
+    assert code == 2
+    assert "no client is let in; add one with 'escape keys allow NAME KEY'" in said
+    assert find_listing("razor-shwfs") is None
+    assert servers() == ()
+
+
+def test_clients_are_let_in_and_out_by_name(document) -> None:
+    assert document("keys", "allow", "alice", OTHER)[0] == 0
+    assert document("keys", "trust", "bench.example.org", OTHER)[0] == 0
+    found = document("keys", "list")[1]
+    assert found["allowed"] == {"alice": OTHER}
+    assert found["servers"] == {"bench.example.org": OTHER}
+    assert found["public"] is None
+    assert document("keys", "forget", "alice")[0] == 0
+    assert document("keys", "forget", "alice")[0] == 2
+    assert keys.allowed_keys() == {}
+
+
+@pytest.mark.parametrize("name", ["../alice", "", "a/b", ".hidden", "x" * 65])
+def test_names_stay_in_their_folder(name: str) -> None:
+    with pytest.raises(ConfigError, match="a name has letters"):
+        keys.allow(name, OTHER)
+
+
+@pytest.mark.parametrize("key", ["", "short", OTHER + "1", " " * 40, "é" * 40, "~" * 40])
+def test_what_is_no_key_is_refused(key: str) -> None:
+    with pytest.raises(ConfigError, match="is no key"):
+        keys.allow("alice", key)
+
+
+def test_a_client_is_told_which_key_is_missing() -> None:
+    assert keys.client_keys("ipc:///anything") is None
+    assert keys.client_keys("tcp://127.0.0.1:5555") is None
+    with pytest.raises(ConfigError, match="far asks for a key; make one"):
+        keys.client_keys("tcp://far:5555")
+    own = keys.make_keys()
+    with pytest.raises(
+        ConfigError, match="the key of far is not known; add it with 'escape keys trust far KEY'"
+    ):
+        keys.client_keys("tcp://far:5555")
+    keys.trust("far", OTHER)
+    assert keys.client_keys("tcp://far:5555") == (OTHER.encode(), own.public, own.secret)
+
+
+def test_addresses() -> None:
+    assert [is_loopback(host) for host in ("127.0.0.1", "127.1.2.3", "localhost", "[::1]")] == [True] * 4
+    assert not any(map(is_loopback, ("0.0.0.0", "10.0.0.1", "*", "localhost.example.org")))
+    assert resolve("tcp://far:5555").events == "tcp://far:5556"
+    for wrong in ("tcp://far", "tcp://far:0", "tcp://far:70000", "http://far:5555", "tcp://a/b:5555"):
+        with pytest.raises(ConfigError, match="is no address"):
+            resolve(wrong)
+
+
+def test_a_runtime_folder_that_others_may_write_to_is_not_used(home: Path) -> None:
+    (home / "escape").mkdir(mode=0o700)
+    (home / "escape").chmod(0o777)
+    with pytest.raises(StorageError, match="others may write there"):
+        find_listing("razor-shwfs")

@@ -1,0 +1,58 @@
+"""The paper's numbers beside ours: a row for each, ours where the run is there."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from made_up_sweep import SWEPT, made_up
+
+from escape_hw.errors import ConfigError
+from escape_hw.io.run_folder import RunFolder
+from escape_hw.report.build import write_report
+from escape_hw.report.paper_results import write_results
+from escape_hw.runtime.paper import sweep_runs
+from escape_hw.runtime.sweep.document import sweep_document
+from escape_hw.runtime.sweep.result import conclude
+
+
+@pytest.fixture(scope="module")
+def sweep_run(tmp_path_factory):
+    with RunFolder("razor-shwfs", "sweep", tmp_path_factory.mktemp("sweep") / "run") as folder:
+        head = {"schema": 1, "command": "sweep", "system": "razor-shwfs", "simulated": True, "seed": 1}
+        folder.write_result({**head, **sweep_document(conclude(SWEPT, made_up(0.0), 0.01))})
+    return folder.path
+
+
+def test_without_runs_every_row_says_how_to_make_it(tmp_path):
+    text = write_results(tmp_path / "results", {}).read_text()
+    rows = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    assert len(rows) > 25
+    assert all("(not run)" in row and "`escape " in row for row in rows)
+    assert "Table 1, SHORT: Shift X [% of Sub Aperture] | −15.3 |" in text
+
+
+def test_a_sweep_fills_its_rows_and_draws_its_figures(tmp_path, sweep_run):
+    runs = sweep_runs([sweep_run])
+    assert list(runs) == ["sweep-shwfs"]
+    write_results(tmp_path, runs)
+    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
+    ours = {row["number"]: row["ours"] for row in rows if row["ours"]}
+    assert ours["razor-shwfs: randomised trials"] == "80, 128 loops in all"
+    assert "equivalent within" in ours["razor-shwfs: at their own best parameters"]
+    assert "importance of the choice of matrix" in " ".join(ours)
+    names = {path.name for path in tmp_path.glob("*.png")}
+    assert names == {f"sweep-shwfs-{part}.png" for part in ("loops", "importance", "differences")}
+    assert all(path.stat().st_size < 120_000 for path in tmp_path.glob("*.png"))
+
+
+def test_the_report_tells_of_a_sweep(sweep_run):
+    page = write_report(sweep_run).read_text()
+    for words in ("Sweep", "equivalent within", "Importance by functional analysis", "dropped modes"):
+        assert words in page
+
+
+def test_what_is_no_sweep_of_the_papers_is_refused(tmp_path):
+    (tmp_path / "result.json").write_text('{"system": "maps-nir", "sweep": {}, "products": {}}')
+    with pytest.raises(ConfigError, match="--sweep"):
+        sweep_runs([tmp_path])

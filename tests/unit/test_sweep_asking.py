@@ -1,0 +1,116 @@
+"""What may be swept where; a sweep on an open bench, as on hardware; conclusions from made-up loops."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+from made_up_sweep import SWEPT, made_up
+from small_system import SMALL, configuration
+
+import escape_hw
+from escape_hw.api.procedure import run
+from escape_hw.config.load import load_system
+from escape_hw.errors import ConfigError
+from escape_hw.io.provenance import sha256_of
+from escape_hw.runtime.sweep.ask import need_optuna, swept_space
+from escape_hw.runtime.sweep.document import criteria, sweep_document, trials_csv
+from escape_hw.runtime.sweep.kept import KeptSweep, read_kept
+from escape_hw.runtime.sweep.plan import Arm, Design
+from escape_hw.runtime.sweep.result import conclude
+from escape_hw.runtime.sweep.run import Sweep, run_sweep
+from escape_hw.runtime.sweep.space import default_space, parse_parameter
+
+
+def test_hardware_wants_a_persons_limits_on_everything():
+    config = load_system("razor-shwfs", mode="hardware")
+    with pytest.raises(ConfigError, match="leak, dropped_modes"):
+        swept_space(config, ["gain=0.1:0.5"])
+    limits = ["gain=0.1:0.5", "leak=0.01:0.05", "dropped_modes=10:20"]
+    assert [one.to_text() for one in swept_space(config, limits)] == limits
+    for text in ("twin.latency_s=0:1e-3", "delay=0:1", "calibration.poke=0.01:0.02"):
+        with pytest.raises(ConfigError, match="on hardware only"):
+            swept_space(config, [*limits, text])
+
+
+@pytest.mark.parametrize("text", ["gian=0:1", "sensor.threshold=0:1", "basis.n_modes=10:20"])
+def test_what_cannot_be_varied_is_said(text):
+    with pytest.raises(ConfigError, match="--vary"):
+        swept_space(configuration(), [text])
+
+
+def test_ranges_beyond_the_configurations_are_refused():
+    for text in ("gain=0.1:9", "leak=0:2", "dropped_modes=0:30", "twin.loss_probability=0:0.9", "twin.x=0:1"):
+        arm = Arm("A", False, __file__, "")
+        space = default_space(30, [parse_parameter(text)])
+        swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
+        with pytest.raises(ConfigError, match=text.partition("=")[0]):
+            KeptSweep(swept, "sqlite://", "s", "random", 0.01).checked()
+
+
+def test_passwords_are_not_written(tmp_path):
+    (tmp_path / "im.fits").write_bytes(b"")
+    path = tmp_path / "im.fits"
+    arm = Arm("A", False, path, sha256_of(path))
+    space = default_space(30, [parse_parameter("gain=0.1:1")])
+    swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
+    url = "postgresql+psycopg://me:secret@host/sweeps"
+    assert "secret" not in KeptSweep(swept, url, "s", "random", 0.01).keep(tmp_path).read_text()
+    with pytest.raises(ConfigError, match="--storage"):
+        read_kept(tmp_path)
+    assert read_kept(tmp_path, url).storage == url
+
+
+def test_without_optuna_the_way_out_is_named(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"escape-hw\[sweep\]"):
+        need_optuna()
+
+
+def test_a_sweep_on_an_open_bench(tmp_path):
+    with escape_hw.open_system("razor-shwfs", set=SMALL) as bench:
+        path = escape_hw.save_matrix(tmp_path / "im.fits", bench.calibrate("push-pull"))
+        np.save(tmp_path / "psf.npy", bench.take_model_psf())
+        sent = []
+        arms = tuple(Arm(name, False, path, sha256_of(path)) for name in ("A", "B"))
+        space = tuple(parse_parameter(t) for t in ("gain=0.3:0.6", "leak=0.01", "dropped_modes=2:6"))
+        swept = Sweep(
+            bench.config.to_toml(), arms, space, Design(4, 1, 1, 6), 200, 1,
+            psf=str(tmp_path / "psf.npy"), simulated=False,
+        )  # fmt: skip
+        kept = KeptSweep(swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05).checked()
+        kept.keep(tmp_path)
+        assert read_kept(tmp_path) == kept
+        found = run(run_sweep(swept, kept.store(), bench), observers=(sent.append,))
+        assert np.all(bench.dm.shape == 0)
+    result = conclude(swept, found, 0.05)
+    assert len(found.records) == 4 + 2 + 12
+    done = [progress.done for progress in sent if progress.stage == "sweep"]
+    assert done == sorted(set(done))
+    assert done[-1] == 18
+    for record in found.records:
+        assert 0.3 <= record.values["gain"] <= 0.6
+        assert 2 <= record.values["dropped_modes"] <= 6
+        assert record.values["leak"] == 0.01
+    assert set(result.best) == {"A", "B"}
+    assert sweep_document(result)["sweep"]["loops"] == {"explore": 4, "shortlist": 2, "final": 12}
+    assert len(trials_csv(result).splitlines()) == 1 + 18
+
+
+@pytest.mark.parametrize(
+    ("difference", "word"), [(0.0, "equivalent"), (0.05, "ESCAPE better"), (-0.05, "worse")]
+)
+def test_conclusions(difference, word):
+    result = conclude(SWEPT, made_up(difference), 0.01)
+    (one,) = result.comparisons
+    assert one.found.mean == pytest.approx(difference, abs=0.005)
+    assert (word if word != "worse" else "push-pull better than ESCAPE") in one.text
+    assert criteria(result)[-1]["met"] == (difference >= 0)
+    # The hill in the gain is what matters, unless the matrices differ by more than it does.
+    assert result.importance["gain"] > 0.5
+    assert result.importance["chance"] < 0.1
+    assert (result.importance["matrix"] > result.importance["chance"]) == (difference != 0)
+    # At the same random parameters the same difference shows.
+    assert result.at_random[0].found.mean == pytest.approx(difference, abs=0.005)
+    assert result.at_random[0].found.pairs == 40
