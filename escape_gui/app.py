@@ -10,6 +10,7 @@ import pyqtgraph
 from PySide6.QtCore import QObject, QTimer
 from PySide6.QtWidgets import QApplication
 
+from escape_gui.display import check_display
 from escape_gui.exports import save_png
 from escape_gui.live import Attachment, LiveSource
 from escape_gui.main_window import MainWindow
@@ -106,8 +107,9 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     Raises
     ------
     ConfigError
-        There is no such system.
+        There is no such system, or no display.
     """
+    check_display()
     qt = application()
     recording = bool(system) and is_recording(Path(system))
     address, own = ("", None) if recording else _server(system, address)

@@ -15,6 +15,8 @@ from escape_hw.remote.source import Source
 from escape_hw.remote.state import State
 
 _KEPT = 4096
+#: Seconds between two states from which on there is a gap in the curves.
+_GAP_S = 2.0
 
 
 class PerformancePanel(Panel):
@@ -24,8 +26,8 @@ class PerformancePanel(Panel):
     title: ClassVar[str] = "Performance"
     help: ClassVar[str] = (
         "Strehl ratio of the science camera by its peak against the model, and residual wavefront of the "
-        "modes the loop controls, over the last two minutes. Gaps: the loop was open, or there is no model "
-        "image."
+        "modes the loop controls, over the last two minutes. Gaps: the panel was "
+        "hidden, the loop was open, or there is no model image."
     )
     rate_hz: ClassVar[float] = 10.0
     empty: ClassVar[str] = (
@@ -52,6 +54,7 @@ class PerformancePanel(Panel):
         self.body.addWidget(self.strehl, 1)
         self.body.addWidget(self.residual, 1)
         self._history = {"strehl": History(_KEPT), "residual": History(_KEPT)}
+        self._last = time.monotonic()
 
     def take_state(self, state: State) -> None:
         """Another point of each curve."""
@@ -63,6 +66,11 @@ class PerformancePanel(Panel):
         strehl = np.nan if loop.strehl is None or not loop.closed else 100 * loop.strehl
         # None was measured yet in the moment of closing.
         residual = loop.residual_nm if loop.closed and loop.residual_nm > 0 else np.nan
+        if now - self._last > _GAP_S:
+            # Nobody looked meanwhile: no line leads across.
+            for history in self._history.values():
+                history.add(now, np.nan)
+        self._last = now
         self._history["strehl"].add(now, strehl)
         self._history["residual"].add(now, residual)
         sigma = "" if loop.strehl_sigma is None else f" ± {100 * loop.strehl_sigma:.1f}"

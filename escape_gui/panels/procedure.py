@@ -77,7 +77,7 @@ class ProcedurePanel(Panel):
         self.form.edited.connect(self._edit)
         self.plan = _words()
         self.plan.setAccessibleName("Plan")
-        for widget, stretch in ((self.choice, 0), (self._about, 0), (self.form, 1), (self.plan, 0)):
+        for widget, stretch in ((self.choice, 0), (self._about, 0), (self.form, 2), (self.plan, 0)):
             self.body.addWidget(widget, stretch)
 
     def _make_buttons(self) -> None:

@@ -238,14 +238,26 @@ def test_log_search_level_and_copy(window: MainWindow, source: ScriptedSource) -
     assert "message 4" in QGuiApplication.clipboard().text()
 
 
-def test_performance_has_gaps_where_the_loop_was_open(window: MainWindow, source: ScriptedSource) -> None:
+def test_performance_has_gaps_where_nobody_looked(window: MainWindow, source: ScriptedSource) -> None:
+    panel = panel_of(window, PerformancePanel)
+    panel._last -= 60.0
+    source.change(loop=source.state.loop.model_copy(update={"residual_nm": 50.0}))
+    window.ticker.tick(everything=True)
+    (table,) = panel.shown()
+    assert np.isnan(table.data[-2, 1:]).all()
+    assert table.data[-1, 2] == 50.0
+
+
+def test_performance_has_gaps_where_the_loop_was_open(
+    window: MainWindow, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("escape_gui.panels.performance._GAP_S", np.inf)
     panel = panel_of(window, PerformancePanel)
     source.change(loop=source.state.loop.model_copy(update={"closed": False}))
     window.ticker.tick(everything=True)
     (table,) = panel.shown()
-    assert table.data.shape == (2, 3)
-    assert table.data[0, 1:] == pytest.approx([36.5, 44.0])
-    assert np.isnan(table.data[1, 1:]).all()
+    assert table.data[-2, 1:] == pytest.approx([36.5, 44.0])
+    assert np.isnan(table.data[-1, 1:]).all()
 
 
 def test_profiles_begin_at_the_strehl_ratio(make_window: MakeWindow, source: ScriptedSource) -> None:

@@ -13,6 +13,7 @@ import pytest
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, disc, rows_of, secondary
 
+from escape_gui.display import check_display
 from escape_gui.loop_form import LoopEdit
 from escape_gui.maps import GAP, ActuatorMap, mask_of, slope_maps
 from escape_gui.radial import RadialProfile
@@ -22,6 +23,7 @@ from escape_gui.theme import PALETTES, SCALES, Colours, Theme, contrast
 from escape_gui.widgets.quiver import outline_points
 from escape_gui.widgets.strip_chart import History
 from escape_hw.cli.app import run
+from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Geometry, LoopState
 
 SURFACES = ("window", "panel", "field")
@@ -238,6 +240,20 @@ def test_a_system_and_an_address_are_refused(capsys: pytest.CaptureFixture[str])
         run(["gui", "razor-shwfs", "--connect", "tcp://bench:5555"])
     assert ended.value.code == 2
     assert "not both" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("display", "said"), [("", "ssh -X"), (":0", "apt install libxcb-cursor0")])
+def test_without_a_display_the_way_out_is_told(
+    monkeypatch: pytest.MonkeyPatch, display: str, said: str
+) -> None:
+    for name in ("QT_QPA_PLATFORM", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    with pytest.raises(ConfigError, match=said):
+        check_display()
+    monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
+    check_display()
 
 
 def test_qt_keeps_its_references() -> None:

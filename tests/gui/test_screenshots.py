@@ -27,7 +27,7 @@ def picture(operator: Operator, name: str) -> None:
     path = FIGURES / f"{name}.png"
     assert operator.window.grab().save(str(path))
     with Image.open(path) as image:
-        few = image.convert("RGB").quantize(128)
+        few = image.convert("RGB").quantize(256)
     few.save(path, optimize=True)
 
 

@@ -1,0 +1,73 @@
+"""A window that is killed or hangs: the closed loop does not notice, and the next window finds the server."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from serving import SYSTEM, Served, serving, until_idle, wait_for
+from small_system import configuration
+
+from escape_hw.remote.client import Connection
+from escape_hw.remote.state import Phase
+
+#: Longest wait for a window that loads its libraries on a busy machine, seconds.
+ATTACH_S = 60.0
+
+
+def window(served: Served) -> subprocess.Popen[bytes]:
+    """``escape gui`` on the server, without a screen."""
+    code = "from escape_hw.cli import main; main()"
+    environment = {
+        **served.environment, "QT_QPA_PLATFORM": "offscreen", "XDG_CONFIG_HOME": str(served.folder),
+    }  # fmt: skip
+    words = [sys.executable, "-c", code, "gui", "--connect", SYSTEM]
+    return subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def closed_loop(bench: Connection) -> None:
+    """Calibrate a little and close the loop."""
+    bench.calibrate("docrime", frames=600)
+    matrix = bench.state.products[-1].name
+    bench.close_loop(matrix, gain=0.3)
+    wait_for(lambda: bench.state.loop.closed and bench.state.phase is Phase.LOOP, "the loop is closed")
+
+
+def advances(bench: Connection, frames: int) -> None:
+    """The loop takes so many further frames without a fault."""
+    before = bench.state.rates.frames
+    wait_for(lambda: bench.state.rates.frames > before + frames, "frames go on")
+    assert bench.state.fault is None
+    assert bench.state.loop.closed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+def test_the_loop_does_not_notice_a_window_that_dies(number: int, tmp_path: Path) -> None:
+    small = tmp_path / "small.toml"
+    small.write_text(configuration().to_toml())
+    with serving(small, "--set", "server.silent_s=60", folder=tmp_path) as served:
+        bench = served.connect(control=True)
+        windows: list[subprocess.Popen[bytes]] = []
+        try:
+            until_idle(bench)
+            closed_loop(bench)
+            alone = bench.state.clients
+            windows.append(window(served))
+            wait_for(lambda: bench.state.clients == alone + 1, "the window is attached", ATTACH_S)
+            advances(bench, 200)
+            os.kill(windows[0].pid, number)
+            advances(bench, 500)
+            windows.append(window(served))
+            wait_for(lambda: bench.state.clients >= alone + 1, "the next window is attached", ATTACH_S)
+            advances(bench, 200)
+            bench.open_loop()
+        finally:
+            for one in windows:
+                one.kill()
+                one.wait()
+            bench.close()
