@@ -13,7 +13,8 @@ import pytest
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 
 import shiboken6
-from PySide6.QtCore import QCoreApplication, QEvent, QTimer
+from gui_windows import dispose, settle, shown
+from PySide6.QtCore import QTimer
 from PySide6.QtWidgets import QApplication
 from scripted import ScriptedControl, ScriptedSource
 
@@ -49,14 +50,6 @@ def timers() -> set[int]:
 def widgets() -> dict[int, str]:
     """All widgets by the place of their C++ half; wrappers come and go."""
     return {shiboken6.getCppPointer(one)[0]: repr(one) for one in QApplication.allWidgets()}
-
-
-def settle() -> None:
-    """Let Qt delete what was to be deleted, and Python what nobody holds."""
-    QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete.value)
-    QCoreApplication.processEvents()
-    gc.collect()
-    QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete.value)
 
 
 @pytest.fixture(autouse=True)
@@ -100,24 +93,6 @@ def session(source: ScriptedSource, control: ScriptedControl) -> Iterator[Sessio
     yield session
     session.close()
     session.deleteLater()
-
-
-def shown(
-    session: Session, store: Path, panels: Sequence[type[Panel]] = PANELS, settings: Settings | None = None
-) -> MainWindow:
-    """A window that has looked once at everything."""
-    window = MainWindow(session, settings or Settings(), store, panels)
-    window.show()
-    QCoreApplication.processEvents()
-    window.ticker.tick(everything=True)
-    QCoreApplication.processEvents()
-    return window
-
-
-def dispose(window: MainWindow) -> None:
-    """Close a window and all it holds."""
-    window.close()
-    window.deleteLater()
 
 
 @pytest.fixture

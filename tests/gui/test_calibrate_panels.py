@@ -9,7 +9,7 @@ from pathlib import Path
 import fake_results as fake
 import numpy as np
 import pytest
-from conftest import dispose, shown
+from gui_windows import dispose, shown
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import recorded_run
-from conftest import dispose
+from gui_windows import dispose
 from PySide6.QtCore import QMimeData, QPoint, QPointF, Qt, QUrl
 from PySide6.QtGui import QDragEnterEvent, QDropEvent
 from PySide6.QtWidgets import QApplication, QFileDialog

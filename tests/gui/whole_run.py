@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import serving
-from conftest import dispose
+from gui_windows import dispose
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton

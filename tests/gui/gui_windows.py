@@ -1,0 +1,41 @@
+"""Windows for tests: made, looked at, closed, and nothing of them left behind."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Sequence
+from pathlib import Path
+
+from PySide6.QtCore import QCoreApplication, QEvent
+
+from escape_gui.main_window import MainWindow
+from escape_gui.panels import PANELS
+from escape_gui.panels.panel import Panel
+from escape_gui.session import Session
+from escape_gui.settings import Settings
+
+
+def settle() -> None:
+    """Let Qt delete what was to be deleted, and Python what nobody holds."""
+    QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete.value)
+    QCoreApplication.processEvents()
+    gc.collect()
+    QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete.value)
+
+
+def shown(
+    session: Session, store: Path, panels: Sequence[type[Panel]] = PANELS, settings: Settings | None = None
+) -> MainWindow:
+    """A window that has looked once at everything."""
+    window = MainWindow(session, settings or Settings(), store, panels)
+    window.show()
+    QCoreApplication.processEvents()
+    window.ticker.tick(everything=True)
+    QCoreApplication.processEvents()
+    return window
+
+
+def dispose(window: MainWindow) -> None:
+    """Close a window and all it holds."""
+    window.close()
+    window.deleteLater()
