@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from escape_hw.calibration.demodulation import line_frequencies
 from escape_hw.calibration.docrime import least_frames
@@ -24,10 +25,12 @@ _PUSH_PULL_FIRST, _SETTLING = 50, 2
 _ROUNDS = 3
 #: Standard deviations of the sum of random pokes that some actuator reaches in a run.
 _REACHED = 4.0
+#: Share of the frames whose pokes the limits may shorten before the plan says so.
+_SHORTENED = 0.05
 #: Science frames of a model PSF.
 _PSF_FRAMES = 20
 #: Methods that poke every mode in every frame.
-_RANDOM = ("docrime", "escape", "push-pull-fast", "gains", "track")
+_RANDOM = ("docrime", "escape", "gains", "track")
 
 
 class Planner:
@@ -53,10 +56,11 @@ class Planner:
         """
         rate = self._bench.wfs.settings.frame_rate_hz
         frames = self._frames(name, arguments, rate)
-        stroke = self._stroke(name, arguments)
+        each = self._each_poke(arguments)
         return Plan(
-            name=name, arguments=dict(arguments), frames=frames, seconds=frames / rate, stroke=stroke,
-            warnings=tuple(self._warnings(name, arguments, stroke)),
+            name=name, arguments=dict(arguments), frames=frames, seconds=frames / rate,
+            stroke=min(_largest(name, each), self._bench.dm.limits.max_stroke),
+            warnings=tuple(self._warnings(name, arguments, each)),
         )  # fmt: skip
 
     def _frames(self, name: str, arguments: Arguments, rate: float) -> int:
@@ -79,26 +83,24 @@ class Planner:
             return psf + math.ceil(float(arguments.get("seconds") or 0.0) * rate)
         return psf + frames
 
-    def _stroke(self, name: str, arguments: Arguments) -> float:
-        """Largest poke of an actuator, fraction of full stroke."""
+    def _each_poke(self, arguments: Arguments) -> NDArray[np.float64]:
+        """Largest poke of every actuator by every mode ``(n_act, n_modes)``, fraction of full stroke."""
         poke = arguments.get("poke")
         if poke is None:
-            return 0.0
+            return np.zeros((0, 0))
         if self._m2c is None:
             self._m2c = modal_basis(self._bench)
-        amplitude = poke_amplitudes(self._bench, self._m2c, float(poke))
-        each = np.abs(self._m2c * amplitude)
-        if name not in _RANDOM:
-            return float(each.max())
-        # Uniform pokes of amplitude a have the standard deviation a / sqrt(3).
-        usual = _REACHED * np.sqrt(np.square(each).sum(axis=1) / 3)
-        return float(np.minimum(usual, each.sum(axis=1)).max())
+        return np.abs(self._m2c * poke_amplitudes(self._bench, self._m2c, float(poke)))
 
-    def _warnings(self, name: str, arguments: Arguments, stroke: float) -> list[str]:
+    def _warnings(self, name: str, arguments: Arguments, each: NDArray[np.float64]) -> list[str]:
         bench, found = self._bench, []
         limit = bench.dm.limits.max_stroke
-        if stroke > limit:
-            found.append(f"pokes of {stroke:.2f} of the stroke are shortened to the limit of {limit:g}")
+        share = _beyond(name, each, limit)
+        if share > _SHORTENED:
+            found.append(
+                f"in {100 * share:.2g} % of the frames the pokes would pass {limit:g} of the stroke; "
+                "they are shortened as a whole, which the estimate knows"
+            )
         frames = int(arguments.get("frames") or 0)
         least = least_frames(bench.config.calibration, bench.config.basis.n_modes)
         if name in ("docrime", "push-pull-fast") and frames < least:
@@ -108,3 +110,30 @@ class Planner:
         if arguments.get("snr") is not None or arguments.get("accuracy") is not None:
             found.append("it may stop earlier, when the target is reached")
         return found
+
+
+def _usual(each: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviation of every actuator's command when all modes are poked at once ``(n_act,)``.
+
+    Uniform pokes of amplitude ``a`` have the standard deviation ``a / sqrt(3)``.
+    """
+    return np.asarray(np.sqrt(np.square(each).sum(axis=1) / 3), np.float64)
+
+
+def _largest(name: str, each: NDArray[np.float64]) -> float:
+    """Largest command of an actuator that a run's pokes ask for, fraction of full stroke."""
+    if not each.size:
+        return 0.0
+    if name not in _RANDOM:
+        return float(each.max())
+    return float(np.minimum(_REACHED * _usual(each), each.sum(axis=1)).max())
+
+
+def _beyond(name: str, each: NDArray[np.float64], limit: float) -> float:
+    """Share of the frames in which some actuator would pass the limit, at most (union bound)."""
+    if not each.size or _largest(name, each) <= limit:
+        return 0.0
+    if name not in _RANDOM:
+        return 1.0
+    usual = _usual(each)
+    return float(min(1.0, 2 * norm.sf(limit / usual[usual > 0]).sum()))
