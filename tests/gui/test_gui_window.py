@@ -19,7 +19,7 @@ from escape_gui.settings import Settings, load_settings
 from escape_gui.widgets.picture import Picture
 from escape_gui.workspaces import WORKSPACES
 from escape_hw.remote.source import Source
-from escape_hw.remote.state import Ended, Finish, Health
+from escape_hw.remote.state import Ended, Finish, Health, Parameter, ProcedureEntry
 
 MakeWindow = Callable[..., MainWindow]
 
@@ -230,3 +230,30 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
     assert window.panels["camera"].is_empty
     dispose(window)
     session.close()
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.4])
+def test_the_window_fits_a_small_screen(
+    make_window: MakeWindow, source: ScriptedSource, scale: float
+) -> None:
+    """1366 x 768 with a task bar, even while a fault takes a row more."""
+    source.offers = (
+        ProcedureEntry(
+            name="escape",
+            title="ESCAPE",
+            help="Measures an interaction matrix. " * 12,
+            parameters=tuple(Parameter(name=f"number {k}", kind="int", default=k) for k in range(9)),
+        ),
+    )
+    source.change(last=Ended(id=1, name="escape", finish=Finish.DONE, message="all went well " * 20))
+    source.fail()
+    window = make_window(settings=Settings(font_scale=scale))
+    window.ticker.tick(everything=True)
+    for one in WORKSPACES:
+        window.show_workspace(one.name)
+        QApplication.processEvents()
+        window.ticker.tick(everything=True)
+        QApplication.processEvents()
+        assert window.minimumSizeHint().height() <= 700, one.name
+        window.resize(round(1366 * scale), 700)
+        assert window.height() == 700
