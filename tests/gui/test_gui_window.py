@@ -17,9 +17,10 @@ from escape_gui.main_window import MainWindow
 from escape_gui.session import NoSource, Session
 from escape_gui.settings import Settings, load_settings
 from escape_gui.widgets.picture import Picture
+from escape_gui.widgets.status_pill import Level
 from escape_gui.workspaces import WORKSPACES
 from escape_hw.remote.source import Source
-from escape_hw.remote.state import Ended, Finish, Health, Parameter, ProcedureEntry
+from escape_hw.remote.state import Ended, Finish, Health, Parameter, ProcedureEntry, Rates
 
 MakeWindow = Callable[..., MainWindow]
 
@@ -79,6 +80,14 @@ def test_the_band_says_what_it_is(small_window: MainWindow, source: ScriptedSour
     window.context.session.use(source, None)
     window.refresh()
     assert strip.text().startswith("REPLAY")
+
+
+def test_light_is_unknown_until_frames_come(small_window: MainWindow, source: ScriptedSource) -> None:
+    light = small_window.band.light
+    assert (light.level, light.word) == (Level.GOOD, "saturated 0.04 %")
+    source.change(rates=Rates())
+    small_window.refresh()
+    assert (light.level, light.word) == (Level.QUIET, "saturated –")
 
 
 def test_a_fault_stays_until_it_is_cleared(
@@ -228,6 +237,14 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
     assert not quiet.connected
     window = shown(session, tmp_path / "gui.json")
     assert window.panels["camera"].is_empty
+    band = window.band
+    assert "escape serve SYSTEM" in band.strip.text()
+    assert "old" not in band.strip.text()
+    assert {one.text for one in band.readouts.values()} == {"–"}
+    for pill in (band.phase, band.loop, band.light, band.control):
+        assert pill.level is Level.QUIET
+        assert pill.word.endswith("–")
+    assert "escape serve SYSTEM" in window.panels["loop"]._nothing.text()
     dispose(window)
     session.close()
 
