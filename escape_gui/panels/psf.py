@@ -21,9 +21,7 @@ _FLOOR = 1e-4
 CAPTIONS = {"psf": "measured, solid", "model_psf": "model, dashed"}
 #: Instead of the model while there is none, and why that matters.
 NO_MODEL = "no model image yet: run model-psf"
-NO_MODEL_TIP = (
-    "The Strehl ratio is the image's peak against the model's; 'Model PSF' measures it"
-)
+NO_MODEL_TIP = "The Strehl ratio is the image's peak against the model's; 'Model PSF' measures it"
 
 
 class PsfPanel(Panel):

@@ -115,6 +115,29 @@ def test_the_end_of_a_run_is_told(small_window: MainWindow, source: ScriptedSour
     assert small_window.toasts.notes == []
 
 
+def test_a_note_covers_nothing(
+    small_window: MainWindow, qtbot: QtBot, qapp: QApplication, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    window, toasts = small_window, small_window.toasts
+    where = {name: dock.geometry() for name, dock in window.docks.items()}
+    monkeypatch.setattr("escape_gui.widgets.toasts.SHOWN_MS", 30)
+    toasts.tell(Level.BAD, "Not saved", "the disk is full, " * 40 + "\n/runs/2")
+    toasts.tell(Level.GOOD, "Saved", "/runs/3")
+    qapp.processEvents()
+    bad, good = toasts.notes
+    assert good.isVisible()
+    assert not bad.isVisible()
+    assert {name: dock.geometry() for name, dock in window.docks.items()} == where
+    assert window.statusBar().isAncestorOf(good)
+    assert window.width() == 1280
+    assert "/runs/2" in bad.toolTip()
+    # What informs goes by itself; what is bad comes back and stays.
+    qtbot.waitUntil(lambda: toasts.notes == [bad])
+    qapp.processEvents()
+    assert bad.isVisible()
+    assert bad.shut.mapTo(window, QPoint(0, 0)).x() < window.width()
+
+
 def test_a_refused_request_is_told(small_window: MainWindow, control: ScriptedControl, qtbot: QtBot) -> None:
     control.refuse = "ben has control since 20:00"
     small_window.actions_by_name["give_back"].trigger()
