@@ -66,8 +66,9 @@ WORKSPACES: tuple[Workspace, ...] = (
         "Calibrate",
         "Interaction matrix, registration, optical gains",
         (
-            Column((Cell(("procedure",), 1.9), Cell(("camera", "devices", "log"), 1.0)), 1.0),
-            Column((Cell(("modes",)),), 1.4),
+            # The form with its plan and its result takes a whole column of a small screen.
+            Column((Cell(("procedure",)),), 1.0),
+            Column((Cell(("modes",), 1.6), Cell(("camera", "devices", "log"), 1.0)), 1.4),
             Column((Cell(("sprint",), 1.2), Cell(("gains",), 1.0)), 1.1),
         ),
     ),

@@ -68,7 +68,9 @@ class ArgumentForm(QWidget):
             row.setSpacing(8)
             row.addWidget(field, 1)
             if one.unit:
-                row.addWidget(QLabel(one.unit))
+                unit = QLabel(one.unit)
+                unit.setObjectName("caption")
+                row.addWidget(unit)
             name = QLabel(words.label(one))
             name.setToolTip(words.hint(one))
             name.setBuddy(field)

@@ -8,12 +8,21 @@ from pathlib import Path
 import pytest
 from gui_windows import dispose, settle, shown
 from PySide6.QtCore import QPoint, Qt
-from PySide6.QtWidgets import QAbstractButton, QAbstractSpinBox, QApplication, QComboBox, QLineEdit, QTabBar
+from PySide6.QtWidgets import (
+    QAbstractButton,
+    QAbstractSpinBox,
+    QApplication,
+    QComboBox,
+    QLabel,
+    QLineEdit,
+    QTabBar,
+)
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, ScriptedSource
 
 from escape_gui.band import Band
 from escape_gui.main_window import MainWindow
+from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.session import NoSource, Session
 from escape_gui.settings import Settings, load_settings
 from escape_gui.widgets.picture import Picture
@@ -113,6 +122,43 @@ def test_the_end_of_a_run_is_told(small_window: MainWindow, source: ScriptedSour
     assert (note.title, note.text) == ("escape failed", "too dark\n/runs/2")
     note.shut.click()
     assert small_window.toasts.notes == []
+
+
+def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: ScriptedSource) -> None:
+    """Nine arguments and five lines of result at 1280 x 800, and no unit at its field's edge."""
+    parameters = (
+        Parameter(name="poke", kind="float", default=0.01, unit="of full stroke"),
+        Parameter(name="accuracy", kind="float", unit="% of a sub-aperture"),
+        *(Parameter(name=f"number {k}", kind="int", default=k, unit="frame") for k in range(7)),
+    )
+    about = "Calibrates without a calibration source: DO-CRIME on the turbulence, then SPRINT. " * 2
+    source.offers = (ProcedureEntry(name="escape", title="ESCAPE", help=about, parameters=parameters),)
+    document = {
+        "gain": 0.97,
+        "residual_rms_nm": 44.0,
+        "snr": {"min": 8.2},
+        "strehl": {"peak": {"value": 0.4}},
+    }
+    source.change(last=Ended(id=1, name="escape", finish=Finish.DONE, folder="/runs/2", document=document))
+    window = make_window(settings=Settings(workspace="calibrate"))
+    panel = window.panels["procedure"]
+    assert isinstance(panel, ProcedurePanel)
+    for _ in range(3):
+        window.ticker.tick(everything=True)
+        QApplication.processEvents()
+    fields = panel.form.fields.values()
+    assert len(fields) == 9
+    for widget in (*fields, panel.numbers, panel.start):
+        assert widget.visibleRegion().boundingRect() == widget.rect(), widget.accessibleName()
+    for field in fields:
+        unit = next(
+            one
+            for one in field.parentWidget().findChildren(QLabel)
+            if one.text() in ("of full stroke", "% of a sub-aperture", "frame")
+            and one.geometry().center().y() - field.geometry().center().y() in (-1, 0, 1)
+        )
+        assert unit.geometry().left() - field.geometry().right() > 8
+        assert field.width() >= 60
 
 
 def test_a_note_covers_nothing(
