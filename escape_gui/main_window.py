@@ -45,7 +45,7 @@ from escape_hw.errors import StorageError
 
 log = logging.getLogger(__name__)
 #: Version of the arrangement Qt stores; layouts of another one are dropped.
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 
 
 class MainWindow(QMainWindow):

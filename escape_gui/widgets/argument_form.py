@@ -57,6 +57,7 @@ class ArgumentForm(QWidget):
         form = QFormLayout(page)
         form.setContentsMargins(0, 0, 8, 0)
         form.setVerticalSpacing(4)
+        form.setHorizontalSpacing(8)
         form.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         for one in self._parameters:
             field = self._field(one)
