@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 #: Seconds that an engine has to end in order: a partial result is saved meanwhile.
 ENDING_S = 60.0
+#: Seconds that an engine has to its first word: it imports, reads and builds before it can speak.
+STARTING_S = 120.0
 _ENGINE, _GUARDIAN = "escape_hw.server.engine", "escape_hw.server.guardian"
 
 
@@ -42,7 +44,9 @@ class EngineProcess:
     said_goodbye
         Whether the engine ended in order.
     heard
-        When it last said something, monotonic seconds.
+        When it last said something, monotonic seconds; when it was started, before its first word.
+    has_spoken
+        Whether it has said anything yet.
     """
 
     def __init__(self, setup: Setup, incidents: str) -> None:
@@ -65,7 +69,7 @@ class EngineProcess:
         self._guardian.stdin.close()
         self._lines = Lines()
         self._unsent = b""
-        self.said_goodbye = False
+        self.said_goodbye = self.has_spoken = False
         self.heard = time.monotonic()
         self.send(setup.model_dump(mode="json"))
         self.connection.setblocking(False)
@@ -103,7 +107,7 @@ class EngineProcess:
                 return
             if not data:
                 return
-            self.heard = time.monotonic()
+            self.heard, self.has_spoken = time.monotonic(), True
             for message in self._lines.feed(data):
                 self.said_goodbye = self.said_goodbye or "goodbye" in message
                 yield message

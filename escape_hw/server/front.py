@@ -20,7 +20,7 @@ from escape_hw.remote import requests as ask
 from escape_hw.remote.source import STREAMS
 from escape_hw.remote.state import SCHEMA, Ended, Fault, LogLine, Phase, State
 from escape_hw.server.door import Door, Letter
-from escape_hw.server.engine_process import EngineProcess
+from escape_hw.server.engine_process import STARTING_S, EngineProcess
 from escape_hw.server.journal import Journal
 from escape_hw.server.lease import Client, LeaseBook
 from escape_hw.server.log_book import LogBook
@@ -155,6 +155,8 @@ class Front:
             return
         self._mind_abandoned(engine)
         silent, limit = now - engine.heard, self._config.server.silent_s
+        if not engine.has_spoken:
+            limit = max(limit, STARTING_S)
         waiting = [one for one in self._pending.values() if isinstance(one.letter.request, _SAFETY)]
         if silent > limit:
             self._condemn(engine, f"the engine was silent for {silent:.1f} s (limit {limit:g} s)")
