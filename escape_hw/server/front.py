@@ -20,7 +20,7 @@ from escape_hw.remote import requests as ask
 from escape_hw.remote.source import STREAMS
 from escape_hw.remote.state import SCHEMA, Ended, Fault, LogLine, Phase, State
 from escape_hw.server.door import Door, Letter
-from escape_hw.server.engine_process import STARTING_S, EngineProcess
+from escape_hw.server.engine_process import EngineProcess
 from escape_hw.server.journal import Journal
 from escape_hw.server.lease import Client, LeaseBook
 from escape_hw.server.log_book import LogBook
@@ -147,16 +147,18 @@ class Front:
         if engine is None:
             return
         engine.flush()
-        if now - self._ticked > _TICK_S:
+        # Looked at before the engine is: a guardian ends in order only after its engine.
+        tick, guarded = now - self._ticked > _TICK_S, engine.guarded()
+        if tick:
             self._ticked = now
             engine.send({"alive": True})
         if engine.ended():
             self._bury(engine)
             return
+        if tick and not guarded:
+            engine.replace_guardian()
         self._mind_abandoned(engine)
-        silent, limit = now - engine.heard, self._config.server.silent_s
-        if not engine.has_spoken:
-            limit = max(limit, STARTING_S)
+        silent, limit = now - engine.heard, engine.patience(self._config.server.silent_s)
         waiting = [one for one in self._pending.values() if isinstance(one.letter.request, _SAFETY)]
         if silent > limit:
             self._condemn(engine, f"the engine was silent for {silent:.1f} s (limit {limit:g} s)")
