@@ -223,7 +223,7 @@ class MainWindow(QMainWindow):
     def refresh(self) -> None:
         """Bring band, actions and notes up to date."""
         session = self.context.session
-        source, live = session.source, session.commands is not None
+        source, live = session.source, session.live
         state = source.state
         now = Situation(state, source.connected, live, session.may_write)
         self.band.show_state(state, connected=now.connected, live=live, mine=now.may_write)

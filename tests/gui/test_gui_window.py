@@ -228,5 +228,7 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
     assert not quiet.connected
     window = shown(session, tmp_path / "gui.json")
     assert window.panels["camera"].is_empty
+    window.refresh()
+    assert window.band.strip.text().startswith("NOT CONNECTED")
     dispose(window)
     session.close()
