@@ -190,6 +190,8 @@ class Telemetry(Part):
     written: int = 0
     #: Frames that were not written because the disk was behind.
     dropped: int = 0
+    #: Why the last recording ended by itself: a full disk.
+    fault: str = ""
 
 
 class Disk(Part):
