@@ -17,7 +17,7 @@ from escape_gui.main_window import MainWindow
 from escape_gui.own_server import OwnServer
 from escape_gui.replay.desk import WORKSPACE, is_recording
 from escape_gui.replay.source import ReplaySource
-from escape_gui.session import Session
+from escape_gui.session import NoSource, Session
 from escape_gui.settings import Settings, load_settings, settings_file
 from escape_gui.widgets.status_pill import Level
 from escape_hw.config.load import load_system
@@ -102,7 +102,7 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     Returns
     -------
     int
-        Exit code.
+        Exit code; 1 for a picture without a server.
 
     Raises
     ------
@@ -131,7 +131,9 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     window.ticker.start()
     window.show()
     try:
-        return qt.exec()
+        code = qt.exec()
+        # A picture of a window that never found its server is no picture of what was asked for.
+        return code if screenshot is None or not isinstance(session.source, NoSource) else 1
     finally:
         session.close()
         if desk is not None:

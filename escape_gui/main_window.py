@@ -76,10 +76,9 @@ class MainWindow(QMainWindow):
         self.context.theme.apply()
         self.context.theme.changed.connect(self._fit_tabs)
         self.setDockNestingEnabled(True)
+        # Not animated: Qt would leave the tabs of the workspace before on the screen.
         self.setDockOptions(
-            QMainWindow.DockOption.AnimatedDocks
-            | QMainWindow.DockOption.AllowNestedDocks
-            | QMainWindow.DockOption.AllowTabbedDocks
+            QMainWindow.DockOption.AllowNestedDocks | QMainWindow.DockOption.AllowTabbedDocks
         )
         self.setTabPosition(Qt.DockWidgetArea.AllDockWidgetAreas, QTabWidget.TabPosition.North)
         self.actions_by_name = self._make_actions()
@@ -223,7 +222,7 @@ class MainWindow(QMainWindow):
     def refresh(self) -> None:
         """Bring band, actions and notes up to date."""
         session = self.context.session
-        source, live = session.source, session.commands is not None
+        source, live = session.source, session.live
         state = source.state
         now = Situation(state, source.connected, live, session.may_write)
         self.band.show_state(state, connected=now.connected, live=live, mine=now.may_write)

@@ -251,6 +251,11 @@ class Session(QObject):
         self.changed.emit()
 
     @property
+    def live(self) -> bool:
+        """Whether this is, or waits for, a server: no recording."""
+        return self.commands is not None or isinstance(self.source, NoSource)
+
+    @property
     def may_write(self) -> bool:
         """Whether the lease is ours."""
         lease = self.source.state.lease

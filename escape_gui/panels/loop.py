@@ -20,6 +20,7 @@ from escape_gui.panels.panel import Context, Panel
 from escape_gui.situation import Situation, is_measured, to_write
 from escape_gui.widgets.hold_button import HoldButton
 from escape_gui.widgets.status_pill import Level, StatusPill
+from escape_hw.config.models import GAIN_MOST
 from escape_hw.remote.source import Source
 from escape_hw.remote.state import LoopState, Phase, State
 
@@ -56,7 +57,7 @@ class LoopPanel(Panel):
         self.modes = QLabel()
         self.modes.setObjectName("caption")
         self.matrix = QComboBox()
-        self.gain = _spin(0.0, 100.0, 0.05, 4)
+        self.gain = _spin(0.0, GAIN_MOST, 0.05, 4)
         self.leak = _spin(0.0, 1.0, 0.005, 4)
         self.dropped_modes = QSpinBox()
         self.dropped_modes.setRange(0, 10000)
@@ -160,7 +161,7 @@ class LoopPanel(Panel):
     def tick(self, source: Source) -> None:
         """Buttons are possible or say why not."""
         session = self.context.session
-        now = Situation(source.state, source.connected, session.commands is not None, session.may_write)
+        now = Situation(source.state, source.connected, session.live, session.may_write)
         why = to_write(now)
         _allow(
             self.apply_button, why or ("" if self._checked else "press Check first"), "Change the loop now"

@@ -114,6 +114,9 @@ class ModesPanel(Panel):
         self._words.setFont(theme.font(mono=True))
         # It must not make the panel wider than its neighbours allow.
         self._words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
+        self._words.setWordWrap(True)
+        # Two lines always, so that the maps do not change their size under the pointer.
+        self._words.setFixedHeight(2 * self._words.fontMetrics().lineSpacing())
         self.body.addWidget(self._words)
         self.setFocusProxy(self.mosaic)
         self.mosaic.hovered.connect(self._say)

@@ -135,7 +135,7 @@ class Panel(QWidget):
         if state.phase is Phase.FAULT:
             return Health.FAULT
         limit = self.stale_after_s
-        live = self.context.session.commands is not None
+        live = self.context.session.live
         if live and limit is not None and time.monotonic() - self._newest > limit:
             return Health.STALE
         return Health.OK

@@ -269,7 +269,7 @@ class ProcedurePanel(Panel):
         """Buttons that are of no use now say why."""
         session = self.context.session
         source = session.source
-        now = Situation(source.state, source.connected, session.commands is not None, session.may_write)
+        now = Situation(source.state, source.connected, session.live, session.may_write)
         busy = "a procedure runs" if now.state.procedure is not None else ""
         unplanned = "" if self._plan is not None else "the arguments are not checked yet"
         for button, tip, why in (

@@ -36,6 +36,11 @@ def make(
         public = make_keys(replace).public.decode()
         one.result(_document(public=public, folder=str(keys_folder())))
         one.show(f"public key: {public}", f"(in {keys_folder()}; the secret one never leaves it)")
+        # Keys hold characters that mean something to a shell, but never a single quote.
+        one.show(
+            f"at a server that shall let you in: escape keys allow NAME '{public}'",
+            f"at a client of your server: escape keys trust HOST '{public}'",
+        )
 
 
 @app.command("list")

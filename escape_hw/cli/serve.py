@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from escape_hw.config.models import SystemConfig
     from escape_hw.remote.address import Listing
 
+_LOOPBACK = "127.0.0.1"
+
 
 def serve(
     system: options.System,
@@ -25,7 +27,7 @@ def serve(
     ] = None,
     bind: Annotated[
         str, typer.Option("--bind", metavar="ADDRESS", help="Address for --port; others need 'escape keys'.")
-    ] = "127.0.0.1",
+    ] = _LOOPBACK,
     read: Annotated[
         list[Path] | None,
         typer.Option("--read", metavar="FOLDER", help="Clients may load products from there; repeatable."),
@@ -41,9 +43,12 @@ def serve(
 ) -> None:
     """Own the devices of a system, and serve screens, scripts and notebooks until stopped."""
     with session("serve", json=json, quiet=quiet) as one:
+        from escape_hw.errors import ConfigError
         from escape_hw.io.run_folder import default_base
         from escape_hw.server.serving import Serving
 
+        if port is None and bind != _LOOPBACK:
+            raise ConfigError(f"--bind {bind} needs a --port; without one nothing listens on the network")
         config = one.configured(options.Choice.of(system, set, seed, mode))
         runs = default_base() if out is None else out.expanduser().absolute()
         with Serving(config, bind, port) as serving:

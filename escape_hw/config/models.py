@@ -20,6 +20,9 @@ from escape_hw.errors import ConfigError
 
 S = TypeVar("S", bound=SensorSection)
 
+#: Largest gain of the loop: an integrator above it diverges on any bench.
+GAIN_MOST = 2.0
+
 
 Estimator = Literal["auto", "matrix", "telemetry"]
 #: What SPRINT can fit within ESCAPE.
@@ -76,7 +79,7 @@ class BasisSection(Section):
 class LoopSection(Section):
     """Leaky integrator."""
 
-    gain: float = Field(0.4, gt=0, le=2, description="gain of the integrator")
+    gain: float = Field(0.4, gt=0, le=GAIN_MOST, description="gain of the integrator")
     leak: float = Field(0.01, ge=0, le=1, description="share of the integrator lost per frame")
     dropped_modes: int = Field(
         0, ge=0, le=10000, description="weakest eigenmodes left out of the reconstructor"

@@ -32,7 +32,7 @@ class Connection(Viewer):
         LeaseHeld
             Somebody else has it; says who.
         """
-        answer, _ = self._ask(ask.Acquire(client=self.client, take_over=take_over))
+        answer, _ = self._ask(ask.made(ask.Acquire, client=self.client, take_over=take_over))
         lease = Lease.model_validate(answer)
         self._became_holder(lease)
         return lease
@@ -76,7 +76,7 @@ class Connection(Viewer):
         RequestRefused
             Something else is going on.
         """
-        request = ask.Start(client=self.client, procedure=procedure, arguments=arguments)
+        request = ask.made(ask.Start, client=self.client, procedure=procedure, arguments=arguments)
         number, _ = self._ask(request, SLOW_S)
         return Run(self, int(number), procedure)
 
@@ -100,9 +100,14 @@ class Connection(Viewer):
         dropped_modes: int | None = None,
     ) -> None:
         """Close the loop on a matrix that the server holds, until it is opened."""
-        request = ask.CloseLoop(
-            client=self.client, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
-        )
+        request = ask.made(
+            ask.CloseLoop,
+            client=self.client,
+            matrix=matrix,
+            gain=gain,
+            leak=leak,
+            dropped_modes=dropped_modes,
+        )  # fmt: skip
         self._ask(request, SLOW_S)
 
     def set_loop(
@@ -113,19 +118,21 @@ class Connection(Viewer):
         dropped_modes: int | None = None,
     ) -> None:
         """Other parameters for the loop, closed or not; what is absent stays."""
-        request = ask.SetLoop(
-            client=self.client, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
+        request = ask.made(
+            ask.SetLoop, client=self.client, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
         )
         self._ask(request, SLOW_S)
 
     def load_product(self, path: str | Path, name: str | None = None) -> Product:
         """Load a FITS product into the engine, under its file's name by default."""
-        answer, _ = self._ask(ask.LoadProduct(client=self.client, path=str(path), name=name), SLOW_S)
+        answer, _ = self._ask(
+            ask.made(ask.LoadProduct, client=self.client, path=str(path), name=name), SLOW_S
+        )
         return Product.model_validate(answer)
 
     def record(self, on: bool) -> None:
         """Begin or end recording telemetry at full rate."""
-        self._ask(ask.Record(client=self.client, on=on), SLOW_S)
+        self._ask(ask.made(ask.Record, client=self.client, on=on), SLOW_S)
 
     def clear_fault(self) -> None:
         """End a fault's latch; closed devices are opened again."""

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from escape_hw.config.models import GAIN_MOST
+from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Arguments
 
 #: Names that come from a client: products, procedures, people.
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w .+@:-]+$")]
 ClientId = Annotated[str, Field(min_length=8, max_length=64, pattern=r"^[0-9a-f-]+$")]
-#: A loop's gain.
-Positive = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+#: A loop's gain, in the range of the configuration.
+Gain = Annotated[float, Field(gt=0, le=GAIN_MOST, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
@@ -22,6 +24,29 @@ class Request(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     client: ClientId
+
+
+R = TypeVar("R", bound=Request)
+
+
+def complaint(error: ValidationError) -> str:
+    """The first thing that is wrong with a request: where, and what."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    return f"{'.'.join(map(str, first['loc'])) or 'the text'}: {first['msg']}"
+
+
+def made(kind: type[R], **fields: Any) -> R:
+    """A request of what a caller said.
+
+    Raises
+    ------
+    ConfigError
+        A field is of the wrong kind or out of range.
+    """
+    try:
+        return kind(**fields)
+    except ValidationError as error:
+        raise ConfigError(complaint(error)) from None
 
 
 # ---------------------------------------------------------------- to look
@@ -144,7 +169,7 @@ class CloseLoop(Request):
 
     verb: Literal["close_loop"] = "close_loop"
     matrix: Name
-    gain: Positive | None = None
+    gain: Gain | None = None
     leak: Share | None = None
     dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
 
@@ -154,7 +179,7 @@ class SetLoop(Request):
 
     verb: Literal["set_loop"] = "set_loop"
     matrix: Name | None = None
-    gain: Positive | None = None
+    gain: Gain | None = None
     leak: Share | None = None
     dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
 
@@ -163,7 +188,7 @@ class LoadProduct(Request):
     """Load a FITS product into the engine; the path must lie where the server may read."""
 
     verb: Literal["load_product"] = "load_product"
-    path: Annotated[str, Field(min_length=1, max_length=4096)]
+    path: Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00]+$")]
     name: Name | None = None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -190,6 +190,8 @@ class Telemetry(Part):
     written: int = 0
     #: Frames that were not written because the disk was behind.
     dropped: int = 0
+    #: Why the last recording ended by itself: a full disk.
+    fault: str = ""
 
 
 class Disk(Part):
@@ -269,7 +271,7 @@ class Geometry(Part):
 
 
 #: Arguments of a procedure by name.
-Arguments = dict[str, float | int | bool | str | None]
+Arguments = dict[str, Annotated[float, Field(allow_inf_nan=False)] | int | bool | str | None]
 
 
 class Plan(Part):

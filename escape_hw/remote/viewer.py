@@ -194,7 +194,7 @@ class Viewer:
 
     def _latest_from_afar(self, stream: str, after: int) -> Sample | None:
         try:
-            head, data = self._ask(ask.GetLatest(client=self.client, stream=stream, after=after))
+            head, data = self._ask(ask.made(ask.GetLatest, client=self.client, stream=stream, after=after))
         except ServerGone:
             return None
         if head is None:
@@ -235,7 +235,7 @@ class Viewer:
         ConfigError
             An argument is wrong; says which and the way out.
         """
-        request = ask.Check(client=self.client, procedure=procedure, arguments=arguments or {})
+        request = ask.made(ask.Check, client=self.client, procedure=procedure, arguments=arguments or {})
         answer, _ = self._ask(request, SLOW_S)
         return Plan.model_validate(answer)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from escape_hw.api.flag import Flag
 from escape_hw.calibration.loop_orders import LoopOrders
+from escape_hw.config.models import SystemConfig
 from escape_hw.errors import RequestRefused
 from escape_hw.io.provenance import utc_text
 from escape_hw.remote.state import Ended, Fault, Phase, Running
@@ -20,6 +21,12 @@ class LoopChoice:
     gain: float = 0.0
     leak: float = 0.0
     dropped_modes: int = 0
+
+    @classmethod
+    def configured(cls, config: SystemConfig, matrix: str = "") -> LoopChoice:
+        """As the configuration has it."""
+        loop = config.loop
+        return cls(matrix, loop.gain, loop.leak, loop.dropped_modes)
 
 
 @dataclass(slots=True)

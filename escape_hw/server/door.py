@@ -17,7 +17,7 @@ from escape_hw.io.documents import plain
 from escape_hw.remote.address import Endpoint
 from escape_hw.remote.faults import to_wire
 from escape_hw.remote.keys import KeyPair
-from escape_hw.remote.requests import REQUESTS, AnyRequest
+from escape_hw.remote.requests import REQUESTS, AnyRequest, complaint
 
 log = logging.getLogger(__name__)
 
@@ -129,9 +129,7 @@ class Door:
                 raise RequestRefused(f"{len(parts[2])} bytes; a request has at most {LONGEST}")
             return Letter(route, REQUESTS.validate_json(parts[2]))
         except ValidationError as error:
-            first = error.errors(include_url=False, include_input=False)[0]
-            place = ".".join(map(str, first["loc"])) or "the text"
-            self.refuse(route, RequestRefused(f"no request: {place}: {first['msg']}"))
+            self.refuse(route, RequestRefused(f"no request: {complaint(error)}"))
         except RequestRefused as error:
             self.refuse(route, error)
         return None

@@ -62,8 +62,7 @@ class Engine:
     def __init__(self, channel: Channel, setup: Setup) -> None:
         self.channel, self.setup = channel, setup
         self.config = load_text(setup.config_text)
-        loop = self.config.loop
-        self.board = Board(LoopChoice(gain=loop.gain, leak=loop.leak, dropped_modes=loop.dropped_modes))
+        self.board = Board(LoopChoice.configured(self.config))
         self.bench = System.from_config(self.config)
         self.publisher = Publisher(self.config.system.name)
         self.shelf = Shelf((setup.runs, *setup.reads))

@@ -44,27 +44,22 @@ class EngineProcess:
     said_goodbye
         Whether the engine ended in order.
     heard
-        When it last said something, monotonic seconds.
+        When it last said something, monotonic seconds; when it was started, before its first word.
     """
 
     def __init__(self, setup: Setup, incidents: str) -> None:
         self.connection, theirs = socket.socketpair()
-        watched, held = os.pipe()
+        self._watched, held = os.pipe()
         try:
             self._process = self._spawn(_ENGINE, (theirs.fileno(), held))
             started = process_start(self._process.pid) or 0
-            watch = Watch(
+            self._watch = Watch(
                 config_text=setup.config_text, incidents=incidents, pid=self._process.pid, started=started
             )
-            self._guardian = self._spawn(_GUARDIAN, (watched,), stdin=subprocess.PIPE)
+            self._guardian = self._guard()
         finally:
             theirs.close()
             os.close(held)
-            os.close(watched)
-        if self._guardian.stdin is None:
-            raise RuntimeError("the guardian has no standard input")
-        self._guardian.stdin.write(watch.model_dump_json().encode())
-        self._guardian.stdin.close()
         self._lines = Lines()
         self._unsent = b""
         self.said_goodbye = False
@@ -79,6 +74,19 @@ class EngineProcess:
             [sys.executable, "-m", module, *map(str, descriptors)],
             pass_fds=descriptors, start_new_session=True, **options,
         )  # fmt: skip
+
+    def _guard(self) -> subprocess.Popen[bytes]:
+        guardian = self._spawn(_GUARDIAN, (self._watched,), stdin=subprocess.PIPE)
+        if guardian.stdin is None:
+            raise RuntimeError("the guardian has no standard input")
+        guardian.stdin.write(self._watch.model_dump_json().encode())
+        guardian.stdin.close()
+        return guardian
+
+    def replace_guardian(self) -> None:
+        """Have another guardian at the same pipe: the one before was killed, and the engine goes on."""
+        log.error("the guardian (process %d) died; another one takes its place", self._guardian.pid)
+        self._guardian = self._guard()
 
     @property
     def pid(self) -> int:
@@ -139,6 +147,7 @@ class EngineProcess:
             self._process.wait()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._guardian.wait(ENDING_S)
+        os.close(self._watched)
         list(self.receive())
         self.connection.close()
         return self.said_goodbye

@@ -231,6 +231,8 @@ def _keep_loop_closed(engine: Engine, orders: LoopOrders) -> None:
         )  # fmt: skip
         log.info("loop open after %d frames, %d lost; mirror flat", end.frames, end.lost_frames)
         if end.fault:
+            # What led there is not what the next loop begins with.
+            board.loop = LoopChoice.configured(engine.config, board.loop.matrix)
             engine.make_safe(f"the loop was opened: {end.fault}", "mend it, then clear the fault")
     except Aborted:
         log.info("loop open, mirror flat")

@@ -84,12 +84,16 @@ class Keeper:
         if engine is None:
             return
         engine.flush()
-        if now - self._ticked > _TICK_S:
+        # Looked at before the engine is: a guardian ends in order only after its engine.
+        tick, guarded = now - self._ticked > _TICK_S, engine.guarded()
+        if tick:
             self._ticked = now
             engine.send({"alive": True})
         if engine.ended():
             self._bury(engine)
             return
+        if tick and not guarded:
+            engine.replace_guardian()
         self._mind_abandoned(engine)
         # On a busy machine a compiler may hold an engine up; that harms nobody while the mirror is flat.
         moving = self._state.mirror.peak > 0 or self._state.loop.closed

@@ -73,8 +73,11 @@ class Switch:
             return self._last
         told = process.state
         if told.fault or not process.running:
-            log.error("recording ended: %s", told.fault or "its process has gone")
+            fault = told.fault or "its process has gone"
+            log.error("recording ended: %s", fault)
             self._process = None
-            self._last = Telemetry(path=str(process.folder), written=told.written, dropped=told.dropped)
+            self._last = Telemetry(
+                path=str(process.folder), written=told.written, dropped=told.dropped, fault=fault
+            )
             return self._last
         return Telemetry(recording=True, path=str(process.folder), written=told.written, dropped=told.dropped)

@@ -49,7 +49,7 @@ class Row:
 class StreamTable:
     """Looks at all streams of this user, time after time."""
 
-    _before: dict[str, tuple[float, RingStats]] = field(default_factory=dict)
+    _before: dict[str, RingStats] = field(default_factory=dict)
 
     def rows(self) -> tuple[Row, ...]:
         """The streams there are now, living and dead."""
@@ -66,15 +66,20 @@ class StreamTable:
                 stats = reader.stats()
         except StreamGone:
             return Row(*common)
-        now = time.monotonic()
-        then, before = self._before.get(one.name, (now, stats))
-        self._before[one.name] = now, stats
+        before = self._before.get(one.name)
+        self._before[one.name] = stats
         age = (time.monotonic_ns() - stats.arrived_ns) * 1e-9 if stats.written else math.nan
-        rate = (stats.written - before.written) / (now - then) if now > then else math.nan
+        rate = math.nan if before is None else _rate(before, stats)
         return Row(
             *common, stats.written, stats.shape, stats.dtype, rate, age,
-            _spacing(stats.intervals - before.intervals),
+            _spacing(stats.intervals - (stats if before is None else before).intervals),
         )  # fmt: skip
+
+
+def _rate(before: RingStats, now: RingStats) -> float:
+    """Entries per second by the entries' own times: whoever looks may have been held up meanwhile."""
+    entries, elapsed_ns = now.written - before.written, now.arrived_ns - before.arrived_ns
+    return 1e9 * entries / elapsed_ns if entries and elapsed_ns > 0 else 0.0
 
 
 def _spacing(counts: NDArray[np.uint64]) -> tuple[float, float, float]:

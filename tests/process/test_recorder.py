@@ -250,8 +250,8 @@ def test_the_command_shows_what_flows(writer, capsys):
     finally:
         stop.set()
         thread.join()
-    rows = {row["stream"]: row for row in document(capsys)["streams"] if row["system"] == SYSTEM}
-    row = rows["slopes"]
+    (row,) = (row for row in document(capsys)["streams"] if row["segment"] == writer.name)
+    assert (row["system"], row["stream"]) == (SYSTEM, "slopes")
     assert row["alive"]
     assert row["shape"] == [100]
     assert row["dtype"] == "f4"

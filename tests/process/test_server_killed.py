@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
@@ -81,6 +82,29 @@ def test_the_guardian_flattens_the_mirror_of_an_engine_that_was_killed(system, b
 def guarded(client: Connection) -> bool:
     """Whether the fault says that the guardian has flattened the mirror."""
     return client.state.fault is not None and "the mirror is flat" in client.state.fault.reason
+
+
+def guardian_of(served: Served) -> int:
+    """Process of the guardian; 0: there is none."""
+    words = ("-f", "escape_hw.server.guardian", "-P", str(served.pid))
+    found = subprocess.run(("pgrep", *words), capture_output=True, text=True, check=False).stdout.split()
+    return int(found[0]) if found else 0
+
+
+def test_a_guardian_that_was_killed_is_replaced_and_does_its_work(system, bench, tmp_path) -> None:
+    server, spy = bench
+    with on_metal(system, server, tmp_path) as served, served.connect(control=True) as client:
+        until_idle(client)
+        first = guardian_of(served)
+        os.kill(first, signal.SIGKILL)
+        wait_for(lambda: guardian_of(served) not in (0, first), "another guardian")
+        run = client.start("docrime", frames=10_000_000)
+        wait_for(lambda: not spy.flat, "the mirror is poked")
+        os.kill(client.state.engine_pid, signal.SIGKILL)
+        with pytest.raises(CalibrationError, match=r"ended with its engine: the engine .* died; "):
+            run.wait(60)
+        wait_for(lambda: guarded(client), "the guardian has done its work")
+        assert spy.flat
 
 
 def load_state_frames(path: Path) -> int:

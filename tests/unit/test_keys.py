@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import stat
 from pathlib import Path
 
@@ -31,6 +32,18 @@ def test_keys_are_made_once_and_are_the_users_own(document) -> None:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert document("keys", "make")[1]["public"] == made["public"]
     assert document("keys", "make", "--replace")[1]["public"] != made["public"]
+
+
+def test_a_key_is_told_as_a_shell_takes_it(escape, document) -> None:
+    public = document("keys", "make")[1]["public"]
+    lines = [line for line in escape("keys", "make")[1].splitlines() if "escape keys" in line]
+    assert [shlex.split(line.partition("escape ")[2])[-1] for line in lines] == [public] * 2
+
+
+def test_an_address_without_a_port_is_refused(escape) -> None:
+    code, _, said = escape("serve", "razor-shwfs", "--bind", "0.0.0.0")
+    assert code == 2
+    assert "--bind 0.0.0.0 needs a --port" in said
 
 
 def test_a_secret_key_that_others_may_read_is_not_used() -> None:

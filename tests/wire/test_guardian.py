@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from asm_bench import emulator, port_of, wait_for
@@ -31,8 +34,13 @@ os.write(int(sys.argv[2]), b"bye")
 """
 
 
-def guarded(tmp_path: Path, port: int, end: str) -> Incident | None:
-    """Run an engine of that kind until it is killed or says goodbye; what its guardian wrote."""
+def guarded(
+    tmp_path: Path, port: int, end: str, meanwhile: Callable[[], object] = lambda: None
+) -> Incident | None:
+    """Run an engine of that kind until it is killed or says goodbye; what its guardian wrote.
+
+    ``meanwhile`` runs when the engine has ended, before the guardian looks.
+    """
     words = [
         "devices.dm.mode=hardware", f"devices.dm.options.port={port}", "devices.dm.options.reply_s=10",
         "devices.dm.options.heartbeat_s=0.05",
@@ -40,32 +48,42 @@ def guarded(tmp_path: Path, port: int, end: str) -> Incident | None:
     config = tmp_path / "maps.toml"
     config.write_text(load_system("maps-nir", overrides=words).to_toml())
     watched, held = os.pipe()
-    engine = subprocess.Popen(
-        [sys.executable, "-c", _ENGINE, str(config), str(held)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=(held,),
-    )  # fmt: skip
-    watch = Watch(
-        config_text=config.read_text(), incidents=str(tmp_path), pid=engine.pid,
-        started=process_start(engine.pid) or 0,
-    )  # fmt: skip
-    guardian = subprocess.Popen(
-        [sys.executable, "-m", "escape_hw.server.guardian", str(watched)],
-        stdin=subprocess.PIPE, text=True, pass_fds=(watched,),
-    )  # fmt: skip
-    os.close(held)
-    os.close(watched)
-    assert engine.stdout is not None
-    assert engine.stdout.readline() == "shaped\n"
-    if end == "kill":
-        engine.kill()
-        engine.communicate()
+    with contextlib.ExitStack() as ends:
+        engine = subprocess.Popen(
+            [sys.executable, "-c", _ENGINE, str(config), str(held)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=(held,),
+        )  # fmt: skip
+        ends.callback(finished, engine)
+        watch = Watch(
+            config_text=config.read_text(), incidents=str(tmp_path), pid=engine.pid,
+            started=process_start(engine.pid) or 0,
+        )  # fmt: skip
+        guardian = subprocess.Popen(
+            [sys.executable, "-m", "escape_hw.server.guardian", str(watched)],
+            stdin=subprocess.PIPE, text=True, pass_fds=(watched,),
+        )  # fmt: skip
+        ends.callback(finished, guardian)
+        os.close(held)
+        os.close(watched)
+        assert engine.stdout is not None
+        assert engine.stdout.readline() == "shaped\n"
+        if end == "kill":
+            engine.kill()
+            engine.communicate()
+        else:
+            engine.communicate("\n", timeout=60)
+        meanwhile()
         guardian.communicate(watch.model_dump_json(), timeout=120)
-    else:
-        engine.communicate("\n", timeout=60)
-        guardian.communicate(watch.model_dump_json(), timeout=120)
-    assert guardian.returncode == 0
+        assert guardian.returncode == 0
     found = list(tmp_path.glob("*.incident.json"))
     return Incident.model_validate_json(found[0].read_bytes()) if found else None
+
+
+def finished(process: subprocess.Popen[str]) -> None:
+    """End a process, whatever the test came to."""
+    if process.poll() is None:
+        process.kill()
+        process.communicate()
 
 
 def test_a_floating_shell_is_flattened_and_rested(tmp_path: Path) -> None:
@@ -79,11 +97,13 @@ def test_a_floating_shell_is_flattened_and_rested(tmp_path: Path) -> None:
 
 def test_a_shell_that_went_to_rest_by_itself_is_not_lifted(tmp_path: Path) -> None:
     states = []
-    with emulator(hold=0.1, rest=0.2) as made:
+    with emulator(hold=1.0, rest=2.0) as made:
         port = port_of(made)
         step = made.body.ask_state
         made.body.ask_state = lambda wanted, now: (states.append(wanted), step(wanted, now))[1]
-        incident = guarded(tmp_path, port, "kill")
+        shell = made.body.shell
+        at_rest = partial(wait_for, lambda: shell.state is ShellState.RESTED, "the shell is at rest")
+        incident = guarded(tmp_path, port, "kill", at_rest)
         assert incident is not None
         assert incident.flat is True
         assert made.body.shell.state is ShellState.RESTED
