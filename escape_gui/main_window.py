@@ -40,7 +40,7 @@ from escape_gui.ticker import Ticker
 from escape_gui.widgets.overlay import Overlay
 from escape_gui.widgets.status_pill import Level
 from escape_gui.widgets.toasts import Toasts
-from escape_gui.workspaces import WORKSPACES, arrange, workspace
+from escape_gui.workspaces import WORKSPACES, arrange, hide_stray_tabs, workspace
 from escape_hw.errors import StorageError
 
 log = logging.getLogger(__name__)
@@ -76,9 +76,10 @@ class MainWindow(QMainWindow):
         self.context.theme.apply()
         self.context.theme.changed.connect(self._fit_tabs)
         self.setDockNestingEnabled(True)
-        # Not animated: Qt would leave the tabs of the workspace before on the screen.
         self.setDockOptions(
-            QMainWindow.DockOption.AllowNestedDocks | QMainWindow.DockOption.AllowTabbedDocks
+            QMainWindow.DockOption.AnimatedDocks
+            | QMainWindow.DockOption.AllowNestedDocks
+            | QMainWindow.DockOption.AllowTabbedDocks
         )
         self.setTabPosition(Qt.DockWidgetArea.AllDockWidgetAreas, QTabWidget.TabPosition.North)
         self.actions_by_name = self._make_actions()
@@ -179,6 +180,7 @@ class MainWindow(QMainWindow):
             arrange(self, docks, self.workspace)
         # A layout of a larger window must not make this one larger.
         self.resize(size)
+        hide_stray_tabs(self, docks)
         # Docks that were shown anew lie over everything.
         self.overlay.raise_()
 

@@ -343,3 +343,25 @@ def test_the_window_fits_a_small_screen(
         assert window.minimumSizeHint().height() <= 700, one.name
         window.resize(round(1366 * scale), 700)
         assert window.height() == 700
+
+
+def test_no_tab_bar_of_another_workspace_stays(make_window: MakeWindow) -> None:
+    window = make_window()
+    for one in (*WORKSPACES, *WORKSPACES):
+        window.show_workspace(one.name)
+        for _ in range(5):
+            QApplication.processEvents()
+            window.ticker.tick(everything=True)
+        bars = window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly)
+        seen = {
+            tuple(bar.tabText(k) for k in range(bar.count()))
+            for bar in bars
+            if bar.isVisible() and bar.count()
+        }
+        wanted = {
+            tuple(window.docks[name].windowTitle() for name in cell.names)
+            for column in one.columns
+            for cell in column.cells
+            if len(cell.names) > 1
+        }
+        assert seen == wanted, one.name
