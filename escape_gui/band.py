@@ -7,6 +7,7 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QGridLayout, QHBoxLayout, QLabel, QPushButton, QVBoxLayout, QWidget
 
 from escape_gui.panels.panel import Context
+from escape_gui.situation import UNKNOWN, is_lit, is_measured
 from escape_gui.widgets.readout import Readout
 from escape_gui.widgets.status_pill import Level, StatusPill
 from escape_hw.remote.state import Phase, State
@@ -21,6 +22,8 @@ PHASES: dict[Phase, Level] = {
 }
 #: Share of saturated pixels from which the number is a warning, and from which it is bad.
 SATURATED_WARN, SATURATED_BAD = 0.001, 0.01
+#: What to do before a server was ever heard of.
+NOWHERE = "NOT CONNECTED · start a server with 'escape serve SYSTEM', or open a recording (File)"
 
 
 class Strip(QLabel):
@@ -37,7 +40,9 @@ class Strip(QLabel):
     def show_state(self, state: State, *, connected: bool, live: bool) -> None:
         """Say what we are connected to."""
         where = f"{state.system} · seed {state.seed}" if state.simulated else state.system
-        if not live:
+        if not connected and not is_measured(state):
+            word, looks = NOWHERE, ("button", "text")
+        elif not live:
             word, looks = f"REPLAY · {state.system}", ("button", "text")
         elif not connected:
             word, looks = "NOT CONNECTED · the numbers below are old", ("stop", "on_stop")
@@ -117,17 +122,10 @@ class Band(QWidget):
     def show_state(self, state: State, *, connected: bool, live: bool, mine: bool) -> None:
         """Bring everything up to date."""
         self.strip.show_state(state, connected=connected, live=live)
-        self.phase.show_condition(PHASES[state.phase], state.phase.value)
-        closed = state.loop.closed
-        self.loop.show_condition(
-            Level.ACTIVE if closed else Level.QUIET, "loop closed" if closed else "loop open"
-        )
-        saturated = state.light.saturated
-        level = Level.GOOD if saturated < SATURATED_WARN else Level.WARN
-        self.light.show_condition(
-            Level.BAD if saturated >= SATURATED_BAD else level, f"saturated {100 * saturated:.2f} %"
-        )
-        self._show_control(state, live=live, mine=mine)
+        known = live and is_measured(state)
+        self._show_conditions(state, known=known)
+        replay = connected and not live
+        self._show_control(state, replay=replay, mine=mine)
         values = {
             "rate": f"{state.rates.frame_hz:.1f}",
             "lost": f"{state.rates.lost:d}",
@@ -137,11 +135,32 @@ class Band(QWidget):
             "jitter": f"{state.latency.jitter_p99:.0f}",
         }
         for name, text in values.items():
-            self.readouts[name].show_value(text)
+            self.readouts[name].show_value(text if known else UNKNOWN)
 
-    def _show_control(self, state: State, *, live: bool, mine: bool) -> None:
-        if not live:
+    def _show_conditions(self, state: State, *, known: bool) -> None:
+        if known:
+            closed = state.loop.closed
+            self.phase.show_condition(PHASES[state.phase], state.phase.value)
+            self.loop.show_condition(
+                Level.ACTIVE if closed else Level.QUIET, "loop closed" if closed else "loop open"
+            )
+        else:
+            self.phase.show_condition(Level.QUIET, UNKNOWN)
+            self.loop.show_condition(Level.QUIET, f"loop {UNKNOWN}")
+        if not (known and is_lit(state)):
+            self.light.show_condition(Level.QUIET, f"saturated {UNKNOWN}")
+            return
+        saturated = state.light.saturated
+        level = Level.GOOD if saturated < SATURATED_WARN else Level.WARN
+        self.light.show_condition(
+            Level.BAD if saturated >= SATURATED_BAD else level, f"saturated {100 * saturated:.2f} %"
+        )
+
+    def _show_control(self, state: State, *, replay: bool, mine: bool) -> None:
+        if replay:
             self.control.show_condition(Level.QUIET, "replay")
+        elif not is_measured(state):
+            self.control.show_condition(Level.QUIET, f"control {UNKNOWN}")
         elif mine:
             self.control.show_condition(Level.GOOD, "you have control")
         elif state.lease is not None:

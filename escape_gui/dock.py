@@ -2,8 +2,18 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import Qt, Signal
-from PySide6.QtWidgets import QDockWidget, QHBoxLayout, QLabel, QMainWindow, QMenu, QToolButton, QWidget
+from PySide6.QtCore import QSize, Qt, Signal
+from PySide6.QtWidgets import (
+    QDockWidget,
+    QFrame,
+    QHBoxLayout,
+    QLabel,
+    QMainWindow,
+    QMenu,
+    QScrollArea,
+    QToolButton,
+    QWidget,
+)
 
 from escape_gui.panels.panel import Panel
 from escape_gui.theme import Theme
@@ -17,6 +27,33 @@ LEVELS: dict[Health, Level] = {
     Health.FAULT: Level.BAD,
     Health.CLOSED: Level.QUIET,
 }
+
+
+#: Height below which a panel is scrolled instead of making the window higher, pixels.
+LEAST_PX = 130
+
+
+class _Room(QScrollArea):
+    """A panel's room: it may be lower than the panel wants, never narrower."""
+
+    def __init__(self, panel: Panel) -> None:
+        super().__init__()
+        self._panel = panel
+        self.setWidgetResizable(True)
+        self.setFrameShape(QFrame.Shape.NoFrame)
+        self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setWidget(panel)
+
+    def minimumSizeHint(self) -> QSize:
+        """The panel's width with a scroll bar, and little height."""
+        least = self._panel.minimumSizeHint()
+        bar = self.verticalScrollBar().sizeHint().width() if least.height() > LEAST_PX else 0
+        return QSize(least.width() + bar, min(least.height(), LEAST_PX))
+
+    def sizeHint(self) -> QSize:
+        """What the panel wants."""
+        return self._panel.sizeHint()
 
 
 class Dock(QDockWidget):
@@ -43,7 +80,7 @@ class Dock(QDockWidget):
         self.setObjectName(panel.name)
         self.panel = panel
         self._theme = theme
-        self.setWidget(panel)
+        self.setWidget(_Room(panel))
         self._title = QLabel(panel.title)
         self._pill = StatusPill(theme)
         self.setTitleBarWidget(self._make_title())

@@ -45,7 +45,8 @@ class FaultBar(QWidget):
     def show_state(self, state: State) -> None:
         """Appear or go."""
         fault = state.fault
-        self.setVisible(fault is not None)
         if fault is not None:
             text = f"{fault.reason} · {fault.at_utc}"
             self._text.setText(f"{text}\n{fault.way_out}" if fault.way_out else text)
+        # Shown before it has its words it would take another height for a moment.
+        self.setVisible(fault is not None)

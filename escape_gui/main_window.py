@@ -40,12 +40,12 @@ from escape_gui.ticker import Ticker
 from escape_gui.widgets.overlay import Overlay
 from escape_gui.widgets.status_pill import Level
 from escape_gui.widgets.toasts import Toasts
-from escape_gui.workspaces import WORKSPACES, arrange, workspace
+from escape_gui.workspaces import WORKSPACES, arrange, hide_stray_tabs, workspace
 from escape_hw.errors import StorageError
 
 log = logging.getLogger(__name__)
 #: Version of the arrangement Qt stores; layouts of another one are dropped.
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 
 
 class MainWindow(QMainWindow):
@@ -89,10 +89,11 @@ class MainWindow(QMainWindow):
         self.panels = {kind.name: kind(self.context) for kind in panels}
         self.docks = {name: self._make_dock(panel) for name, panel in self.panels.items()}
         self._make_top()
-        self._notes = {name: QLabel() for name in ("busy", "saved", "recording", "disk")}
+        self._notes = {name: QLabel() for name in ("frozen", "busy", "saved", "recording", "disk")}
+        self.toasts = Toasts(self.context.theme)
+        self.statusBar().addWidget(self.toasts, 1)
         for label in self._notes.values():
             self.statusBar().addPermanentWidget(label)
-        self.toasts = Toasts(self, self.context.theme)
         self.overlay = Overlay(self, self.context.theme)
         self.news = News(self.toasts)
         self.saver: Saver = Saver(self)
@@ -179,9 +180,9 @@ class MainWindow(QMainWindow):
             arrange(self, docks, self.workspace)
         # A layout of a larger window must not make this one larger.
         self.resize(size)
-        for above in (self.toasts, self.overlay):
-            # Docks that were shown anew lie over everything.
-            above.raise_()
+        hide_stray_tabs(self, docks)
+        # Docks that were shown anew lie over everything.
+        self.overlay.raise_()
 
     def show_workspace(self, name: str) -> None:
         """Change to another workspace, each as it was left."""
@@ -246,7 +247,7 @@ class MainWindow(QMainWindow):
         self.setWindowTitle(f"ESCAPE · {state.system}" if state.system else "ESCAPE")
 
     def note(self, name: str, text: str) -> None:
-        """Change a note in the status bar: busy, saved, recording, disk."""
+        """Change a note in the status bar: frozen, busy, saved, recording, disk."""
         self._notes[name].setText(text)
 
     # ------------------------------------------------------------ what actions do
@@ -285,7 +286,7 @@ class MainWindow(QMainWindow):
     def toggle_freeze(self) -> None:
         """Hold the panels, or let them go on; band and safety buttons never freeze."""
         self.ticker.frozen = not self.ticker.frozen
-        self.statusBar().showMessage("Panels are frozen; X goes on" if self.ticker.frozen else "", 0)
+        self.note("frozen", "Panels are frozen; X goes on" if self.ticker.frozen else "")
 
     def toggle_key_map(self) -> None:
         """Show the keys, or close them."""

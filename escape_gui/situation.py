@@ -30,6 +30,20 @@ class Situation:
     may_write: bool
 
 
+#: What stands for a number that nobody knows.
+UNKNOWN = "–"
+
+
+def is_measured(state: State) -> bool:
+    """Whether a server measures the state's numbers; a recording, or no word yet, leaves them at zero."""
+    return state.server_pid != 0
+
+
+def is_lit(state: State) -> bool:
+    """Whether frames have come, so that what is said of the light is true."""
+    return is_measured(state) and state.rates.frames > 0
+
+
 #: Says why an action is impossible now; empty when it is possible.
 Obstacle = Callable[[Situation], str]
 
@@ -41,6 +55,8 @@ def always(_: Situation) -> str:
 
 def to_ask(now: Situation) -> str:
     """Why no request can be made at all."""
+    if not now.connected and not is_measured(now.state):
+        return "no server was found yet; start one with 'escape serve SYSTEM'"
     if not now.live:
         return "a finished run is replayed, there is no server to ask"
     return "" if now.connected else "the server does not answer"

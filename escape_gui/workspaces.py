@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QDockWidget, QMainWindow
+from PySide6.QtWidgets import QDockWidget, QMainWindow, QTabBar
 
 #: Between docks, as the style sheet says.
 SEPARATOR_PX = 6
@@ -66,8 +66,9 @@ WORKSPACES: tuple[Workspace, ...] = (
         "Calibrate",
         "Interaction matrix, registration, optical gains",
         (
-            Column((Cell(("procedure",), 1.9), Cell(("camera", "devices", "log"), 1.0)), 1.0),
-            Column((Cell(("modes",)),), 1.4),
+            # The form with its plan and its result takes a whole column of a small screen.
+            Column((Cell(("procedure",)),), 1.0),
+            Column((Cell(("modes",), 1.6), Cell(("camera", "devices", "log"), 1.0)), 1.4),
             Column((Cell(("sprint",), 1.2), Cell(("gains",), 1.0)), 1.1),
         ),
     ),
@@ -119,6 +120,17 @@ def arrange(window: QMainWindow, docks: dict[str, QDockWidget], plan: Workspace)
         # Where the View menu will show it.
         window.addDockWidget(Qt.DockWidgetArea.RightDockWidgetArea, docks[name])
         docks[name].hide()
+
+
+def hide_stray_tabs(window: QMainWindow, docks: dict[str, QDockWidget]) -> None:
+    """Hide the tab bars of the arrangement before, which Qt leaves where they were."""
+    groups = [
+        {one.windowTitle() for one in (dock, *window.tabifiedDockWidgets(dock)) if not one.isHidden()}
+        for dock in docks.values()
+    ]
+    for bar in window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly):
+        if {bar.tabText(k) for k in range(bar.count())} not in groups:
+            bar.hide()
 
 
 def _front(docks: dict[str, QDockWidget], cell: Cell) -> QDockWidget:

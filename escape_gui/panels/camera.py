@@ -13,6 +13,7 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QToolButton
 
 from escape_gui.maps import mask_of, slope_maps
 from escape_gui.panels.panel import Context, Panel, Shown
+from escape_gui.situation import UNKNOWN, is_lit
 from escape_gui.widgets.choice import Choice
 from escape_gui.widgets.picture import COUNTS, SIGNED, Picture
 from escape_gui.widgets.picture_bar import PictureBar
@@ -103,7 +104,10 @@ class CameraPanel(Panel):
     def take_state(self, state: State) -> None:
         """Saturation, counted by the server over all frames."""
         light = state.light
-        self.saturation.setText(f"peak {100 * light.peak:3.0f} %   saturated {100 * light.saturated:5.2f} %")
+        peak, saturated = f"{100 * light.peak:3.0f} %", f"{100 * light.saturated:5.2f} %"
+        if not is_lit(state):
+            peak = saturated = UNKNOWN
+        self.saturation.setText(f"peak {peak}   saturated {saturated}")
 
     def take_sample(self, stream: str, sample: Sample) -> None:
         """A frame or slopes."""

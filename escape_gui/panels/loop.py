@@ -17,7 +17,7 @@ from PySide6.QtWidgets import (
 
 from escape_gui.loop_form import FIELDS, LoopEdit
 from escape_gui.panels.panel import Context, Panel
-from escape_gui.situation import Situation, to_write
+from escape_gui.situation import Situation, is_measured, to_write
 from escape_gui.widgets.hold_button import HoldButton
 from escape_gui.widgets.status_pill import Level, StatusPill
 from escape_hw.config.models import GAIN_MOST
@@ -30,6 +30,10 @@ _TIPS = {
     "leak": "Share of the command that is forgotten in each frame",
     "dropped_modes": "Highest modes that are left alone",
 }
+
+
+#: What stands here while no server was heard of, and in a recording.
+NOBODY = "There is no loop to close here: no server has answered.\nStart one with 'escape serve SYSTEM'."
 
 
 class LoopPanel(Panel):
@@ -124,7 +128,7 @@ class LoopPanel(Panel):
     def take_state(self, state: State) -> None:
         """Current values; the form follows them until it is edited."""
         self._loop = loop = state.loop
-        self.set_empty(state.phase in (Phase.STARTING, Phase.STOPPED))
+        self.set_empty(state.phase in (Phase.STARTING, Phase.STOPPED), None if is_measured(state) else NOBODY)
         self.pill.show_condition(
             Level.ACTIVE if loop.closed else Level.QUIET, "closed" if loop.closed else "open"
         )

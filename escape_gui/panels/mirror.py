@@ -10,6 +10,7 @@ from PySide6.QtWidgets import QGridLayout, QHBoxLayout, QLabel
 
 from escape_gui.maps import ActuatorMap
 from escape_gui.panels.panel import Context, Panel, Shown
+from escape_gui.situation import UNKNOWN, is_measured
 from escape_gui.widgets.choice import Choice
 from escape_gui.widgets.picture import SIGNED, Picture
 from escape_gui.widgets.picture_bar import PictureBar
@@ -87,9 +88,13 @@ class MirrorPanel(Panel):
     def take_state(self, state: State) -> None:
         """Numbers that the server takes over every frame."""
         mirror = state.mirror
-        self.readouts["rms"].show_value(f"{mirror.rms:.4f}")
-        self.readouts["peak"].show_value(f"{mirror.peak:.4f}")
-        self.readouts["clipped"].show_value(f"{100 * mirror.clipped:.2f}")
+        values = {
+            "rms": f"{mirror.rms:.4f}",
+            "peak": f"{mirror.peak:.4f}",
+            "clipped": f"{100 * mirror.clipped:.2f}",
+        }
+        for name, text in values.items():
+            self.readouts[name].show_value(text if is_measured(state) else UNKNOWN)
 
     def take_sample(self, stream: str, sample: Sample) -> None:
         """Another command, or where the actuators are."""

@@ -6,9 +6,10 @@ import time
 from typing import ClassVar
 
 import numpy as np
-from PySide6.QtWidgets import QHBoxLayout
+from PySide6.QtWidgets import QHBoxLayout, QLabel
 
 from escape_gui.panels.panel import Context, Panel, Shown
+from escape_gui.panels.psf import NO_MODEL, NO_MODEL_TIP
 from escape_gui.widgets.readout import Readout
 from escape_gui.widgets.strip_chart import History, StripChart
 from escape_hw.remote.source import Source
@@ -49,6 +50,11 @@ class PerformancePanel(Panel):
         row.setSpacing(24)
         for readout in self.readouts.values():
             row.addWidget(readout)
+        self.missing = QLabel(NO_MODEL)
+        self.missing.setObjectName("caption")
+        self.missing.setToolTip(NO_MODEL_TIP)
+        self.missing.hide()
+        row.addWidget(self.missing)
         row.addStretch()
         self.body.addLayout(row)
         self.body.addWidget(self.strehl, 1)
@@ -75,6 +81,8 @@ class PerformancePanel(Panel):
         self._history["residual"].add(now, residual)
         sigma = "" if loop.strehl_sigma is None else f" ± {100 * loop.strehl_sigma:.1f}"
         self.readouts["strehl"].show_value("–" if np.isnan(strehl) else f"{strehl:.1f}{sigma}")
+        modelled = any(stream.name == "model_psf" for stream in state.streams)
+        self.missing.setVisible(loop.closed and bool(np.isnan(strehl)) and not modelled)
         self.readouts["residual"].show_value("–" if np.isnan(residual) else f"{residual:.1f}")
 
     def tick(self, source: Source) -> None:

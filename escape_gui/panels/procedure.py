@@ -34,6 +34,8 @@ _SETTLED_MS = 400
 #: What stands in the form of a recording.
 NOTHING = "This is a recording: it can be looked at, nothing can be started. Its result stands below."
 
+NOBODY = "No server has answered. Start one with 'escape serve SYSTEM', or open a recording (File)."
+
 
 class ProcedurePanel(Panel):
     """The form, the plan, four buttons, progress, and the last result."""
@@ -131,7 +133,8 @@ class ProcedurePanel(Panel):
             self._choose()
         self.form.setVisible(bool(self._entries))
         if not self._entries:
-            _put(self._about, "" if self.context.session.commands else NOTHING)
+            replay = source.connected and self.context.session.commands is None
+            _put(self._about, NOTHING if replay else "" if source.connected else NOBODY)
         self._enable()
 
     def take_state(self, state: State) -> None:

@@ -18,6 +18,11 @@ from escape_hw.remote.source import Sample
 #: The lowest value of the profiles, relative to the peak of the model.
 _FLOOR = 1e-4
 
+CAPTIONS = {"psf": "measured, solid", "model_psf": "model, dashed"}
+#: Instead of the model while there is none, and why that matters.
+NO_MODEL = "no model image yet: run model-psf"
+NO_MODEL_TIP = "The Strehl ratio is the image's peak against the model's; 'Model PSF' measures it"
+
 
 class PsfPanel(Panel):
     """Image, model and the radial profiles of both."""
@@ -42,15 +47,17 @@ class PsfPanel(Panel):
             "psf": Picture(theme, "Image of the science camera", unit="counts"),
             "model_psf": Picture(theme, "Model of a perfect image"),
         }
+        self.captions: dict[str, QLabel] = {}
         pair = QHBoxLayout()
         pair.setSpacing(8)
-        for key, caption in (("psf", "measured, solid"), ("model_psf", "model, dashed")):
+        for key, caption in CAPTIONS.items():
             self.pictures[key].logarithmic = True
             self.pictures[key].use_map(1)
             column = QVBoxLayout()
             column.setSpacing(2)
             label = QLabel(caption)
             label.setObjectName("caption")
+            self.captions[key] = label
             column.addWidget(label)
             column.addWidget(self.pictures[key], 1)
             pair.addLayout(column, 1)
@@ -70,10 +77,12 @@ class PsfPanel(Panel):
         self._images: dict[str, NDArray[Any]] = {}
         self._profiles: dict[str, NDArray[np.float64]] = {}
         self._radial = RadialProfile((1, 1), (0, 0))
+        self._say_model()
 
     def take_sample(self, stream: str, sample: Sample) -> None:
         """Another image, or the model."""
         self._images[stream] = sample.data
+        self._say_model()
         self.pictures[stream].show_array(sample.data)
         self._profiles[stream] = self._profile(sample.data)
         model = self._profiles.get("model_psf")
@@ -84,6 +93,11 @@ class PsfPanel(Panel):
         for key, profile in self._profiles.items():
             relative = np.maximum(profile / reference[0], _FLOOR)
             self._curves[key].setData(np.arange(relative.size), relative)
+
+    def _say_model(self) -> None:
+        label = self.captions["model_psf"]
+        label.setText(CAPTIONS["model_psf"] if "model_psf" in self._images else NO_MODEL)
+        label.setToolTip(NO_MODEL_TIP if "model_psf" not in self._images else "")
 
     def _profile(self, image: NDArray[Any]) -> NDArray[np.float64]:
         """Mean over rings, of the light above the darkest corner, as a share of all of it."""
@@ -99,6 +113,7 @@ class PsfPanel(Panel):
         """Another source."""
         self._images.clear()
         self._profiles.clear()
+        self._say_model()
         for key, picture in self.pictures.items():
             picture.clear()
             self._curves[key].setData([], [])

@@ -57,6 +57,7 @@ class ArgumentForm(QWidget):
         form = QFormLayout(page)
         form.setContentsMargins(0, 0, 8, 0)
         form.setVerticalSpacing(4)
+        form.setHorizontalSpacing(8)
         form.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         for one in self._parameters:
             field = self._field(one)
@@ -68,7 +69,9 @@ class ArgumentForm(QWidget):
             row.setSpacing(8)
             row.addWidget(field, 1)
             if one.unit:
-                row.addWidget(QLabel(one.unit))
+                unit = QLabel(one.unit)
+                unit.setObjectName("caption")
+                row.addWidget(unit)
             name = QLabel(words.label(one))
             name.setToolTip(words.hint(one))
             name.setBuddy(field)

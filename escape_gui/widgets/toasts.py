@@ -1,20 +1,21 @@
-"""Short notes at the corner of the window: a run has ended, a fault, a refusal. None asks for a click."""
+"""Short notes in the status bar: a run has ended, a fault, a refusal. They cover nothing."""
 
 from __future__ import annotations
 
-from PySide6.QtCore import QEvent, QObject, Qt, QTimer
-from PySide6.QtWidgets import QFrame, QHBoxLayout, QLabel, QToolButton, QVBoxLayout, QWidget
+from PySide6.QtCore import Qt, QTimer
+from PySide6.QtGui import QResizeEvent
+from PySide6.QtWidgets import QFrame, QHBoxLayout, QLabel, QSizePolicy, QToolButton, QWidget
 
 from escape_gui.theme import Theme
 from escape_gui.widgets.status_pill import Level, StatusPill
 
 #: How long a note stays; one about something bad stays until it is closed.
-SHOWN_MS = 8000
+SHOWN_MS = 6000
 _MOST = 4
 
 
 class Toast(QFrame):
-    """One note.
+    """One note in one line; what does not fit stands in the tooltip.
 
     Parameters
     ----------
@@ -26,54 +27,58 @@ class Toast(QFrame):
 
     def __init__(self, theme: Theme, level: Level, title: str, text: str) -> None:
         super().__init__()
-        colours = theme.colours
-        edge = getattr(colours, level.value)
-        self.setObjectName("toast")
-        self.setStyleSheet(
-            f"#toast {{ background: {colours.button}; border: 1px solid {edge}; border-radius: 6px; }}"
-        )
         self.title, self.text, self.level = title, text, level
+        self._line = " · ".join(line.strip() for line in text.splitlines() if line.strip())
         pill = StatusPill(theme)
         pill.show_condition(level, title)
         self.shut = QToolButton()
         self.shut.setObjectName("quiet")
         self.shut.setText("×")
         self.shut.setAccessibleName("Close this note")
-        words = QLabel(text)
-        words.setWordWrap(True)
-        words.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        head = QHBoxLayout()
-        head.addWidget(pill)
-        head.addStretch()
-        head.addWidget(self.shut)
-        column = QVBoxLayout(self)
-        column.setContentsMargins(8, 4, 4, 8)
-        column.setSpacing(2)
-        column.addLayout(head)
-        column.addWidget(words)
+        self._words = QLabel(self._line)
+        self._words.setTextFormat(Qt.TextFormat.PlainText)
+        self._words.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        # It takes what room there is and asks for none: a long reason must not make the window wider.
+        self._words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
+        row = QHBoxLayout(self)
+        row.setContentsMargins(0, 0, 0, 0)
+        row.setSpacing(8)
+        row.addWidget(pill)
+        row.addWidget(self._words, 1)
+        row.addWidget(self.shut)
+        self.setToolTip(f"{title}\n{text}".strip())
         self.setAccessibleName(f"{title}: {text}")
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Cut the words where the room ends."""
+        super().resizeEvent(event)
+        metrics = self._words.fontMetrics()
+        self._words.setText(metrics.elidedText(self._line, Qt.TextElideMode.ElideRight, self._words.width()))
 
 
 class Toasts(QWidget):
-    """The notes of a window, newest below.
+    """The notes of a window: the newest is seen, the others come back when it goes.
 
     Parameters
     ----------
-    window
-        Over whose lower right corner they lie.
     theme
         Look.
     """
 
-    def __init__(self, window: QWidget, theme: Theme) -> None:
-        super().__init__(window)
-        self._window, self._theme = window, theme
-        self._column = QVBoxLayout(self)
-        self._column.setContentsMargins(0, 0, 0, 0)
-        self._column.setSpacing(8)
+    def __init__(self, theme: Theme) -> None:
+        super().__init__()
+        self._theme = theme
+        self._row = QHBoxLayout(self)
+        self._row.setContentsMargins(8, 0, 8, 0)
+        self._row.setSpacing(8)
+        self._more = QLabel()
+        self._more.setObjectName("caption")
+        self._row.addWidget(self._more)
         self.notes: list[Toast] = []
-        window.installEventFilter(self)
-        self.hide()
+        # Room for a note is always kept, so that no panel moves when one comes.
+        self.setMinimumHeight(self._height())
+        theme.changed.connect(lambda: self.setMinimumHeight(self._height()))
+        self._show_newest()
 
     def tell(self, level: Level, title: str, text: str, *, stays: bool | None = None) -> None:
         """Show a note until its time is over, or until it is closed; the oldest goes when there are many."""
@@ -82,37 +87,28 @@ class Toasts(QWidget):
         note = Toast(self._theme, level, title, text)
         note.shut.clicked.connect(lambda: self._drop(note))
         self.notes.append(note)
-        self._column.addWidget(note)
+        self._row.insertWidget(0, note, 1)
         if not (level is Level.BAD if stays is None else stays):
             timer = QTimer(note)
             timer.setSingleShot(True)
             timer.timeout.connect(lambda: self._drop(note))
             timer.start(SHOWN_MS)
-        self._place()
+        self._show_newest()
 
     def _drop(self, note: Toast) -> None:
         if note in self.notes:
             self.notes.remove(note)
-            self._column.removeWidget(note)
+            self._row.removeWidget(note)
             note.hide()
             note.deleteLater()
-            self._place()
+            self._show_newest()
 
-    def _place(self) -> None:
-        if not self.notes:
-            self.hide()
-            return
-        width = min(self._theme.pixels(380), self._window.width() - 32)
-        self.setFixedWidth(width)
-        height = max(self._column.heightForWidth(width), self.sizeHint().height())
-        self.setGeometry(
-            self._window.width() - width - 16, self._window.height() - height - 40, width, height
-        )
-        self.show()
-        self.raise_()
+    def _show_newest(self) -> None:
+        for note in self.notes:
+            note.setVisible(note is self.notes[-1])
+        others = len(self.notes) - 1
+        self._more.setText(f"+{others}" if others > 0 else "")
+        self._more.setToolTip("Notes behind this one" if others > 0 else "")
 
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
-        """Stay in the corner."""
-        if event.type() is QEvent.Type.Resize:
-            self._place()
-        return False
+    def _height(self) -> int:
+        return self._theme.pixels(26)

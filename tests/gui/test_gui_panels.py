@@ -27,7 +27,7 @@ from escape_gui.panels.psf import PsfPanel
 from escape_gui.session import Session
 from escape_gui.widgets.hold_button import HOLD_MS
 from escape_hw.errors import StorageError
-from escape_hw.remote.state import Health, Light, LoopState, Mirror, Phase, State
+from escape_hw.remote.state import Health, Light, LoopState, Mirror, Phase, State, StreamEntry
 
 P = TypeVar("P", bound=Panel)
 MakeWindow = Callable[..., MainWindow]
@@ -311,3 +311,20 @@ def test_a_full_disk_is_told_and_nothing_breaks(
     window.saver.panel_to(tmp_path / "a.png", "png", window.panels["camera"])
     assert "No space left" in window.toasts.notes[-1].text
     assert list(tmp_path.glob("a*")) == []
+
+
+def test_a_missing_model_image_is_told(make_window: MakeWindow, source: ScriptedSource) -> None:
+    model = source.streams.pop("model_psf")
+    source.change(loop=LoopState(closed=True, matrix="escape", residual_nm=50.0))
+    window = make_window((PsfPanel, PerformancePanel))
+    psf, performance = panel_of(window, PsfPanel), panel_of(window, PerformancePanel)
+    window.docks["psf"].raise_()
+    window.ticker.tick(everything=True)
+    assert "run model-psf" in psf.captions["model_psf"].text()
+    assert performance.readouts["strehl"].text == "–"
+    assert performance.missing.isVisible()
+    source.streams["model_psf"] = model
+    source.change(streams=(StreamEntry(name="model_psf", segment="", unit=""),))
+    window.ticker.tick(everything=True)
+    assert psf.captions["model_psf"].text() == "model, dashed"
+    assert not performance.missing.isVisible()

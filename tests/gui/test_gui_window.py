@@ -8,18 +8,28 @@ from pathlib import Path
 import pytest
 from gui_windows import dispose, settle, shown
 from PySide6.QtCore import QPoint, Qt
-from PySide6.QtWidgets import QAbstractButton, QAbstractSpinBox, QApplication, QComboBox, QLineEdit, QTabBar
+from PySide6.QtWidgets import (
+    QAbstractButton,
+    QAbstractSpinBox,
+    QApplication,
+    QComboBox,
+    QLabel,
+    QLineEdit,
+    QTabBar,
+)
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, ScriptedSource
 
 from escape_gui.band import Band
 from escape_gui.main_window import MainWindow
+from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.session import NoSource, Session
 from escape_gui.settings import Settings, load_settings
 from escape_gui.widgets.picture import Picture
+from escape_gui.widgets.status_pill import Level
 from escape_gui.workspaces import WORKSPACES
 from escape_hw.remote.source import Source
-from escape_hw.remote.state import Ended, Finish, Health
+from escape_hw.remote.state import Ended, Finish, Health, Parameter, ProcedureEntry, Rates
 
 MakeWindow = Callable[..., MainWindow]
 
@@ -81,6 +91,14 @@ def test_the_band_says_what_it_is(small_window: MainWindow, source: ScriptedSour
     assert strip.text().startswith("REPLAY")
 
 
+def test_light_is_unknown_until_frames_come(small_window: MainWindow, source: ScriptedSource) -> None:
+    light = small_window.band.light
+    assert (light.level, light.word) == (Level.GOOD, "saturated 0.04 %")
+    source.change(rates=Rates())
+    small_window.refresh()
+    assert (light.level, light.word) == (Level.QUIET, "saturated –")
+
+
 def test_a_fault_stays_until_it_is_cleared(
     small_window: MainWindow, source: ScriptedSource, control: ScriptedControl
 ) -> None:
@@ -104,6 +122,66 @@ def test_the_end_of_a_run_is_told(small_window: MainWindow, source: ScriptedSour
     assert (note.title, note.text) == ("escape failed", "too dark\n/runs/2")
     note.shut.click()
     assert small_window.toasts.notes == []
+
+
+def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: ScriptedSource) -> None:
+    """Nine arguments and five lines of result at 1280 x 800, and no unit at its field's edge."""
+    parameters = (
+        Parameter(name="poke", kind="float", default=0.01, unit="of full stroke"),
+        Parameter(name="accuracy", kind="float", unit="% of a sub-aperture"),
+        *(Parameter(name=f"number {k}", kind="int", default=k, unit="frame") for k in range(7)),
+    )
+    about = "Calibrates without a calibration source: DO-CRIME on the turbulence, then SPRINT. " * 2
+    source.offers = (ProcedureEntry(name="escape", title="ESCAPE", help=about, parameters=parameters),)
+    document = {
+        "gain": 0.97,
+        "residual_rms_nm": 44.0,
+        "snr": {"min": 8.2},
+        "strehl": {"peak": {"value": 0.4}},
+    }
+    source.change(last=Ended(id=1, name="escape", finish=Finish.DONE, folder="/runs/2", document=document))
+    window = make_window(settings=Settings(workspace="calibrate"))
+    panel = window.panels["procedure"]
+    assert isinstance(panel, ProcedurePanel)
+    for _ in range(3):
+        window.ticker.tick(everything=True)
+        QApplication.processEvents()
+    fields = panel.form.fields.values()
+    assert len(fields) == 9
+    for widget in (*fields, panel.numbers, panel.start):
+        assert widget.visibleRegion().boundingRect() == widget.rect(), widget.accessibleName()
+    for field in fields:
+        unit = next(
+            one
+            for one in field.parentWidget().findChildren(QLabel)
+            if one.text() in ("of full stroke", "% of a sub-aperture", "frame")
+            and one.geometry().center().y() - field.geometry().center().y() in (-1, 0, 1)
+        )
+        assert unit.geometry().left() - field.geometry().right() > 8
+        assert field.width() >= 60
+
+
+def test_a_note_covers_nothing(
+    small_window: MainWindow, qtbot: QtBot, qapp: QApplication, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    window, toasts = small_window, small_window.toasts
+    where = {name: dock.geometry() for name, dock in window.docks.items()}
+    monkeypatch.setattr("escape_gui.widgets.toasts.SHOWN_MS", 30)
+    toasts.tell(Level.BAD, "Not saved", "the disk is full, " * 40 + "\n/runs/2")
+    toasts.tell(Level.GOOD, "Saved", "/runs/3")
+    qapp.processEvents()
+    bad, good = toasts.notes
+    assert good.isVisible()
+    assert not bad.isVisible()
+    assert {name: dock.geometry() for name, dock in window.docks.items()} == where
+    assert window.statusBar().isAncestorOf(good)
+    assert window.width() == 1280
+    assert "/runs/2" in bad.toolTip()
+    # What informs goes by itself; what is bad comes back and stays.
+    qtbot.waitUntil(lambda: toasts.notes == [bad])
+    qapp.processEvents()
+    assert bad.isVisible()
+    assert bad.shut.mapTo(window, QPoint(0, 0)).x() < window.width()
 
 
 def test_a_refused_request_is_told(small_window: MainWindow, control: ScriptedControl, qtbot: QtBot) -> None:
@@ -228,7 +306,62 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
     assert not quiet.connected
     window = shown(session, tmp_path / "gui.json")
     assert window.panels["camera"].is_empty
-    window.refresh()
-    assert window.band.strip.text().startswith("NOT CONNECTED")
+    band = window.band
+    assert "escape serve SYSTEM" in band.strip.text()
+    assert "old" not in band.strip.text()
+    assert {one.text for one in band.readouts.values()} == {"–"}
+    for pill in (band.phase, band.loop, band.light, band.control):
+        assert pill.level is Level.QUIET
+        assert pill.word.endswith("–")
+    assert "escape serve SYSTEM" in window.panels["loop"]._nothing.text()
     dispose(window)
     session.close()
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.4])
+def test_the_window_fits_a_small_screen(
+    make_window: MakeWindow, source: ScriptedSource, scale: float
+) -> None:
+    """1366 x 768 with a task bar, even while a fault takes a row more."""
+    source.offers = (
+        ProcedureEntry(
+            name="escape",
+            title="ESCAPE",
+            help="Measures an interaction matrix. " * 12,
+            parameters=tuple(Parameter(name=f"number {k}", kind="int", default=k) for k in range(9)),
+        ),
+    )
+    source.change(last=Ended(id=1, name="escape", finish=Finish.DONE, message="all went well " * 20))
+    source.fail()
+    window = make_window(settings=Settings(font_scale=scale))
+    window.ticker.tick(everything=True)
+    for one in WORKSPACES:
+        window.show_workspace(one.name)
+        QApplication.processEvents()
+        window.ticker.tick(everything=True)
+        QApplication.processEvents()
+        assert window.minimumSizeHint().height() <= 700, one.name
+        window.resize(round(1366 * scale), 700)
+        assert window.height() == 700
+
+
+def test_no_tab_bar_of_another_workspace_stays(make_window: MakeWindow) -> None:
+    window = make_window()
+    for one in (*WORKSPACES, *WORKSPACES):
+        window.show_workspace(one.name)
+        for _ in range(5):
+            QApplication.processEvents()
+            window.ticker.tick(everything=True)
+        bars = window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly)
+        seen = {
+            tuple(bar.tabText(k) for k in range(bar.count()))
+            for bar in bars
+            if bar.isVisible() and bar.count()
+        }
+        wanted = {
+            tuple(window.docks[name].windowTitle() for name in cell.names)
+            for column in one.columns
+            for cell in column.cells
+            if len(cell.names) > 1
+        }
+        assert seen == wanted, one.name

@@ -19,6 +19,7 @@ from escape_gui.panels import PANELS
 from escape_gui.replay.source import ReplaySource
 from escape_gui.session import Session
 from escape_gui.settings import Settings
+from escape_gui.widgets.status_pill import Level
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +72,21 @@ def test_a_run_is_shown_by_every_panel(empty, folder):
     assert sprint._pill.word == "converged, 18 iterations"
     assert list(gains._curves) == ["ESCAPE", "DO-CRIME"]
     assert not empty.panels["psf"].is_empty
+
+
+def test_what_a_recording_does_not_know_is_no_zero(empty, folder):
+    empty.replay.open(folder)
+    until(lambda: is_open(empty), empty)
+    for name in ("camera", "mirror"):
+        empty.docks[name].show()
+        empty.docks[name].raise_()
+        QApplication.processEvents()
+        until(lambda: True, empty)
+    band, panels = empty.band, empty.panels
+    assert {one.text for one in band.readouts.values()} == {"–"}
+    assert (band.light.level, band.light.word) == (Level.QUIET, "saturated –")
+    assert panels["camera"].saturation.text() == "peak –   saturated –"
+    assert {one.text for one in panels["mirror"].readouts.values()} == {"–"}
 
 
 def test_nothing_can_be_commanded_and_the_reason_is_told(empty, folder):
