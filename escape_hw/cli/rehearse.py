@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import subprocess
@@ -71,10 +72,16 @@ def _run(one: Session, command: Sequence[str], environment: Mapping[str, str]) -
         return _NOT_FOUND
     while True:
         try:
-            code = child.wait()
-            return code if code >= 0 else 128 - code
+            # Its end is looked at, not taken: a Ctrl-C in this very moment would lose its exit code.
+            end = os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+            break
         except KeyboardInterrupt:
             one.tell("rehearse: waiting for the command to end")
+    with contextlib.suppress(KeyboardInterrupt):
+        child.wait()
+    if end is None:
+        raise RuntimeError("the command's end was not told")
+    return end.si_status if end.si_code == os.CLD_EXITED else 128 + end.si_status
 
 
 def _until_stopped(one: Session, rehearsal: Rehearsal) -> None:
