@@ -33,8 +33,7 @@ from escape_hw.remote.state import (
     Running,
     State,
 )
-from escape_hw.streams.ring import RingReader
-from escape_hw.streams.segments import StreamGone
+from escape_hw.streams.reader_shelf import ReaderShelf
 
 #: Longest wait for an ordinary answer, and for one that comes when a mirror is flat, seconds.
 TIMEOUT_S, SLOW_S = 3.0, 30.0
@@ -80,7 +79,7 @@ class Viewer:
         self._ended: dict[int, Ended] = {}
         self._geometry: tuple[object, Geometry] | None = None
         self._procedures: tuple[ProcedureEntry, ...] | None = None
-        self._readers: dict[str, RingReader] = {}
+        self._readers = ReaderShelf()
         self._here = endpoint.requests.startswith("ipc://")
         self._link = Link(endpoint, self._event, self._beat, keys=keys)
         try:
@@ -109,9 +108,7 @@ class Viewer:
             return
         self._closed = True
         self._link.close()
-        for reader in self._readers.values():
-            reader.close()
-        self._readers.clear()
+        self._readers.close()
 
     def __enter__(self) -> Self:
         return self
@@ -173,24 +170,9 @@ class Viewer:
         """The newest entry of a stream, or ``None`` when there is none newer than ``after``."""
         if not self._here:
             return self._latest_from_afar(stream, after)
-        reader = self._reader(stream)
-        return None if reader is None else reader.latest(after)
-
-    def _reader(self, stream: str) -> RingReader | None:
         segment = next((one.segment for one in self._state.streams if one.name == stream), None)
-        known = self._readers.get(stream)
-        if known is not None and known.name == segment and not known.closed:
-            return known
-        if known is not None:
-            del self._readers[stream]
-            known.close()
-        if segment is None:
-            return None
-        try:
-            self._readers[stream] = RingReader(segment)
-        except StreamGone:
-            return None
-        return self._readers[stream]
+        reader = self._readers.reader(stream, segment)
+        return None if reader is None else reader.latest(after)
 
     def _latest_from_afar(self, stream: str, after: int) -> Sample | None:
         try:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from escape_hw.streams.ring import RingReader
-from escape_hw.streams.segments import StreamGone
+from escape_hw.streams.reader_shelf import ReaderShelf
 
 
 class Samples:
     """Reads the engine's rings."""
 
     def __init__(self) -> None:
-        self._readers: dict[str, RingReader] = {}
+        self._readers = ReaderShelf()
 
     def newest(
         self, stream: str, segment: str | None, after: int
@@ -28,7 +27,7 @@ class Samples:
         after
             Index of the entry that the client has.
         """
-        reader = self._reader(stream, segment)
+        reader = self._readers.reader(stream, segment)
         sample = None if reader is None else reader.latest(after)
         if sample is None:
             return None, None
@@ -40,21 +39,4 @@ class Samples:
 
     def close(self) -> None:
         """Let go of the rings."""
-        for reader in self._readers.values():
-            reader.close()
-        self._readers.clear()
-
-    def _reader(self, stream: str, segment: str | None) -> RingReader | None:
-        known = self._readers.get(stream)
-        if known is not None and known.name == segment and not known.closed:
-            return known
-        if known is not None:
-            del self._readers[stream]
-            known.close()
-        if segment is None:
-            return None
-        try:
-            self._readers[stream] = RingReader(segment)
-        except StreamGone:
-            return None
-        return self._readers[stream]
+        self._readers.close()

@@ -13,9 +13,9 @@ from escape_hw.runtime.sweep.space import DELAY, LOOP_KEYS, Parameter, default_s
 if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult
     from escape_hw.config.models import SystemConfig
+    from escape_hw.runtime.loop_bench import LoopBench
     from escape_hw.runtime.sweep.kept import KeptSweep
     from escape_hw.runtime.sweep.result import SweepResult
-    from escape_hw.runtime.system import System
 
 #: Parts of the configuration that the matrices were measured with.
 _FIXED = ("system", "sensor", "basis", "devices", "schema")
@@ -75,7 +75,7 @@ def swept_space(config: SystemConfig, texts: Sequence[str]) -> tuple[Parameter, 
 
 
 def sweep_of(
-    bench: System,
+    bench: LoopBench,
     matrices: Mapping[str, CalibrationResult],
     folder: Path,
     vary: Sequence[str],
@@ -108,7 +108,7 @@ def sweep_of(
 
 
 def _begin(
-    bench: System,
+    bench: LoopBench,
     matrices: Mapping[str, CalibrationResult],
     folder: Path,
     space: tuple[Parameter, ...],
