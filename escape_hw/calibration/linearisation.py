@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.departures import PEDESTAL, MirrorDepartures
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.weighted import WeightedMatrix
 
-#: Width of the broad pedestal that influence functions may stand on, relative to their own.
-_PEDESTAL = 1.7
 #: Places of the common parameters among the unknowns; the registration has places 1 to 5.
 GAIN, WIDTH, SHAPE = 0, 6, 7
 
@@ -138,7 +137,7 @@ class Problem:
         here, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
         zonal, moved = (weigh(part) for part in zonal_jacobian(self.model, here, w))
         by_width = moved[5] * w
-        by_shape = weigh(self.model.zonal_matrix(here, w * _PEDESTAL)) - zonal
+        by_shape = weigh(self.model.zonal_matrix(here, w * PEDESTAL)) - zonal
         variants = [weigh(v.zonal_matrix(here, w)) - zonal for v in self.variants]
         variants += [zonal @ bend for bend in self.bends]
         shaped = zonal + state.shape * by_shape + state.actuator_width * by_width
@@ -198,7 +197,7 @@ class Problem:
         here, w = Registration.from_array(state.alpha), 1.0 + state.width
         zonal, moved = zonal_jacobian(self.model, here, w)
         shaped = zonal + state.actuator_width * moved[5] * w
-        shaped += state.shape * (self.model.zonal_matrix(here, w * _PEDESTAL) - zonal)
+        shaped += state.shape * (self.model.zonal_matrix(here, w * PEDESTAL) - zonal)
         for share, variant in zip(state.variant, self.variants, strict=True):
             shaped += share * (variant.zonal_matrix(here, w) - zonal)
         half = len(zonal) // 2
@@ -228,6 +227,20 @@ class Problem:
             scatter[name] = max(float(np.sqrt(found)), least)
         decided = float(np.sum(1 - variance * self.precision))
         return Learned(replace(self.priors, **scatter), decided)
+
+    def departures(self, state: State, system: NormalEquations) -> MirrorDepartures:
+        """How the mirror of a solution differs from the model's.
+
+        Parameters
+        ----------
+        state, system
+            Solution, and the problem about it.
+        """
+        first = SHAPE + 1 + self.n_variants + self.n_lines
+        # Slopes' gains, eliminated first, come last.
+        variance = np.diag(np.linalg.inv(system.whole))[first : first + self.model.n_act]
+        sigma = np.sqrt(np.maximum(variance, 0.0)) * self.weighted.noise(system.residual)
+        return MirrorDepartures(state.actuator_gain, sigma, state.actuator_width, state.shape)
 
     def move(self, state: State, step: NDArray[np.floating]) -> State:
         """The state after a step, in the order of the unknowns."""

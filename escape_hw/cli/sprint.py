@@ -66,6 +66,7 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
         choice=settings.modes_choice,
         solver=settings.solver,
         loss=settings.loss,
+        actuators=settings.actuators,
         learning_rate=settings.learning_rate,
     )
     result = replace(product.result, matrix=measured, measured=None, registration=estimate)
