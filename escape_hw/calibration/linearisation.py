@@ -12,6 +12,7 @@ from escape_hw.api.departures import PEDESTAL, MirrorDepartures
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.derivatives import modal_matrix, zonal_jacobian
+from escape_hw.calibration.evidence import believed
 from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.weighted import WeightedMatrix
 
@@ -21,8 +22,8 @@ GAIN, WIDTH, SHAPE = 0, 6, 7
 
 #: Random effects of which there are many of a kind, in the order of the unknowns ...
 _EFFECTS = ("sampling", "actuator_gain", "actuator_width", "slope_gain")
-#: ... and the share of its usual scatter below which none is taken to fall.
-_LEAST_SCATTER = 0.05
+#: ... and the shares of their usual scatter below and above which none is taken to be.
+_LEAST_SCATTER, _MOST_SCATTER = 0.05, 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,11 +237,23 @@ class Problem:
         state, system
             Solution, and the problem about it.
         """
-        first = SHAPE + 1 + self.n_variants + self.n_lines
         # Slopes' gains, eliminated first, come last.
-        variance = np.diag(np.linalg.inv(system.whole))[first : first + self.model.n_act]
-        sigma = np.sqrt(np.maximum(variance, 0.0)) * self.weighted.noise(system.residual)
-        return MirrorDepartures(state.actuator_gain, sigma, state.actuator_width, state.shape)
+        inner = len(system.whole)
+        n_act = self.model.n_act
+        kinds = slice(inner - 2 * n_act, inner - n_act), slice(inner - n_act, inner)
+        usual = Priors()
+        bounds = [
+            (_LEAST_SCATTER * each, _MOST_SCATTER * each)
+            for each in (usual.actuator_gain, usual.actuator_width)
+        ]
+        # Where the model does not fit, single actuators are to be believed less.
+        rms = float(np.sqrt(np.mean(np.square(system.residual))))
+        value, sigma = believed(
+            system.whole, state.offset(self.mean_width)[:inner], self.precision[:inner], kinds, bounds,
+            max(rms, self.weighted.noise(system.residual)),
+        )  # fmt: skip
+        gains, widths = kinds
+        return MirrorDepartures(value[gains], sigma[gains], value[widths], state.shape)
 
     def move(self, state: State, step: NDArray[np.floating]) -> State:
         """The state after a step, in the order of the unknowns."""
