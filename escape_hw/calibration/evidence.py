@@ -25,8 +25,8 @@ def believed(
     """Effects with the priors that make the data likeliest, from a solution with other priors.
 
     The scatter of each kind of effects goes to ``sum x^2 / sum(1 - var / scatter^2)`` (MacKay 1992, eq.
-    4.9 and 4.10), the fixed point of the evidence, with a few effects of zero added to either sum. Unlike a prior that was chosen, it goes to nothing where
-    the data say nothing, and then so do the effects.
+    4.9 and 4.10), the fixed point of the evidence, with a few effects of zero added to the count. Unlike a
+    prior that was chosen, it goes to nothing where the data say nothing, and then so do the effects.
 
     Parameters
     ----------
