@@ -149,7 +149,8 @@ def sections(head: Metadata, step: int, header_bytes: int = HEADER_BYTES) -> Sec
     ):  # fmt: skip
         starts.append(at)
         at += math.ceil(length / step) * step
-    return Sections(starts[0], *starts[2:6], *starts[8:12], starts[13], at)
+    data, _, semaphores, log, readers, writers, _, _, traces, acquired, written, counts, _, ring = starts
+    return Sections(data, semaphores, log, readers, writers, traces, acquired, written, counts, ring, at)
 
 
 def found_sections(head: Metadata, file_bytes: int) -> Sections | None:

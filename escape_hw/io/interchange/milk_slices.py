@@ -52,7 +52,8 @@ class Slices:
 
     def newest(self) -> NDArray[Any]:
         """The newest array, in place."""
-        return self._data[self._head.cnt1 % self._n] if self._circular else self._data[0]
+        newest: NDArray[Any] = self._data[self._head.cnt1 % self._n if self._circular else 0]
+        return newest
 
     def put(self, data: NDArray[Any]) -> None:
         """Write an array; readers see it once the metadata say so."""
