@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from array import array
 from dataclasses import replace
 from pathlib import Path
@@ -92,14 +93,15 @@ class Ripples:
     """Keeps the rms of the wavefront in front of the sensor, mirror included, of every moment it is seen."""
 
     def __init__(self, twin: SimBench) -> None:
-        self._lit = np.flatnonzero(twin.pupil.lit)
+        self._share = (twin.pupil.lit / np.count_nonzero(twin.pupil.lit)).astype(np.float32).ravel()
         self.seconds, self.nm = array("d"), array("f")
         twin.onlookers.append(self)
 
     def __call__(self, opd: NDArray[np.float32], time_s: float) -> None:
         """Take the optical path ``(n, n)`` in metres."""
         self.seconds.append(time_s)
-        self.nm.append(1e9 * float(opd.ravel()[self._lit].std()))
+        path = opd.ravel()
+        self.nm.append(1e9 * math.sqrt(float((path * path) @ self._share) - float(path @ self._share) ** 2))
 
 
 class Wavefronts:

@@ -37,7 +37,10 @@ def draw(out: Path, figure: Path) -> None:
         error = (rows[name] - truth[:, k])[settled]
         chi2 = np.mean(np.square(error / rows[f"{name}_sigma"][settled]))
         rms, worst = np.sqrt(np.mean(error**2)), np.abs(error).max()
-        print(f"{name}: rms error {rms:.4f}, largest {worst:.4f}, chi2 {chi2:.2f}")
+        print(
+            f"{name}: rms error {rms:.4f}, largest {worst:.4f}, chi2 {chi2:.2f}; mean {error.mean():+.4f}, "
+            f"scatter about it {error.std():.4f}"
+        )
     gains = np.array(tracked["gains"])
     gains = gains[gains[:, 0] > SETTLED_S]
     share = np.interp(gains[:, 0], t, rows["optical_gain"]) / gains[:, 1] - 1
