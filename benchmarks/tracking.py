@@ -126,9 +126,7 @@ def moved_to(bench: System, start: CalibrationResult, here: Registration) -> NDA
     """The start's matrix moved to a registration ``(n_slopes, n_modes)``, each mode as strong as it was."""
     known, matrix, model = start.registration, start.matrix, bench.model(start.grid)
     assert known is not None
-    then, now = (
-        found_matrix(model, where, known, matrix.m2c) for where in (known.registration, here)
-    )
+    then, now = (found_matrix(model, where, known, matrix.m2c) for where in (known.registration, here))
     return np.asarray(now * ((then * matrix.data).sum(axis=0) / np.square(then).sum(axis=0)))
 
 
