@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from pathlib import Path
 
@@ -29,6 +30,9 @@ log = logging.getLogger(__name__)
 DEFAULT_SYSTEM = "razor-shwfs"
 #: Milliseconds from an engine that is ready to the picture, and how long to wait for one at most.
 _PICTURE_AFTER_MS, _PICTURE_AT_LAST_MS = 4000, 60_000
+
+#: A window may wait for a loop on the same machine.
+_NICENESS = 10
 
 
 def application() -> QApplication:
@@ -113,6 +117,8 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     qt = application()
     recording = bool(system) and is_recording(Path(system))
     address, own = ("", None) if recording else _server(system, address)
+    # Only now: a server of its own, whose engine runs a loop, stands in front.
+    os.nice(_NICENESS)
     store = settings_file()
     settings, warnings = (Settings(), ()) if reset_settings else load_settings(store)
     session = Session()

@@ -162,7 +162,8 @@ def fitting(engine: Engine, name: str) -> MatrixProduct:
     ConfigError, ProductError, IncompatibleProduct
         There is none of that name, or it belongs elsewhere.
     """
-    product = fitting_matrix(engine.shelf.matrix(name), engine.config)
+    # Real drivers may stand on stand-ins: what is open says whether this is a simulation.
+    product = fitting_matrix(engine.shelf.matrix(name), engine.config, force=engine.bench.simulated)
     refuse_simulated(product, engine.bench, force=False)
     return product
 
