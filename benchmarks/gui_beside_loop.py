@@ -1,9 +1,9 @@
 """What a window does to the loop beside it: latency with the window alive and with it halted, in turn.
 
-A server of ``razor-shwfs`` on the twin, which loses no frames here, closes its loop on a short DO-CRIME. A
-window on it is halted and let go every few seconds, so that whatever else the machine does falls on both alike.
-Printed are the ratios, with, by, without, and their scatter: 16th to 84th percentile of a bootstrap over pairs
-of turns. A ratio whose interval holds 1 is within noise:
+A server of ``razor-shwfs`` on the twin, which loses no frames here, closes its loop on a short DO-CRIME.
+A window on it is halted and let go every few seconds, so that whatever else the machine does falls on both
+alike. Printed are the ratios of the medians over all turns, and the 16th and 84th percentile of a bootstrap
+over pairs of turns: where 1 lies between them the window is within noise.
 ``python benchmarks/gui_beside_loop.py [TURNS]``.
 """
 

@@ -14,13 +14,14 @@ from escape_hw.errors import RequestRefused
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Finish, Phase
 from escape_sim.devices import shared_bench
-from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build, bench_server
+from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, bench_server, build
 from escape_sim.stand_ins.bench_server import BenchServer
 
 #: On the increments of the real camera.
 REGION = "devices.wfs.region=[216,152,208,208]"
 LIMITS = {
-    "lease_s": 1.5, "abandoned_s": 1, "no_frames_s": 1, "diverging_factor": 2, "diverging_s": 0.4, "silent_s": 60,
+    "lease_s": 1.5, "abandoned_s": 1, "no_frames_s": 1, "diverging_factor": 2, "diverging_s": 0.4,
+    "silent_s": 60,
 }  # fmt: skip
 
 
