@@ -26,7 +26,7 @@ from escape_hw.api.tracking import Alarm, TrackResult
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import Motion, next_frame
 from escape_hw.calibration.closed_loop import integrator_for
-from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.found_mirror import found_matrix
 from escape_hw.calibration.gain_curve import SCATTER
 from escape_hw.calibration.live_registration import LiveEstimate, LiveRegistration
 from escape_hw.calibration.loop_run import RunningLoop
@@ -155,7 +155,9 @@ class _Tracker:
         c, t = bench.config.calibration, bench.config.tracking
         self.bench, self.grid, self.exchange, self.psf = bench, grid, exchange, model_psf
         self.control = integrator_for(bench, matrix, grid, gain=gain)
-        start = registration or sprint(matrix, bench.model(grid), learning_rate=c.learning_rate)
+        start = registration or sprint(
+            matrix, bench.model(grid), learning_rate=c.learning_rate, actuators=c.actuators
+        )
         if not start.converged:
             raise CalibrationError(f"no registration to begin with: {'; '.join(start.warnings)}")
         self.amplitude = poke_amplitudes(bench, matrix.m2c, poke)
@@ -166,7 +168,7 @@ class _Tracker:
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
-        self.updates, self.residual_at, self.began_ns = 0, 0, 0
+        self.updates, self.residual_at = 0, 0
         self.pending: Future[_Answer | None] | None = None
         self.metrics: dict[str, float] = {}
         self.arrays: dict[str, NDArray[np.float32]] = {}
@@ -187,7 +189,7 @@ class _Tracker:
             memory=self.memory, step_s=STEP_S, response=self.response,
             curved=len(SCATTER) if bench.config.sensor.kind == "pyramid" else 0,
         )  # fmt: skip
-        unit = modal_matrix(self.model, start.registration, matrix.m2c, start.width.value)
+        unit = found_matrix(self.model, start.registration, start, matrix.m2c)
         self.begun = (unit * matrix.data).sum(axis=0) / np.square(unit).sum(axis=0)
         self.used = replace(self.used, gain=float(self.begun.mean()))
 
@@ -197,7 +199,7 @@ class _Tracker:
         prepare_sensor(bench)
         bench.dm.flatten()
         next_frame(bench)
-        lost, self.began_ns = bench.wfs.status().lost, bench.wfs.now_ns()
+        lost, result.began_ns = bench.wfs.status().lost, bench.wfs.now_ns()
         science = bench.science if self.psf is not None else None
         if science is not None:
             science.stop()
@@ -257,7 +259,7 @@ class _Tracker:
 
     def _now(self) -> float:
         """Seconds since the loop was closed."""
-        return (self.bench.wfs.now_ns() - self.began_ns) * 1e-9
+        return (self.bench.wfs.now_ns() - self.result.began_ns) * 1e-9
 
     def _images(self, loop: RunningLoop) -> FrameStack | None:
         """The science frames since the last ones, every few updates."""
