@@ -27,6 +27,9 @@ _FAINT = 0.1
 #: little enough that a rim in the shade of a soiled edge is as steep as any other. A bench's stop is whole,
 #: and what diffraction puts between the images would count for more the harder light is pressed.
 _PRESSED, _PRESSED_SOILED = 1.0, 0.25
+#: What the mean place of a telescope's images errs by beyond scatter and roundness, in pixels: from fourteen
+#: clean pupils and twenty soiled ones (docs/decisions/0018-pyramids-in-truth.md).
+_COMMON_PX = 0.018
 
 
 def find_pupils(
@@ -146,7 +149,7 @@ def _refined(
     if shadow is not None:
         offset, sigma = shadow_offset(even, centres, diameter, shadow)
         share = variance / (variance + sigma**2)
-        centres, variance = centres + share * offset, variance * (1 - share)
+        centres, variance = centres + share * offset, variance * (1 - share) + _COMMON_PX**2
     light = _light(image, pupils.corners_px, n_sub)
     flux = np.maximum(light / np.percentile(light[pupils.valid], 95), 0.0).astype(np.float32)
     return replace(
