@@ -23,6 +23,8 @@ DARK_SHARE = 0.02
 _LATER = 2
 #: Blocks of a run at most whose means tell how fast slopes forget; half as many at least.
 _BLOCKS = 8
+#: Share of the air in the slopes' variance below which it cannot be told from chance.
+_LEAST_SHARE = 0.02
 
 
 def some_frames(frames: int, name: str = "frames") -> int:
@@ -128,12 +130,9 @@ class Motion:
         if self._n < 2:
             return grid
         variance = float(np.maximum(self._squares / self._n - np.square(self._sum / self._n), 0).mean())
-        return grid.with_motion(
-            float(np.sqrt(variance)),
-            float(np.sqrt(self._pokes / self._n)),
-            self._looks(variance),
-            self._steady(variance),
-        )
+        pokes, steady = float(np.sqrt(self._pokes / self._n)), self._steady(variance)
+        looks = self._looks(variance, steady if pokes else 1.0)
+        return grid.with_motion(float(np.sqrt(variance)), pokes, looks, steady)
 
     def _steady(self, variance: float) -> float:
         """Correlation of the slopes with those :data:`_LATER` frames later, between 0 and 1."""
@@ -142,17 +141,21 @@ class Motion:
         mean = float(np.square(self._sum / self._n).sum())
         return float(np.clip((self._later / self._pairs - mean) / (variance * self.n_slopes), 0.0, 1.0))
 
-    def _looks(self, variance: float) -> float:
-        """Independent states of the slopes seen so far: by how much means over blocks vary less.
+    def _looks(self, variance: float, share: float) -> float:
+        """Independent states of the air seen so far: by how much means over blocks vary less.
 
         The variance of a mean over ``L`` frames is ``variance * tau / L`` with the integral of the
-        correlation ``tau``, once ``L`` exceeds it.
+        correlation ``tau``, once ``L`` exceeds it. Pokes are new in every frame: all but the air's
+        ``share`` of the variance has a ``tau`` of one frame, and the air's is as much longer.
         """
         whole = self._blocks[: self._n // self._length]
         if len(whole) < _BLOCKS // 2 or not variance > 0:
             return 0.0
         between = float(np.var(np.stack(whole) / self._length, axis=0, ddof=1).mean())
-        return self._n / max(self._length * between / variance, 1.0)
+        tau = self._length * between / variance
+        if share > _LEAST_SHARE:
+            tau = (tau - 1 + share) / share
+        return self._n / max(tau, 1.0)
 
     def references(self, grid: SensorGeometry, focus: MeanFocus | None = None) -> SensorGeometry:
         """The geometry with the references that all frames of a run give, instead of its first ones.

@@ -21,6 +21,9 @@ _INSIDE = 0.5
 #: Highest power of the smooth light that the shadow falls on.
 _SMOOTH = 2
 _ITERATIONS, _LARGEST, _DIFFERENCE = 4, 0.7, 0.25
+#: What light that is uneven on the scale of the shadow moves it by in all four images alike, in pixels: their
+#: scatter does not know (docs/decisions/0018-pyramids-in-truth.md).
+_COMMON_PX = 0.05
 #: Finer than that by so much where the shadow is moved by fractions of a pixel.
 _FINER = 3
 
@@ -99,14 +102,15 @@ def shadow_offset(
     offset : ndarray, ``(2,)``
         As (x, y) in pixels.
     sigma : float
-        Standard error along an axis, by the scatter of the four.
+        Standard error along an axis, by the scatter of the four and what they have in common.
     """
     offset = np.zeros(2)
     moves = np.zeros((4, 2))
     for _ in range(_ITERATIONS):
         moves = np.array([_step(image, at, diameter, shadow) for at in centres + offset])
         offset += np.clip(moves.mean(axis=0), -_LARGEST, _LARGEST)
-    return offset, float(np.sqrt(np.mean(np.var(moves, axis=0, ddof=1)) / len(moves)))
+    scatter = float(np.mean(np.var(moves, axis=0, ddof=1))) / len(moves)
+    return offset, float(np.hypot(np.sqrt(scatter), _COMMON_PX))
 
 
 def _step(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from escape_hw.api.pyramid import IMAGES, PyramidPupils, boxes, without_low_orders
+from escape_hw.api.threads import hold_to_one_thread
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.obscuration import Shadow, shadow_offset
 from escape_hw.pipeline.pyramid_slopes import slopes_of_image
@@ -26,6 +27,9 @@ _FAINT = 0.1
 #: little enough that a rim in the shade of a soiled edge is as steep as any other. A bench's stop is whole,
 #: and what diffraction puts between the images would count for more the harder light is pressed.
 _PRESSED, _PRESSED_SOILED = 1.0, 0.25
+#: What the mean place of a telescope's images errs by beyond scatter and roundness, in pixels: from fourteen
+#: clean pupils and twenty soiled ones (docs/decisions/0018-pyramids-in-truth.md).
+_COMMON_PX = 0.018
 
 
 def find_pupils(
@@ -79,7 +83,7 @@ def find_pupils(
     centres, diameter = _places(image, rough, n_sub)
     _check_fit(centres, rough, diameter, n_sub, image.shape)
     corners = boxes(centres, n_sub)
-    light = np.sum([image[y : y + n_sub, x : x + n_sub] for x, y in corners], axis=0)
+    light = _light(image, corners, n_sub)
     counts = float(np.percentile(light[light > 0.02 * np.percentile(light, 99)], 95))
     flux = np.maximum(light / counts, 0.0)
     # How far the images lie beside their boxes, on average: the pupil's centre in a box.
@@ -105,7 +109,7 @@ def find_pupils(
 def refine_pupils(
     means: Sequence[NDArray[np.float32]], pupils: PyramidPupils, shadow: Shadow | None = None
 ) -> PyramidPupils:
-    """The pupils with centres and diameter from a longer look, and with the error of their mean place.
+    """The pupils with centres, diameter and light from a longer look, and the error of their mean place.
 
     Under turbulence the rims fitted on a second of frames may be some tenths of a pixel off. Boxes
     and mask stay as they are, so slopes keep their meaning; a model wants the centres. A soiled edge
@@ -122,6 +126,14 @@ def refine_pupils(
     shadow
         What passes the telescope's obscuration and vanes; ``None``: there are none.
     """
+    # The products are many and small.
+    with hold_to_one_thread():
+        return _refined(means, pupils, shadow)
+
+
+def _refined(
+    means: Sequence[NDArray[np.float32]], pupils: PyramidPupils, shadow: Shadow | None
+) -> PyramidPupils:
     n_sub = pupils.valid.shape[0]
     pressed, order = (_PRESSED, 1) if shadow is None else (_PRESSED_SOILED, ROUND)
     image = np.asarray(np.mean(means, axis=0), np.float64)
@@ -137,8 +149,17 @@ def refine_pupils(
     if shadow is not None:
         offset, sigma = shadow_offset(even, centres, diameter, shadow)
         share = variance / (variance + sigma**2)
-        centres, variance = centres + share * offset, variance * (1 - share)
-    return replace(pupils, centres_px=centres, diameter_px=diameter, centre_sigma_px=float(np.sqrt(variance)))
+        centres, variance = centres + share * offset, variance * (1 - share) + _COMMON_PX**2
+    light = _light(image, pupils.corners_px, n_sub)
+    flux = np.maximum(light / np.percentile(light[pupils.valid], 95), 0.0).astype(np.float32)
+    return replace(
+        pupils, centres_px=centres, diameter_px=diameter, centre_sigma_px=float(np.sqrt(variance)), flux=flux
+    )
+
+
+def _light(image: NDArray[np.float64], corners: NDArray[np.intp], n_sub: int) -> NDArray[np.float64]:
+    """Light ``(n_sub, n_sub)`` of the boxes of all images together."""
+    return np.asarray(np.sum([image[y : y + n_sub, x : x + n_sub] for x, y in corners], axis=0))
 
 
 def _places(

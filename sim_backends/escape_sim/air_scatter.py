@@ -30,7 +30,8 @@ def air_scatter(
     A pyramid answers differently under every wavefront: where this is steep a pixel is saturated, and
     what it still sees lies a little aside. A model knows the mean only. Its registration therefore
     errs by this much over the root of the number of states that a measurement averaged, however little
-    noise there was. Told by frames: differences of two with the mirror's shape up and down.
+    noise there was. Told by frames: differences of two with the mirror's shape up and down. Pokes are
+    new in every frame, so what they do to a state of the air is averaged.
 
     Parameters
     ----------
@@ -39,7 +40,7 @@ def air_scatter(
     pupils
         Its geometry.
     phases
-        Random states ``(count, n, n)`` in radians: turbulence and pokes.
+        Random states ``(count, k, n, n)`` in radians: turbulence, with other pokes for every shape.
     shapes
         Commands ``(count, n_act, k)`` whose response is looked at under each state, of all modes of a
         calibration: fine shapes tell the registration better than coarse ones.
@@ -49,16 +50,19 @@ def air_scatter(
         The model's matrix for shapes ``(n_act, k)``, and its derivatives by registration and width.
     """
     found = []
-    for phase, commands in zip(phases * (optics.wavelength_m / (2 * np.pi)), shapes, strict=True):
+    for states, commands in zip(phases * (optics.wavelength_m / (2 * np.pi)), shapes, strict=True):
         paths = np.tensordot(commands.T, influence_m, 1)
         step = _STEP * optics.wavelength_m / float(paths.std())
         slopes = [
-            slopes_of_image(optics.frame((phase + step * path).astype(np.float32)), pupils)
-            - slopes_of_image(optics.frame((phase - step * path).astype(np.float32)), pupils)
-            for path in paths
+            slopes_of_image(optics.frame((state + step * path).astype(np.float32)), pupils)
+            - slopes_of_image(optics.frame((state - step * path).astype(np.float32)), pupils)
+            for state, path in zip(states, paths, strict=True)
         ]
         unit, derivatives = jacobian(commands)
         terms = np.concatenate([unit[None], derivatives[:5]]).reshape(6, -1)
         gain, *moved = np.linalg.lstsq(terms @ terms.T, terms @ np.stack(slopes, axis=1).ravel())[0]
         found.append(np.array(moved) / gain)
-    return np.asarray(np.std(found, axis=0, ddof=1))
+    variance = np.var(found, axis=0, ddof=1)
+    # Air and pupil have no preferred direction, and few states tell a variance badly.
+    variance[:2] = variance[:2].mean()
+    return np.asarray(np.sqrt(variance))

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.obscuration import passed_share
+from escape_hw.pipeline.rims import SOFT
 from escape_sim.telescope_pupil import soiled_share
 
 if TYPE_CHECKING:
@@ -22,6 +24,10 @@ PUPIL_SAMPLES = 8
 #: Pupil samples across one actuator pitch that a pyramid needs at least: a Gaussian influence function
 #: keeps less than a ten-thousandth of its amplitude beyond their highest frequency.
 SAMPLES_PER_PITCH = 2.0
+#: Share of the design's light below which a pixel of the rim tells nothing of what dims it, ...
+_TELLING = 0.4
+#: ... and the least share that a sample is left with: what the design lights counts as lit.
+_DIMMEST = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +89,9 @@ def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeome
 def pupil_of_images(config: SystemConfig, pupils: PyramidPupils) -> PupilGeometry:
     """The pupil that a pyramid's images show.
 
+    On a telescope it is lit as they say, for what lies on its mirrors dims parts of it; a bench's beam
+    is taken for the design's.
+
     Raises
     ------
     CalibrationError
@@ -93,7 +102,27 @@ def pupil_of_images(config: SystemConfig, pupils: PyramidPupils) -> PupilGeometr
         raise CalibrationError(
             f"the pupil images have {pupils.valid.shape} pixels; sensor.n_sub is {pupil.n_sub}"
         )
-    return pupil
+    return lit_as_seen(pupil, pupils) if config.telescope.obscuration else pupil
+
+
+def lit_as_seen(pupil: PupilGeometry, pupils: PyramidPupils) -> PupilGeometry:
+    """A pupil, brightened or dimmed by the light of its images relative to the design's."""
+    n, p = pupil.n_sub, pupil.n_pix
+    design = ndimage.gaussian_filter(np.square(pupil.amplitude, dtype=float), SOFT * p)
+    # Boxes lie a fraction of a pixel beside their images.
+    beside = pupils.corners_px + (n - 1) / 2 - pupils.centres_px
+    moved = [ndimage.shift(design, (-y * p, -x * p), order=1) for x, y in beside]
+    expected = np.mean(moved, axis=0).reshape(n, p, n, p).sum(axis=(1, 3))
+    telling = expected > _TELLING * expected.max()
+    share = np.where(telling, pupils.flux / np.where(telling, expected, 1.0), 0.0)
+    # Beyond the last pixel that tells, the nearest one does.
+    share = share[tuple(ndimage.distance_transform_edt(~telling, return_indices=True)[1])]
+    at = (np.arange(n * p) + 0.5) / p - 0.5
+    x, y = beside.mean(axis=0)
+    at_samples = np.meshgrid(at - y, at - x, indexing="ij")
+    dimmed = ndimage.map_coordinates(share / np.percentile(share, 95), at_samples, order=1, mode="nearest")
+    amplitude = pupil.amplitude * np.sqrt(np.maximum(dimmed, _DIMMEST))
+    return replace(pupil, amplitude=amplitude.astype(np.float32))
 
 
 def usual_samples(config: SystemConfig) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,6 +46,10 @@ _SCALING = 0.12
 _SHAPES = 10
 #: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
 _STRENGTH_DOUBT, _ELLIPSE = 0.4, 0.05
+#: Doubt in pixels about the images' place relative to each other, and the pattern of it that matters: one
+#: diagonal pair against the other makes the x slopes hold some of the y slopes' derivative, as a shift does.
+#: The other patterns displace images whose sum is in a slope or whose difference answers to no phase.
+_APART_PX, _DIAGONALS = 0.1, np.array([1.0, -1.0, -1.0, 1.0])
 
 
 def nominal_pupils(config: SystemConfig) -> PyramidPupils:
@@ -81,6 +86,8 @@ class PyramidModel:
         Path of the image over the pyramid; by default a circle of the pupils' radius.
     turbulence
         Pupil diameters over r0 to average over; by default what the pupils' motion tells.
+    basis
+        Modes ``(n_act, n_modes)`` that were poked; by default those of the configuration.
 
     Raises
     ------
@@ -97,12 +104,14 @@ class PyramidModel:
         *,
         modulation: Modulation | None = None,
         turbulence: float | None = None,
+        basis: NDArray[np.float64] | None = None,
     ) -> None:
         pupil = pupil_of_images(config, pupils)
         self._config, self._pupils, self._pupil = config, pupils, pupil
         self._positions = actuator_positions(config)
         self._pitch = pitch_on_pupil(config)
         self._coupling = config.devices.dm.coupling
+        self._modes = basis
         self._modulation = modulation or Modulation.circle(pupils.modulation)
         # A surface changes the path by twice as much.
         scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
@@ -174,43 +183,57 @@ class PyramidModel:
         return parts[0], np.einsum("pka,ksa->psa", by, np.stack(parts[1:]), optimize=True)
 
     def variants(self) -> list[PyramidModel]:
-        """The same sensor under stronger turbulence, and with a modulation that is not quite round."""
+        """The sensor under stronger turbulence, with an oval modulation, and with misplaced images."""
         if self._variants is None:
             radius = self._pupils.modulation
             self._variants = []
             if self.turbulence:
                 stronger = self.turbulence * (1 + _STRENGTH_DOUBT)
-                self._variants.append(PyramidModel(self._config, self._pupils, turbulence=stronger))
+                self._variants.append(self._like(self._modulation, stronger))
             for angle in (0.0, np.pi / 4) if radius else ():
                 oval = Modulation.circle(radius, ellipse=_ELLIPSE, ellipse_angle=angle)
-                self._variants.append(
-                    PyramidModel(self._config, self._pupils, modulation=oval, turbulence=self.turbulence)
-                )
+                self._variants.append(self._like(oval, self.turbulence))
+            for axis in range(2):
+                centres = self._pupils.centres_px.copy()
+                centres[:, axis] += _APART_PX * _DIAGONALS
+                apart = replace(self._pupils, centres_px=centres)
+                self._variants.append(self._like(self._modulation, self.turbulence, apart))
         return list(self._variants)
 
     # ------------------------------------------------------------------ construction
+    def _like(
+        self, modulation: Modulation, turbulence: float, pupils: PyramidPupils | None = None
+    ) -> PyramidModel:
+        return PyramidModel(
+            self._config, pupils or self._pupils, modulation=modulation, turbulence=turbulence,
+            basis=self._modes,
+        )  # fmt: skip
+
     def _air_doubt(self) -> NDArray[np.float64]:
         """What the states of the air and of the mirror that were seen leave of :func:`air_scatter`."""
         if not self._pupils.looks or not (self.turbulence or self._pokes):
             return np.zeros(5)
         if self._scatter is None:
             x, optics = self._pupil.coordinates_m, self.optics()
-            phases = unit_screens(x.size, _OUTER_SCALE) * self.turbulence ** (5 / 6)
+            screens = unit_screens(x.size, _OUTER_SCALE) * self.turbulence ** (5 / 6)
+            phases = np.repeat(screens[:, None], _SHAPES, axis=1)
             if self._pokes:
-                phases += self._pokes.phases(len(phases))
+                phases += self._pokes.phases(screens.shape[0] * _SHAPES).reshape(phases.shape)
             paths = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
             paths *= 2 * self._config.devices.dm.stroke_m
             self._scatter = air_scatter(
-                optics, self._pupils, phases, self._random_commands(len(phases)), paths,
+                optics, self._pupils, phases, self._random_commands(len(screens)), paths,
                 lambda m2c: self.modal_jacobian(Registration(), m2c),
             )  # fmt: skip
         return np.asarray(self._scatter / np.sqrt(self._pupils.looks))
 
     def _basis(self) -> NDArray[np.float64]:
         """The modes of a calibration ``(n_act, n_modes)``."""
-        return configured_basis(
-            self._config, *self.influence_functions(), self._config.devices.dm.limits.disabled
-        )
+        if self._modes is None:
+            self._modes = configured_basis(
+                self._config, *self.influence_functions(), self._config.devices.dm.limits.disabled
+            )
+        return self._modes
 
     def _random_pokes(self, scale: float) -> Pokes:
         """The pokes that were measured; ``scale`` is the phase of a surface of full stroke in radians."""

@@ -285,10 +285,10 @@ def test_motion_beyond_the_most_is_as_strong_as_the_most():
     assert strength(optics, replace(pupils, motion=20.0), 4.0) == most
 
 
-def test_variants_differ_in_turbulence_and_in_the_modulation(model):
+def test_variants_differ_in_turbulence_modulation_and_the_place_of_the_images(model):
     here = model.zonal_matrix(PLANTED)
     matrices = [v.zonal_matrix(PLANTED) for v in model.variants()]
-    assert len(matrices) == 3
+    assert len(matrices) == 5
     for one in matrices:
         assert 1e-3 < np.linalg.norm(one - here) / np.linalg.norm(here) < 0.5
     # An ellipse along the axes changes x slopes one way and y slopes the other.
@@ -299,7 +299,32 @@ def test_variants_differ_in_turbulence_and_in_the_modulation(model):
 
 def test_a_sensor_at_rest_has_no_variants_of_its_modulation():
     config = configuration("sensor.modulation=0")
-    assert PyramidModel(config, nominal_pupils(config)).variants() == []
+    assert len(PyramidModel(config, nominal_pupils(config)).variants()) == 2
+
+
+def test_images_that_were_misplaced_by_diagonals_are_no_shift():
+    config = configuration()
+    pupils = nominal_pupils(config)
+    diagonals = np.array([1.0, -1.0, -1.0, 1.0])[:, None] * [0.12, -0.08]
+    real = PyramidModel(config, replace(pupils, centres_px=pupils.centres_px + diagonals), turbulence=4.0)
+    model = PyramidModel(config, pupils, turbulence=4.0)
+    modes = np.random.default_rng(2).standard_normal((model.n_act, 60))
+    seen = real.modal_matrix(PLANTED, modes)
+    here, moved = model.modal_jacobian(PLANTED, modes)
+
+    def shift(beside):
+        terms = np.stack([here, *moved, *(v.modal_matrix(PLANTED, modes) - here for v in beside)])
+        flat = terms.reshape(len(terms), -1)
+        shares = np.linalg.solve(flat @ flat.T, flat @ seen.ravel())
+        return shares[1:3] / shares[0], shares[-2:] / shares[0]
+
+    blind, _ = shift([])
+    found, apart = shift(model.variants())
+    # Left out, a tenth of a pixel passes for half as much of a shift along the other axis.
+    assert np.abs(blind).max() > 3
+    assert np.abs(found).max() < 0.5
+    # The variants stand a tenth of a pixel away.
+    assert apart == pytest.approx([1.2, -0.8], abs=0.15)
 
 
 def test_found_images_count_and_not_the_design():

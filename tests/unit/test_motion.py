@@ -37,8 +37,10 @@ def test_motion_pokes_and_what_lasts(memory: float, white: float) -> None:
     assert np.mean([f.motion for f in found]) == pytest.approx(0.3, rel=0.03)
     assert np.mean([f.pokes for f in found]) == pytest.approx(0.1, rel=0.03)
     assert np.mean([f.steady for f in found]) == pytest.approx((1 - white) * np.exp(-2 / memory), abs=0.04)
-    # The integral of an exponential's correlation is twice its memory.
-    integral = 1 + (1 - white) * (2 / (np.exp(1 / memory) - 1))
+    # The integral of an exponential's correlation is twice its memory; the air's share is told two frames
+    # late and a little small, so its correlation seems so much longer. Noise that is new in every frame
+    # does not count as states of the air.
+    integral = 1 + np.exp(2 / memory) * (2 / (np.exp(1 / memory) - 1))
     assert np.mean([f.looks for f in found]) == pytest.approx(1500 / integral, rel=0.3)
 
 
@@ -59,6 +61,7 @@ def test_a_run_that_goes_on_later_tells_the_same() -> None:
     one, other = whole.of(pupils()), second.of(pupils())
     assert isinstance(one, PyramidPupils)
     assert isinstance(other, PyramidPupils)
-    assert (other.motion, other.pokes, other.looks) == pytest.approx((one.motion, one.pokes, one.looks))
+    assert (other.motion, other.pokes) == pytest.approx((one.motion, one.pokes))
     # Two pairs across the interruption are lost.
+    assert other.looks == pytest.approx(one.looks, rel=0.03)
     assert other.steady == pytest.approx(one.steady, abs=0.02)
