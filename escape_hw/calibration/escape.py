@@ -153,6 +153,7 @@ def _fit(
             learning_rate=c.learning_rate,
             covariance=solution.covariance,
             learn=True,
+            also=c.also,
         )
     )
 

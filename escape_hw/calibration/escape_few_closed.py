@@ -65,7 +65,7 @@ def escape_closed_from_few(
     fit = yield from telemetry_sprint(
         data, closing.matrix, bench.model(found), order=order, lags=c.lags, known=closing.response,
         start=None if registration is None else registration.registration,
-        learning_rate=c.learning_rate, solver=c.solver, loss=c.loss,
+        learning_rate=c.learning_rate, solver=c.solver, loss=c.loss, also=c.also,
     )  # fmt: skip
     result = few_frames_result(
         bench, fit, found, closing.matrix.m2c, frames=frames, lost=tape.lost, poke=float(poke), order=order,

@@ -14,6 +14,7 @@ from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix
 from escape_hw.calibration.derivatives import modal_jacobian, modal_matrix
+from escape_hw.calibration.extra_unknowns import extra_unknowns, family_of
 
 
 def pseudo_synthetic(
@@ -37,6 +38,9 @@ def pseudo_synthetic(
     """
     width, gain = estimate.width.value, estimate.gain.value
     unit, derivatives = modal_jacobian(model, estimate.registration, m2c, width)
+    for one in extra_unknowns(model, tuple(dict.fromkeys(map(family_of, estimate.extras)))):
+        share = estimate.extras[one.name].value / one.scatter
+        unit += share * (one.per_share(estimate.registration, width, share) @ m2c)
     jacobian = gain * derivatives[:5]
     variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
     variance += np.square(unit * estimate.gain.sigma)

@@ -9,7 +9,7 @@ batches, the original's gain for every mode and other variants can be had instea
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ParamSpec
 
@@ -26,6 +26,7 @@ from escape_hw.calibration.capture import EXPLAINED
 from escape_hw.calibration.covariance import sandwich
 from escape_hw.calibration.degeneracy import degeneracies
 from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.extra_unknowns import extra_unknowns
 from escape_hw.calibration.linearisation import GAIN, WIDTH, Learned
 from escape_hw.calibration.misfit import Priors
 from escape_hw.calibration.mode_choice import choose_modes
@@ -33,8 +34,8 @@ from escape_hw.calibration.parity import parity_hint
 from escape_hw.calibration.robust import ROUNDS, trust
 from escape_hw.calibration.solvers import LARGEST, Descent, Solution, solve
 from escape_hw.calibration.weighted import WeightedMatrix
-from escape_hw.config.models import LOSSES, MODES_CHOICES, SOLVERS, Loss, ModesChoice, Solver
-from escape_hw.errors import CalibrationError, IncompatibleProduct
+from escape_hw.config.models import LOSSES, MODES_CHOICES, SOLVERS, Extra, Loss, ModesChoice, Solver
+from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 
 P = ParamSpec("P")
 
@@ -77,6 +78,7 @@ def fit_steps(
     priors: Priors | None = None,
     learn: bool = False,
     reach: bool = True,
+    also: Sequence[Extra] = (),
 ) -> Procedure[SprintFit]:
     """Registration, gain and their standard errors from an interaction matrix.
 
@@ -117,6 +119,8 @@ def fit_steps(
     reach
         Whether to come from afar first, low modes before high ones (:mod:`~.capture`). Without it the
         descent is from ``start`` alone, on all modes at once.
+    also
+        What to fit beside the registration (:mod:`~.extra_unknowns`), by the solver ``"effects"``.
 
     Returns
     -------
@@ -130,6 +134,8 @@ def fit_steps(
         Matrix and model have different actuators or sub-apertures.
     CalibrationError
         The matrix holds no signal.
+    ConfigError
+        The model does not know what is asked for in ``also``.
     ValueError
         A learning rate outside (0, 1]; no such solver, choice or loss.
     """
@@ -138,12 +144,20 @@ def fit_steps(
     _known("solver", solver, SOLVERS)
     _known("choice", choice, MODES_CHOICES)
     _known("loss", loss, LOSSES)
+    if also and solver != "effects":
+        raise ConfigError(
+            f"calibration.solver = '{solver}' fits gain and registration alone; what calibration.also "
+            "asks for takes solver = 'effects'"
+        )
     begin = start or Registration()
     # The products are many and small.
     with hold_to_one_thread():
         columns = _columns(matrix, model, modes, choice, begin)
         _check(matrix, model, columns)
-        descent = Descent(matrix, model, columns, solver, learning_rate, max_iterations, priors or Priors())
+        extras = extra_unknowns(model, also)
+        descent = Descent(
+            matrix, model, columns, solver, learning_rate, max_iterations, priors or Priors(), extras
+        )
         weighted = WeightedMatrix.of(matrix, columns)
         found = yield from solve(descent, weighted, begin.to_array(), reach)
         if learn and found.learned is not None:
@@ -249,7 +263,9 @@ def _estimate(
     model, history = descent.model, tuple(descent.history)
     residual = found.system.residual
     covariance = sandwich(weighted, found.system, noise)
-    notes = degeneracies(covariance[: len(_NAMES), : len(_NAMES)], _NAMES[: len(covariance)])
+    named = {name: k for k, name in enumerate(_NAMES[: len(covariance)])}
+    named.update({one.unknown.name: one.place for one in found.extras})
+    notes = degeneracies(covariance[np.ix_([*named.values()], [*named.values()])], [*named])
     if found.scatter is not None:
         covariance[1:6, 1:6] += found.scatter
     if isinstance(model, DoubtfulModel):
@@ -284,4 +300,5 @@ def _estimate(
         float(np.mean(np.square(residual))),
         tuple(warnings),
         notes,
+        {one.unknown.name: one.measured(sigma) for one in found.extras},
     )

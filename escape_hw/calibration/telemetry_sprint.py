@@ -10,6 +10,7 @@ the second, the first becomes a matrix whose columns have equal and independent 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +34,7 @@ from escape_hw.calibration.whitening import (
     known_past,
     prediction_error_filter,
 )
-from escape_hw.config.models import Loss, Solver
+from escape_hw.config.models import Extra, Loss, Solver
 from escape_hw.errors import TooFewFrames
 
 #: Rounds of registration, response, whitener and scatter; a fifth changes nothing that matters.
@@ -131,6 +132,7 @@ def telemetry_sprint(
     learning_rate: float = 1.0,
     solver: Solver = "effects",
     loss: Loss = "squares",
+    also: Sequence[Extra] = (),
 ) -> Procedure[TelemetryFit]:
     """Registration, gain and temporal response from a stretch of telemetry.
 
@@ -153,7 +155,7 @@ def telemetry_sprint(
         Where to start; from afar by default.
     known
         A temporal response to go on with for as long as the frames tell it no better.
-    learning_rate, solver, loss
+    learning_rate, solver, loss, also
         As for :func:`~escape_hw.calibration.sprint.sprint`; a solver that needs modes will not do.
 
     Raises
@@ -183,7 +185,7 @@ def telemetry_sprint(
         fit = yield from fit_steps(
             frames.columns(frame, response.weights, matrix, variance), model,
             solver=solver, loss=loss, start=start, learning_rate=learning_rate,
-            covariance=covariance, priors=priors, reach=start is None,
+            covariance=covariance, priors=priors, reach=start is None, also=also,
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal() @ frame.m2c

@@ -22,13 +22,14 @@ def sprint(
     solver: options.Solver = None,
     modes_choice: options.ModesChoice = None,
     loss: options.Loss = None,
+    also: options.Also = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Find the registration behind a measured interaction matrix, and the matrix of the model there."""
     with session("sprint", json=json, quiet=quiet) as one:
         choice = options.Choice.of(system, set, seed, mode).calibrating(
-            solver=solver, modes_choice=modes_choice, loss=loss
+            solver=solver, modes_choice=modes_choice, loss=loss, also=options.listed(also)
         )
         config = one.configured(choice)
         with one.run_folder(config, "sprint", out) as folder:
@@ -67,6 +68,7 @@ def _sprint(one: Session, folder: RunFolder, config: Any, im: Path) -> None:
         solver=settings.solver,
         loss=settings.loss,
         learning_rate=settings.learning_rate,
+        also=settings.also,
     )
     result = replace(product.result, matrix=measured, measured=None, registration=estimate)
     origin = replace(config_record(config), parents={im.name: product.sha256})

@@ -156,6 +156,7 @@ class System(LoopBench):
             solver=settings.solver,
             loss=settings.loss,
             learning_rate=settings.learning_rate,
+            also=settings.also,
         )
 
 
