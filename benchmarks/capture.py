@@ -6,8 +6,9 @@
 Each plant is a twin with all its imperfections, measured by push-pull on the calm beam, two frames per
 sign. SPRINT gets that matrix and a model built on the images found, and starts from zero. A plant is
 recovered when SPRINT says it converged and every parameter is right within the tolerance, flagged when
-it says it did not, and wrong otherwise. Writes ``capture-SYSTEM.json``; exits with 1 when a plant was wrong
-or fewer than 95 in 100 were recovered. A plant takes about two seconds on an idle core.
+it says it did not, and wrong otherwise. Writes ``capture-SYSTEM.jsonl``, a line per plant as soon as it is
+done; plants that the file has already are not run again. Exits with 1 when a plant was wrong or fewer than
+95 in 100 were recovered. A plant takes about two seconds on an idle core.
 """
 
 from __future__ import annotations
@@ -69,14 +70,20 @@ def main() -> int:
     parser.add_argument("--plants", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
-    rows = []
-    for number in range(options.first, options.first + options.plants):
-        rows.append(run_plant(options.system, number))
-        print(f"{number}: {rows[-1]['outcome']} after {rows[-1]['steps']} steps", flush=True)
-    counts = {key: sum(r["outcome"] == key for r in rows) for key in ("recovered", "flagged", "wrong")}
     options.out.mkdir(parents=True, exist_ok=True)
-    target = options.out / f"capture-{options.system}.json"
-    target.write_text(json.dumps({"system": options.system, **counts, "plants": rows}, indent=1) + "\n")
+    target = options.out / f"capture-{options.system}.jsonl"
+    known = target.read_text().splitlines() if target.exists() else []
+    rows = {row["plant"]: row for row in map(json.loads, known)}
+    for number in range(options.first, options.first + options.plants):
+        if number in rows:
+            continue
+        rows[number] = run_plant(options.system, number)
+        with target.open("a") as lines:
+            lines.write(json.dumps(rows[number]) + "\n")
+        print(f"{number}: {rows[number]['outcome']} after {rows[number]['steps']} steps", flush=True)
+    counts = {
+        key: sum(r["outcome"] == key for r in rows.values()) for key in ("recovered", "flagged", "wrong")
+    }
     print(f"{counts}; {target}")
     return 0 if not counts["wrong"] and counts["recovered"] >= 0.95 * len(rows) else 1
 

@@ -6,25 +6,29 @@
     python benchmarks/tracking.py draw --out tracked --figure docs/figures/tracking.png
 
 ``track`` calibrates, on a pyramid finds the optical gains, and runs the tracker once, all frames; it keeps
-its table with the twin's truth beside it. ``compare`` closes another loop for a few seconds at a time, at
-the same moments of the same turbulence, without pokes: with the matrix moved to the true registration and
-scaled to the true gain, or with the matrix of the start. ``draw`` puts them together and says how far they
-are apart. Each takes the same options.
+its table with the twin's truth beside it (``track.json``; ``live.jsonl`` while it runs). ``compare`` closes
+another loop for a few seconds at a time, at the same moments of the same turbulence, without pokes: with the
+matrix moved to the true registration and scaled to the true gain, or with the matrix of the start; looks
+that its file has already are not repeated. ``draw`` puts them together and says how far they are apart. Each
+takes the same options.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+from array import array
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from tracking_figure import draw, looked
 
-from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.procedure import Progress
+from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.closed_loop import integrator_for
 from escape_hw.calibration.derivatives import modal_matrix
@@ -35,7 +39,6 @@ from escape_hw.errors import CalibrationError
 from escape_hw.io.fits import load_matrix, save_matrix
 from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.pipeline.strehl import strehl
-from escape_hw.report import style
 from escape_hw.runtime.system import System, open_system
 from escape_sim.sim_bench import SimBench
 
@@ -43,9 +46,8 @@ from escape_sim.sim_bench import SimBench
 LOOK_S, CLOSE_S = 5.0, 1.0
 #: Modes and wavefronts that the true optical gain is found on; size of the poke in strokes.
 GAIN_MODES, WAVEFRONTS, GAIN_POKE = 12, 4, 3e-3
-#: Seconds from one of those wavefronts to the next; seconds of tracking that are not judged.
-APART_S, SETTLED_S = 0.4, 10.0
-LABELS = {"knows": "knows the truth, no pokes", "never": "never looks, no pokes"}
+#: Seconds from one of those wavefronts to the next.
+APART_S = 0.4
 
 
 def drift_words(options: argparse.Namespace) -> list[str]:
@@ -85,6 +87,21 @@ def twin_of(bench: System) -> SimBench:
     if not isinstance(twin, SimBench):
         raise SystemExit(f"{bench.config.system.name} has no twin with a truth to look at")
     return twin
+
+
+class Ripples:
+    """Keeps the rms of the wavefront in front of the sensor, mirror included, of every moment it is seen."""
+
+    def __init__(self, twin: SimBench) -> None:
+        self._share = (twin.pupil.lit / np.count_nonzero(twin.pupil.lit)).astype(np.float32).ravel()
+        self.seconds, self.nm = array("d"), array("f")
+        twin.onlookers.append(self)
+
+    def __call__(self, opd: NDArray[np.float32], time_s: float) -> None:
+        """Take the optical path ``(n, n)`` in metres."""
+        self.seconds.append(time_s)
+        path = opd.ravel()
+        self.nm.append(1e9 * math.sqrt(float((path * path) @ self._share) - float(path @ self._share) ** 2))
 
 
 class Wavefronts:
@@ -148,13 +165,15 @@ def follow(options: argparse.Namespace) -> None:
     with opened(options) as bench:
         twin = twin_of(bench)
         origin = twin.now_s
+        ripples = Ripples(twin)
         frozen = Wavefronts(twin, np.linspace(origin + 3, origin + options.seconds - 1, 2 * options.looks))
+        (options.out / "live.jsonl").unlink(missing_ok=True)
         found = bench.run(
             track(
                 bench, result.matrix, result.grid, seconds=options.seconds, registration=result.registration,
                 response=result.response, model_psf=psf, memory_s=options.memory, poke=options.poke,
             ),
-            observers=(tell,),
+            observers=(Journal(options.out / "live.jsonl"),),
         )  # fmt: skip
         seconds = origin + found.column("seconds")
         truth = np.array([twin.flexure.at(t).to_array() for t in seconds])
@@ -165,13 +184,25 @@ def follow(options: argparse.Namespace) -> None:
         "alarms": [a.text for a in found.alarms], "poke": found.poke, "system": options.system,
     }  # fmt: skip
     (options.out / "track.json").write_text(json.dumps(document))
+    np.savez(options.out / "ripples.npz", seconds=np.array(ripples.seconds) - origin, nm=ripples.nm)
     print(f"{found.frames} frames, {document['exchanges']} exchanges, alarms: {document['alarms']}")
 
 
-def tell(progress: Any) -> None:
-    """Print how far the tracker is."""
-    if progress.stage == "tracking" and progress.done % 20 == 0 and progress.metrics:
-        print(f"\r{progress.done} of {progress.total} s", end="", flush=True)
+class Journal:
+    """Writes what the tracker tells every second to a file, and now and then to the terminal."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._last = path, 0
+
+    def __call__(self, progress: Progress) -> None:
+        """Take a progress report."""
+        if progress.stage != "tracking" or progress.done == self._last or not progress.metrics:
+            return
+        self._last = progress.done
+        with self._path.open("a") as lines:
+            lines.write(json.dumps({"second": progress.done, **progress.metrics}) + "\n")
+        if progress.done % 20 == 0:
+            print(f"{progress.done} of {progress.total} s", flush=True)
 
 
 def look(bench: System, result: CalibrationResult, psf: Any, at_s: float, matrix: Any) -> tuple[float, float]:
@@ -202,18 +233,21 @@ def compare(options: argparse.Namespace) -> None:
     tracked = json.loads((options.out / "track.json").read_text())
     result, psf = prepared(options)
     gains = np.array(tracked["gains"])
-    looks = []
+    done = looked(options.out, options.loop)
     with opened(options) as bench:
         twin = twin_of(bench)
         for end in moments(tracked, options.looks):
+            if any(abs(end - one[0]) < LOOK_S for one in done):
+                continue
             at, matrix = tracked["origin"] + end - LOOK_S, result.matrix
             if options.loop == "knows":
                 gain = float(np.interp(end, *gains.T))
                 data = gain * moved_to(bench, result, twin.flexure.at(at + LOOK_S / 2))
                 matrix = replace(matrix, data=data.astype(np.float32))
-            looks.append([end, *look(bench, result, psf, at, matrix)])
-            print(options.loop, *(f"{value:.4f}" for value in looks[-1]), flush=True)
-    (options.out / f"{options.loop}.json").write_text(json.dumps(looks))
+            one = [float(end), *look(bench, result, psf, at, matrix)]
+            with (options.out / f"{options.loop}.jsonl").open("a") as lines:
+                lines.write(json.dumps(one) + "\n")
+            print(options.loop, *(f"{value:.4f}" for value in one), flush=True)
 
 
 def moments(tracked: dict[str, Any], looks: int) -> NDArray[np.float64]:
@@ -223,78 +257,6 @@ def moments(tracked: dict[str, Any], looks: int) -> NDArray[np.float64]:
     ends = rows["seconds"][np.isfinite(rows["strehl"])][1:]
     # Two rows apart at least: a look takes longer than the time that it covers.
     return np.asarray(ends[:: max(2, len(ends) // looks)])
-
-
-def draw(options: argparse.Namespace) -> None:
-    """Errors in numbers, and the figure."""
-    tracked = json.loads((options.out / "track.json").read_text())
-    rows = {name: np.array(values, float) for name, values in tracked["rows"].items()}
-    truth, t = np.array(tracked["truth"]), rows["seconds"]
-    settled = t > SETTLED_S
-    for k, name in enumerate(PARAMETERS):
-        error = (rows[name] - truth[:, k])[settled]
-        chi2 = np.mean(np.square(error / rows[f"{name}_sigma"][settled]))
-        rms, worst = np.sqrt(np.mean(error**2)), np.abs(error).max()
-        print(f"{name}: rms error {rms:.4f}, largest {worst:.4f}, chi2 {chi2:.2f}")
-    gains = np.array(tracked["gains"])
-    gains = gains[gains[:, 0] > SETTLED_S]
-    share = np.interp(gains[:, 0], t, rows["optical_gain"]) / gains[:, 1] - 1
-    print(f"optical gain: mean error {share.mean():+.4f}, rms {np.sqrt(np.mean(share**2)):.4f},", end=" ")
-    print(f"largest {np.abs(share).max():.4f}; true {gains[:, 1].min():.3f} to {gains[:, 1].max():.3f}")
-    others = {}
-    for loop in ("knows", "never"):
-        path = options.out / f"{loop}.json"
-        if path.exists():
-            others[loop] = np.array(json.loads(path.read_text()))
-            print(difference(loop, others[loop], t, rows["strehl"]))
-    picture(rows, truth, gains, others).savefig(options.figure, dpi=110)
-
-
-def difference(loop: str, looks: NDArray[np.float64], t: Any, ratios: Any) -> str:
-    """Mean Strehl ratios of the tracked loop and another one at the same moments, and of their difference."""
-    here = np.array([ratios[np.argmin(np.abs(t - end))] for end in looks[:, 0]])
-    apart = here - looks[:, 1]
-    error = apart.std(ddof=1) / np.sqrt(len(apart))
-    return (
-        f"Strehl ratio: tracked {100 * here.mean():.2f} %, {loop} {100 * looks[:, 1].mean():.2f} %, tracked "
-        f"minus {loop} {100 * apart.mean():+.2f} +- {100 * error:.2f} % ({len(apart)} looks), "
-        f"last quarter {100 * apart[-len(apart) // 4 :].mean():+.2f} %"
-    )
-
-
-def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]) -> Figure:
-    """Shift, rotation, gain and Strehl ratio against time."""
-    figure = style.new_figure(9.2, 6.4)
-    panels = figure.subplots(2, 2).ravel()
-    t = rows["seconds"]
-    for panel, name, k, title in (
-        (panels[0], "shift_x", 0, "shift x [% of a sub-aperture]"),
-        (panels[1], "rotation", 2, "rotation [deg]"),
-    ):
-        value, sigma = rows[name] - truth[0, k], rows[f"{name}_sigma"]
-        panel.fill_between(t, value - sigma, value + sigma, color=style.SERIES[0], alpha=0.3, lw=0)
-        panel.plot(t, value, color=style.SERIES[0], lw=1.2, label="tracked")
-        panel.plot(t, truth[:, k] - truth[0, k], ":", color=style.INK, lw=1.2, label="truth")
-        style.tidy(panel).set_title(f"{title}, since the start", fontsize=9.5)
-    sigma = rows["optical_gain_sigma"]
-    panels[2].fill_between(
-        t, rows["optical_gain"] - sigma, rows["optical_gain"] + sigma, color=style.SERIES[0], alpha=0.3, lw=0
-    )
-    panels[2].plot(t, rows["optical_gain"], color=style.SERIES[0], lw=1.2, label="tracked")
-    panels[2].plot(gains[:, 0], gains[:, 1], "o", ms=3, color=style.INK, label="truth")
-    style.tidy(panels[2]).set_title("optical gain, beside the start's matrix", fontsize=9.5)
-    ratio = np.isfinite(rows["strehl"])
-    panels[3].errorbar(
-        t[ratio], rows["strehl"][ratio], rows["strehl_sigma"][ratio],
-        color=style.SERIES[0], lw=1.0, elinewidth=0.5, label="tracked, with pokes",
-    )  # fmt: skip
-    for (loop, looks), mark, colour in zip(others.items(), "os", (style.INK, style.SERIES[1]), strict=False):
-        panels[3].plot(looks[:, 0], looks[:, 1], mark, ms=3.5, color=colour, label=LABELS[loop])
-    style.tidy(panels[3]).set_title("Strehl ratio, peak", fontsize=9.5)
-    for panel in panels:
-        panel.set_xlabel("seconds")
-        panel.legend(frameon=False, fontsize=8)
-    return figure
 
 
 def main() -> None:
@@ -321,7 +283,10 @@ def main() -> None:
     parser.add_argument("--figure", type=Path, default=Path("tracking.png"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    {"track": follow, "compare": compare, "draw": draw}[options.what](options)
+    if options.what == "draw":
+        draw(options.out, options.figure)
+    else:
+        {"track": follow, "compare": compare}[options.what](options)
 
 
 if __name__ == "__main__":

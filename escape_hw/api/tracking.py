@@ -84,6 +84,8 @@ class TrackResult:
         The last pseudo-synthetic matrix, whether the loop runs with it or not; ``None`` before the first.
     stable
         False when the loop was opened because it diverged or went dark.
+    began_ns
+        The sensor's clock when ``seconds`` was zero.
     """
 
     rows: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in COLUMNS})
@@ -98,6 +100,7 @@ class TrackResult:
     poke: float = 0.0
     stable: bool = True
     partial: bool = False
+    began_ns: int = 0
 
     def column(self, name: str) -> NDArray[np.float64]:
         """A column of the table."""

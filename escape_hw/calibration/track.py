@@ -166,7 +166,7 @@ class _Tracker:
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
-        self.updates, self.residual_at, self.began_ns = 0, 0, 0
+        self.updates, self.residual_at = 0, 0
         self.pending: Future[_Answer | None] | None = None
         self.metrics: dict[str, float] = {}
         self.arrays: dict[str, NDArray[np.float32]] = {}
@@ -197,7 +197,7 @@ class _Tracker:
         prepare_sensor(bench)
         bench.dm.flatten()
         next_frame(bench)
-        lost, self.began_ns = bench.wfs.status().lost, bench.wfs.now_ns()
+        lost, result.began_ns = bench.wfs.status().lost, bench.wfs.now_ns()
         science = bench.science if self.psf is not None else None
         if science is not None:
             science.stop()
@@ -257,7 +257,7 @@ class _Tracker:
 
     def _now(self) -> float:
         """Seconds since the loop was closed."""
-        return (self.bench.wfs.now_ns() - self.began_ns) * 1e-9
+        return (self.bench.wfs.now_ns() - self.result.began_ns) * 1e-9
 
     def _images(self, loop: RunningLoop) -> FrameStack | None:
         """The science frames since the last ones, every few updates."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -45,6 +46,11 @@ class TwinDrift(Section):
     def moves(self) -> bool:
         """Whether anything moves at all."""
         return any(getattr(part, name) for part in (self.rate, self.swing) for name in PARAMETERS)
+
+    def way(self, time_s: float) -> list[float]:
+        """How far each of the five parameters is from ``twin.registration`` at a time of the twin's clock."""
+        turned = math.sin(2 * math.pi * time_s / self.period_s)
+        return [getattr(self.rate, n) * time_s + getattr(self.swing, n) * turned for n in PARAMETERS]
 
 
 class TwinSeeing(Section):

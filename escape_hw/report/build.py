@@ -205,10 +205,16 @@ def _track(run: RunContent) -> str:
     if not track or not track["seconds"]:
         return ""
     exchanges, alarms = run.document["exchanges"], run.document["alarms"]
-    drawing = figures_track.course(track, exchanges, alarms)
+    planted = run.document.get("planted_course")
+    drawing = figures_track.course(track, exchanges, alarms, planted)
     caption = (
         "Live registration, optical gain and image quality, with standard errors. "
-        "Dotted: a new matrix was taken into use. Full line: an alarm."
+        "Upright and dotted: a new matrix was taken into use. Upright and full: an alarm."
+        + (
+            ""
+            if planted is None
+            else " Dotted course: planted truth, shown only here; no estimator reads it."
+        )
     )
     lines = tuple(
         (

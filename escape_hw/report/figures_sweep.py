@@ -36,10 +36,17 @@ def strehl_against(sweep: Mapping[str, Any]) -> Figure:
     tint = colours(list(curves))
     texts = {text.partition("=")[0]: text for text in sweep["parameters"]}
     for axes, key in zip(panels, keys, strict=True):
-        for label, values in curves.items():
-            shown = [str(v) if isinstance(v, bool | str) else v for v in values[key]]
-            merit = 100 * np.array(values["merit"], float)
-            axes.scatter(shown, merit, s=5, lw=0, alpha=0.55, color=tint[label], label=label)
+        dots = [
+            (str(value) if isinstance(value, bool | str) else value, 100 * merit, tint[label])
+            for label, values in curves.items()
+            for value, merit in zip(values[key], np.array(values["merit"], float), strict=True)
+        ]
+        # Shuffled, for the arms ran at the same parameters and the last drawn would cover the others.
+        order = np.random.default_rng(0).permutation(len(dots))
+        shown, merits, colour = zip(*(dots[k] for k in order), strict=True)
+        axes.scatter(shown, merits, s=5, lw=0, alpha=0.7, c=colour)
+        for label in curves:
+            axes.scatter([], [], s=5, lw=0, color=tint[label], label=label)
         if texts[key].endswith(":log"):
             axes.set_xscale("log")
         style.tidy(axes).set_xlabel(NAMES.get(key, key))

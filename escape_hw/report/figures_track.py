@@ -17,6 +17,7 @@ def course(
     track: Mapping[str, Sequence[float | None]],
     exchanges: Sequence[Mapping[str, Any]],
     alarms: Sequence[Mapping[str, Any]],
+    planted: Mapping[str, Sequence[float]] | None = None,
 ) -> Figure:
     """Shift, rotation, optical gain and Strehl ratio (or residual) against time, with error bands.
 
@@ -26,6 +27,8 @@ def course(
         Columns of the table, see :data:`~escape_hw.api.tracking.COLUMNS`.
     exchanges, alarms
         Their ``seconds`` are marked; of exchanges, those ``accepted``.
+    planted
+        True registration of a twin at the table's moments, by parameter.
     """
     columns = {name: np.array(values, float) for name, values in track.items()}
     t = columns["seconds"]
@@ -34,9 +37,13 @@ def course(
     for colour, name in zip(style.SERIES, ("shift_x", "shift_y"), strict=False):
         usual = float(np.median(columns[name])) if t.size else 0.0
         _band(panels[0], t, columns[name] - usual, columns[f"{name}_sigma"], colour, name.replace("_", " "))
+        if planted is not None:
+            panels[0].plot(t, np.array(planted[name]) - usual, ":", color=style.INK, lw=1.2)
     style.tidy(panels[0]).set_title("shift about its median [% of a sub-aperture]", fontsize=9.5)
     panels[0].legend(frameon=False, fontsize=8)
     _band(panels[1], t, columns["rotation"], columns["rotation_sigma"], style.SERIES[0])
+    if planted is not None:
+        panels[1].plot(t, planted["rotation"], ":", color=style.INK, lw=1.2)
     style.tidy(panels[1]).set_title("rotation [deg]", fontsize=9.5)
     _band(panels[2], t, columns["optical_gain"], columns["optical_gain_sigma"], style.SERIES[0])
     style.tidy(panels[2]).set_title("mean optical gain beside the first matrix", fontsize=9.5)

@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from escape_hw.api.procedure import Procedure
+from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.tracking import TrackResult
 from escape_hw.runtime.task import Kept, fitting_matrix, given, refuse_simulated
 
 if TYPE_CHECKING:
     from escape_hw.bench import Bench
     from escape_hw.config.models import SystemConfig
+    from escape_hw.config.twin_models import TwinConfig
     from escape_hw.io.fits import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
@@ -54,6 +56,7 @@ class TrackTask:
         self._im, self._seconds, self._exchange = im, seconds, exchange
         self._strehl, self._force = strehl, force
         self._product: MatrixProduct | None = None
+        self._twin: TwinConfig | None = None
 
     @property
     def product(self) -> MatrixProduct:
@@ -65,6 +68,7 @@ class TrackTask:
     def load(self, config: SystemConfig) -> None:
         """See :meth:`~escape_hw.runtime.task.Task.load`."""
         self._product = fitting_matrix(self._im, config, self._force)
+        self._twin = config.twin
 
     def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[TrackResult]:
         """Model PSF where the bench can take one, then the tracker."""
@@ -90,12 +94,16 @@ class TrackTask:
         folder.add("table", folder.write_text("track.csv", result.to_csv()))
         if result.latest is not None:
             keep_calibration(folder, record, "im", result.latest, {"im": self.product.path})
+        track = track_document(result)
         document = finish(
             folder,
             {
                 **record.head("track"),
                 "title": f"Tracking {record.system}",
-                **track_document(result),
+                **track,
+                "planted_course": self._planted(result, track["track"]["seconds"])
+                if record.simulated
+                else None,
                 "im": self.product.path.absolute(),
                 "criteria": [
                     {"text": "loop stable", "met": result.stable},
@@ -105,6 +113,14 @@ class TrackTask:
             },
         )
         return Kept(document, result.stable and not result.alarms)
+
+    def _planted(self, result: TrackResult, seconds: list[float]) -> dict[str, list[float]] | None:
+        """True registration of the twin at some moments of the track; for reports only."""
+        if self._twin is None:
+            return None
+        start = self._twin.registration.to_registration().to_array()
+        course = [start + self._twin.drift.way(result.began_ns * 1e-9 + t) for t in seconds]
+        return {name: [float(there[k]) for there in course] for k, name in enumerate(PARAMETERS)}
 
     def done(self) -> None:
         """Nothing was kept to go on with."""

@@ -37,19 +37,17 @@ class Flexure:
     """
 
     def __init__(self, start: Registration, drift: TwinDrift) -> None:
-        self._start = start
-        self._rate, self._swing = (
+        self._start, self._drift = start, drift
+        rate, swing = (
             np.array([getattr(part, name) for name in PARAMETERS]) for part in (drift.rate, drift.swing)
         )
-        self._turn = 2 * math.pi / drift.period_s
-        fastest = float(((np.abs(self._rate) + np.abs(self._swing) * self._turn) / _WAY).max())
+        fastest = float(((np.abs(rate) + np.abs(swing) * 2 * math.pi / drift.period_s) / _WAY).max())
         self.step_s = 1 / fastest if fastest else math.inf
 
     def at(self, time_s: float) -> Registration:
         """The registration at a time of the twin's clock, in seconds."""
-        moved = self._rate * time_s + self._swing * math.sin(self._turn * time_s)
-        there = self._start.to_array() + moved
-        return replace(Registration.from_array(there), anamorphosis_angle=self._start.anamorphosis_angle)
+        there = Registration.from_array(self._start.to_array() + self._drift.way(time_s))
+        return replace(there, anamorphosis_angle=self._start.anamorphosis_angle)
 
 
 class FlexingSurface:

@@ -237,7 +237,7 @@ def test_stopped_it_keeps_what_it_has(start):
 
 def test_the_command_leaves_table_matrix_and_report(start, tmp_path, capsys):
     system, im = tmp_path / "small.toml", tmp_path / "im.fits"
-    system.write_text(configuration(QUIET).to_toml())
+    system.write_text(configuration(QUIET, "twin.drift.rate.shift_x=1.0").to_toml())
     save_matrix(im, start, Provenance(system.read_text(), "kl", 1))
     with pytest.raises(SystemExit) as ended:
         main(["track", str(system), "--im", str(im), "--seconds", "3", "--no-strehl", "--json",
@@ -249,6 +249,10 @@ def test_the_command_leaves_table_matrix_and_report(start, tmp_path, capsys):
     assert document["alarms"] == []
     assert set(document["registration"]) == set(PARAMETERS)
     assert len(document["track"]["seconds"]) == 3
+    planted, seconds = document["planted_course"]["shift_x"], document["track"]["seconds"]
+    # The drift began when the bench was switched on, so the twin's clock counts.
+    np.testing.assert_allclose(np.diff(planted), np.diff(seconds), rtol=1e-6)
+    assert abs(planted[-1] - document["track"]["shift_x"][-1]) < 3.0
     assert len(document["optical_gain"]) == start.matrix.n_modes
     lines = (tmp_path / "run" / "track.csv").read_text().splitlines()
     assert lines[0].split(",")[:2] == ["seconds", "shift_x"]

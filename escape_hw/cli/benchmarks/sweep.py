@@ -1,11 +1,18 @@
-"""What a second worker brings a sweep: loops per second with two against one, in turns."""
+"""What a second worker brings a sweep: loops per second with two against one, in turns.
+
+Cores share caches, memory and, on a virtual machine, their host; so the same turns also tell what a second
+process brings arithmetic that shares nothing.
+"""
 
 from __future__ import annotations
 
 import tempfile
 import time
-from concurrent.futures import wait
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +24,9 @@ from escape_hw.errors import ConfigError
 #: Systems, and the frames of a loop on each.
 SYSTEMS = {"razor-shwfs": 400, "razor-pywfs": 250}
 #: Turns of each, and the loops of a turn.
-ROUNDS, LOOPS = 3, 6
+ROUNDS, LOOPS = 5, 8
+#: Rounds of the yardstick's arithmetic.
+YARDSTICK = 2_000_000
 
 
 def run() -> list[BenchmarkRow]:
@@ -38,27 +47,44 @@ def _row(system: str, frames: int) -> BenchmarkRow:
     with tempfile.TemporaryDirectory() as folder:
         task = _task(system, frames, Path(folder))
         values = {"gain": 0.4, "leak": 0.01, "dropped_modes": 14}
-        pools = {count: LocalWorkers(count) for count in (1, 2)}
-        rates: dict[int, list[float]] = {1: [], 2: []}
+        workers = {count: LocalWorkers(count) for count in (1, 2)}
+        plain = {count: ProcessPoolExecutor(count, get_context("spawn")) for count in (1, 2)}
+        loops: dict[int, list[float]] = {1: [], 2: []}
+        bare: dict[int, list[float]] = {1: [], 2: []}
         try:
-            for number in range(-1, ROUNDS):
-                for count, pool in pools.items():
-                    # Three loops share their air, as the matrices of a sweep do.
-                    tasks = [
-                        Task(*task, values, frames, seed // 3)
-                        for seed in range(LOOPS * (number + 2), LOOPS * (number + 3))
-                    ]
-                    began = time.perf_counter()
-                    wait([pool.submit(one) for one in tasks])
-                    if number >= 0:
-                        # The first turn starts and compiles.
-                        rates[count].append(LOOPS / (time.perf_counter() - began))
+            for number in range(1 + ROUNDS):
+                # Each loop draws air of its own: workers share nothing.
+                seeds = range(LOOPS * number, LOOPS * (number + 1))
+                for count in (1, 2):
+                    tasks = [Task(*task, values, frames, seed) for seed in seeds]
+                    loops[count].append(_rate(workers[count].submit, tasks))
+                    bare[count].append(_rate(plain[count].submit, [_arithmetic] * LOOPS))
         finally:
-            for pool in pools.values():
+            for pool in workers.values():
                 pool.close()
-    two, one = (float(np.median(rates[count])) for count in (2, 1))
-    note = f"{frames} frames each; a loop opens its twin, draws its air and closes"
+            for spare in plain.values():
+                spare.shutdown(cancel_futures=True)
+    # The first turn starts and compiles.
+    two, one, both, single = (float(np.median(seen[1:])) for seen in (loops[2], loops[1], bare[2], bare[1]))
+    note = (
+        f"{frames} frames each; a loop opens its twin, draws its air and closes; bare arithmetic gains "
+        f"{both / single:.2f} times from a second process here"
+    )
     return BenchmarkRow(f"sweep: {system}", two, one, "the same with one worker", "loop/s", "higher", note)
+
+
+def _rate(submit: Callable[[Any], Future[Any]], work: Sequence[Any]) -> float:
+    began = time.perf_counter()
+    wait([submit(piece) for piece in work])
+    return len(work) / (time.perf_counter() - began)
+
+
+def _arithmetic() -> float:
+    """Work of a processor that touches no memory worth the name."""
+    total = 0.0
+    for number in range(YARDSTICK):
+        total += number * number
+    return total
 
 
 def _task(system: str, frames: int, folder: Path) -> tuple[str, str, str, str]:

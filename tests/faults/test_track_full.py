@@ -1,0 +1,85 @@
+"""Alarms of the tracker on the whole bench: 97 actuators, 24 lenslets across, full turbulence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from escape_hw.api.results import TemporalResponse
+from escape_hw.calibration.track import track
+from escape_hw.runtime.system import open_system
+
+pytestmark = pytest.mark.slow
+
+#: Seconds of tracking, and after which of them something happens.
+SECONDS, AT = 10, 6
+#: An actuator well inside the pupil.
+DEAD = 40
+
+
+@pytest.fixture(scope="module")
+def start():
+    """A calibration to track from."""
+    with open_system("razor-shwfs", seed=5) as bench:
+        return bench.calibrate(frames=1000)
+
+
+def followed(start, do, response=None):
+    """Track with the usual pokes, and do something to the twin once some seconds have passed."""
+    waiting = [do]
+    with open_system("razor-shwfs", seed=5) as bench:
+        twin = bench.dm.twin
+
+        def watch(progress):
+            if progress.stage == "tracking" and progress.done >= AT and waiting:
+                waiting.pop()(twin)
+
+        procedure = track(
+            bench, start.matrix, start.grid, seconds=SECONDS, registration=start.registration,
+            response=response or start.response,
+        )  # fmt: skip
+        found = bench.run(procedure, observers=(watch,))
+        assert not bench.dm.shape.any()
+    return found
+
+
+def commands(change):
+    """Something that happens to every command on its way to the mirror."""
+
+    def happen(twin):
+        send = twin.dynamics.command
+        twin.dynamics.command = lambda time_s, shape: send(time_s, change(shape))
+
+    return happen
+
+
+def die(shape):
+    left = shape.copy()
+    left[DEAD] = 0.0
+    return left
+
+
+def test_a_dead_actuator_is_named_and_nothing_exchanged_for_it(start):
+    found = followed(start, commands(die))
+    alarms = [alarm for alarm in found.alarms if alarm.seconds > AT]
+    assert len(alarms) == len(found.alarms) > 0
+    assert {alarm.kind for alarm in alarms} & {"misfit", "noise", "actuator"}
+    assert not [one for one in found.exchanges if one.accepted and one.seconds >= alarms[0].seconds]
+
+
+def test_a_loop_that_runs_away_is_opened(start):
+    found = followed(start, commands(np.negative))
+    assert not found.stable
+    assert found.alarms[-1].kind == "diverged"
+    assert found.alarms[-1].seconds < AT + 3.5
+
+
+def test_a_wrong_delay_is_told_and_the_registration_kept(start):
+    late = TemporalResponse(np.roll(start.response.weights, 1), start.response.sigma)
+    found = followed(start, lambda twin: None, response=late)
+    alarms = [alarm for alarm in found.alarms if alarm.kind == "delay"]
+    assert len(alarms) == 1
+    assert alarms[0].seconds < AT
+    assert found.latest.response.delay == pytest.approx(start.response.delay, abs=0.1)
+    apart = found.column("shift_x")[-1] - start.registration.registration.shift_x
+    assert abs(apart) < 4 * found.column("shift_x_sigma")[-1]
