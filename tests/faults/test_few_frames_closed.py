@@ -1,4 +1,4 @@
-"""The registration from a tenth of a second of a running loop: right over seeds, and every refusal in words."""
+"""The registration from a tenth of a second of a running loop: right over seeds, refusals in words."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_it_is_the_answer_of_the_frames_and_not_of_the_matrix_that_closes_the_lo
     from escape_hw.api.registration import Registration
     from escape_hw.calibration.derivatives import modal_matrix
 
-    moved = PLANTED + [15.0, -15.0, 0.3, 0.5, -0.5]
+    moved = PLANTED + np.array([15.0, -15.0, 0.3, 0.5, -0.5])
     m2c = closing.matrix.m2c
     gain = np.linalg.norm(closing.matrix.data) / np.linalg.norm(
         modal_matrix(good.model, Registration.from_array(PLANTED), m2c)
