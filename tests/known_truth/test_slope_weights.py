@@ -210,7 +210,7 @@ def test_a_blurred_spot_follows_a_tilt_as_a_sharp_one_does():
     near = np.abs(blurred[0, 0] - still[0, 0]).max() / np.abs(still[0, 0]).max()
     # It changes the answer, and not by much.
     assert 0.01 < near < 1
-    # A tilt of the whole wavefront moves every spot as it does without turbulence, a few per cent less or more.
+    # A tilt of the whole wavefront moves every spot as it does without turbulence, or nearly.
     x = np.tile(pupil.coordinates_m, (pupil.coordinates_m.size, 1))
     tilt = x.reshape(pupil.n_sub, pupil.n_pix, pupil.n_sub, pupil.n_pix).transpose(0, 2, 1, 3)
     inner = np.zeros_like(grid.valid)
