@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pyqtgraph
@@ -29,6 +33,9 @@ log = logging.getLogger(__name__)
 DEFAULT_SYSTEM = "razor-shwfs"
 #: Milliseconds from an engine that is ready to the picture, and how long to wait for one at most.
 _PICTURE_AFTER_MS, _PICTURE_AT_LAST_MS = 4000, 60_000
+
+#: A window may wait for a loop on the same machine.
+_NICENESS = 10
 
 
 def application() -> QApplication:
@@ -113,6 +120,8 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     qt = application()
     recording = bool(system) and is_recording(Path(system))
     address, own = ("", None) if recording else _server(system, address)
+    # Only now: a server of its own, whose engine runs a loop, stands in front.
+    os.nice(_NICENESS)
     store = settings_file()
     settings, warnings = (Settings(), ()) if reset_settings else load_settings(store)
     session = Session()
@@ -131,7 +140,8 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     window.ticker.start()
     window.show()
     try:
-        code = qt.exec()
+        with _closed_by_signals(qt):
+            code = qt.exec()
         # A picture of a window that never found its server is no picture of what was asked for.
         return code if screenshot is None or not isinstance(session.source, NoSource) else 1
     finally:
@@ -151,6 +161,24 @@ def _server(system: str, address: str) -> tuple[str, OwnServer | None]:
     if listing is not None and listing.alive:
         return name, None
     return name, OwnServer(system)
+
+
+@contextmanager
+def _closed_by_signals(qt: QApplication) -> Iterator[None]:
+    """Ctrl-C and SIGTERM close the window in order; an exception out of a slot would be swallowed by Qt.
+
+    Python hears of them with the next tick.
+    """
+
+    def close(*_: object) -> None:
+        QTimer.singleShot(0, qt.closeAllWindows)
+
+    before = {number: signal.signal(number, close) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _picture(window: MainWindow, session: Session, path: Path) -> None:

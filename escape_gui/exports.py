@@ -12,7 +12,6 @@ from PySide6.QtWidgets import QWidget
 
 from escape_gui.panels.panel import Panel, Shown
 from escape_hw.errors import EscapeError
-from escape_hw.io import fits_file
 from escape_hw.io.provenance import Provenance
 from escape_hw.io.storage import write_atomic
 from escape_hw.remote.state import State
@@ -65,6 +64,8 @@ def save_fits(path: Path, panel: Panel, state: State) -> tuple[Path, ...]:
     StorageError
         The file cannot be written.
     """
+    from escape_hw.io import fits_file
+
     arrays = _arrays(panel)
     origin = Provenance(seed=state.seed if state.simulated else None)
     head = fits_file.primary(KIND_SCREEN, state.system, state.simulated, False, origin)

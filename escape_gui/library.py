@@ -8,12 +8,15 @@ from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from escape_gui.views.gain_curves import Curve
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.errors import EscapeError
 from escape_hw.remote.state import Product
-from escape_hw.report.content import RunContent, read_product
+
+if TYPE_CHECKING:
+    from escape_hw.report.content import RunContent
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +73,7 @@ class Library:
                 del self._known[key]
             for key, one in known.items():
                 if key not in self._known:
-                    self._known[key] = self._pool.submit(read_product, Path(one.path))
+                    self._known[key] = self._pool.submit(_read, Path(one.path))
 
     @property
     def reading(self) -> bool:
@@ -100,6 +103,13 @@ def _key(product: Product) -> tuple[str, str, int]:
     except OSError:
         age = 0
     return product.name, product.path, age
+
+
+def _read(path: Path) -> RunContent:
+    # Reading FITS takes half a second to load; a window is there before.
+    from escape_hw.report.content import read_product
+
+    return read_product(path)
 
 
 def _build(number: int, ready: dict[tuple[str, str, int], Future[RunContent]]) -> Shelf:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from escape_hw.remote.state import Geometry
 
@@ -70,6 +69,9 @@ def _nearest(places: NDArray[np.float64]) -> NDArray[np.intp]:
     """Number of the nearest actuator for each pixel, -1 further off than they stand apart."""
     if len(places) < 2:
         return np.zeros((0, 0), np.intp)
+    # It takes half a second to load, and most mirrors have a grid.
+    from scipy.spatial import cKDTree
+
     tree = cKDTree(places)
     apart = float(np.median(tree.query(places, k=2)[0][:, 1]))
     low, high = places.min(axis=0) - apart, places.max(axis=0) + apart

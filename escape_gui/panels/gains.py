@@ -15,7 +15,7 @@ from escape_gui.widgets.curve_plot import MARKERS
 from escape_gui.widgets.gains_plot import GainsPlot
 from escape_hw.remote.source import Sample, Source
 from escape_hw.remote.state import State
-from escape_hw.report.content import METHOD_LABELS
+from escape_hw.report.tables import METHOD_LABELS
 
 
 class GainsPanel(Panel):

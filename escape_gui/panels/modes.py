@@ -29,7 +29,7 @@ from escape_gui.widgets.mode_mosaic import ModeMosaic, Spot
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.remote.source import Sample, Source
 from escape_hw.remote.state import State
-from escape_hw.report.content import METHOD_LABELS
+from escape_hw.report.tables import METHOD_LABELS
 
 #: How the matrix that is being measured is called in the list.
 LIVE = "as measured now"

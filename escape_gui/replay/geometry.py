@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_gui.replay.streams import main_calibration
 from escape_hw.remote.state import Geometry
-from escape_hw.report.content import RunContent
 from escape_hw.server.views import outlines
+
+if TYPE_CHECKING:
+    from escape_hw.report.content import RunContent
 
 
 def geometry_of(run: RunContent) -> Geometry:

@@ -6,15 +6,13 @@ import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from escape_gui.replay.geometry import geometry_of
 from escape_gui.replay.streams import Course, courses, main_calibration
 from escape_hw.errors import ConfigError
-from escape_hw.io.fits import KIND_MATRIX
-from escape_hw.io.gains import KIND_GAINS
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
     Arguments,
@@ -30,7 +28,9 @@ from escape_hw.remote.state import (
     State,
     StreamEntry,
 )
-from escape_hw.report.content import RunContent, read_product, read_run
+
+if TYPE_CHECKING:
+    from escape_hw.report.content import RunContent
 
 #: Why nothing can be commanded.
 REASON = "This is a recording: it can be looked at, nothing in it can be moved."
@@ -57,6 +57,9 @@ class ReplaySource:
     """
 
     def __init__(self, path: Path | str) -> None:
+        # Reading FITS takes half a second to load, and live windows do without.
+        from escape_hw.report.content import read_product, read_run
+
         self.path = Path(path)
         self.run: RunContent = read_run(self.path) if self.path.is_dir() else read_product(self.path)
         self._courses = courses(self.run)
@@ -174,10 +177,6 @@ def _loop_state(run: RunContent) -> LoopState:
     )
 
 
-#: Kinds of products in headers, and in a server's state.
-_KINDS = {KIND_MATRIX: "matrix", KIND_GAINS: "gains"}
-
-
 def _products(run: RunContent) -> tuple[Product, ...]:
     """Every FITS product by name, the run's main matrix last."""
     main = main_calibration(run)
@@ -191,7 +190,10 @@ def _products(run: RunContent) -> tuple[Product, ...]:
 
 
 def _kind(run: RunContent, name: str) -> str:
-    return _KINDS.get(run.kinds.get(name, ""), "psf")
+    from escape_hw.io.fits import KIND_MATRIX
+    from escape_hw.io.gains import KIND_GAINS
+
+    return {KIND_MATRIX: "matrix", KIND_GAINS: "gains"}.get(run.kinds.get(name, ""), "psf")
 
 
 def _log_lines(text: str) -> tuple[LogLine, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from escape_hw.api.gains import GainsResult
 from escape_hw.api.registration import PARAMETERS, TO_PLAIN
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
-from escape_hw.report.content import RunContent
+
+if TYPE_CHECKING:
+    from escape_hw.report.content import RunContent
 
 Meta = Mapping[str, float | str]
 

@@ -102,9 +102,9 @@ def duration(seconds: float) -> str:
 
 def plan_lines(plan: Plan) -> list[str]:
     """A plan in two lines: what it takes, and how far the mirror moves."""
-    stroke = (
-        "the mirror stays flat" if not plan.stroke else f"pokes reach {100 * plan.stroke:.3g} % of the stroke"
-    )
+    stroke = f"pokes reach {100 * plan.stroke:.3g} % of the stroke" if plan.stroke else "no pokes"
+    if not plan.frames:
+        return ["no frames, nothing moves: it computes with what was measured", ""]
     return [f"{plan.frames} frames, {duration(plan.seconds)} at the camera's rate", stroke]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.departures import MirrorDepartures
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
 from escape_hw.api.sensor import SensorGeometry
@@ -69,6 +70,8 @@ class RegistrationEstimate:
         What to know of it that is no reason to distrust it, such as parameters that go together.
     extras
         What was fitted beside the registration, by name (``calibration.also``).
+    departures
+        How the mirror differs from the model's; ``None`` where SPRINT did not look.
     """
 
     registration: Registration
@@ -80,6 +83,7 @@ class RegistrationEstimate:
     chi2: float
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    departures: MirrorDepartures | None = None
     extras: Mapping[str, Measured] = field(default_factory=dict)
 
     @property

@@ -8,7 +8,7 @@ import time
 from array import array
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from escape_hw.calibration.sensor_setup import prepare_sensor
 from escape_hw.errors import Aborted, CalibrationError, CommandRejected, FrameTimeout
 from escape_hw.pipeline.frame_stack import FrameStack
 from escape_hw.streams.loop_timing import Timing
-from escape_hw.streams.realtime import prompt
+from escape_hw.streams.realtime import PRIORITY, isolated_cpus, prompt
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,10 @@ def keep_closed(
 
 def _punctual(bench: Bench) -> AbstractContextManager[tuple[str, ...]]:
     """Priority for the loop's thread; a twin computes all the time and would starve the computer."""
-    return nullcontext(()) if bench.simulated else prompt()
+    if bench.simulated:
+        return prompt(priority=0)
+    # Nothing moves a thread from one isolated processor to another, so one is what it gets.
+    return prompt(isolated_cpus()[:1] or None)
 
 
 class _Keeper:
@@ -141,8 +144,7 @@ class _Keeper:
         stretch = max(1, round(_STEP_S * bench.wfs.settings.frame_rate_hz))
         report = Reporter("closed loop", 0)
         with ThreadPoolExecutor(1, thread_name_prefix="running Strehl") as pool, _punctual(bench) as refused:
-            for reason in refused:
-                log.warning("frames may be answered late: %s", reason)
+            self._tell_priority(refused)
             try:
                 while not self.orders.opened and not fault:
                     fault = yield from self._stretch(stretch, report)
@@ -158,6 +160,13 @@ class _Keeper:
         lost = bench.wfs.status().lost - self.lost_before
         frames, timing = self.loop.record.frames, self.loop.timing.since_start()
         return LoopEnd(fault, self.settings, frames, lost, self.timeouts, timing)
+
+    def _tell_priority(self, refused: tuple[str, ...]) -> None:
+        if refused:
+            log.warning("frames may be answered late: %s", "; ".join(refused))
+        elif not self.bench.simulated:
+            place = ", ".join(map(str, isolated_cpus()[:1])) or "any"
+            log.info("real-time priority %d, memory held, processor: %s", PRIORITY, place)
 
     def _stretch(self, frames: int, report: Reporter) -> Procedure[str]:
         """Answer some frames; what is wrong, if anything."""

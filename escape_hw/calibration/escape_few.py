@@ -73,6 +73,7 @@ def escape_from_few(
     fit = yield from telemetry_sprint(
         time_line(*record, before=2 * c.whiten_order + c.lags), frame, bench.model(found),
         order=order, lags=c.lags, learning_rate=c.learning_rate, solver=c.solver, loss=c.loss, also=c.also,
+        actuators=c.actuators,
     )  # fmt: skip
     lost = int(record[0][-1] - record[0][0]) + 1 - record[0].size
     result = few_frames_result(

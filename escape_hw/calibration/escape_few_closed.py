@@ -66,6 +66,7 @@ def escape_closed_from_few(
         data, closing.matrix, bench.model(found), order=order, lags=c.lags, known=closing.response,
         start=None if registration is None else registration.registration,
         learning_rate=c.learning_rate, solver=c.solver, loss=c.loss, also=c.also,
+        actuators=c.actuators,
     )  # fmt: skip
     result = few_frames_result(
         bench, fit, found, closing.matrix.m2c, frames=frames, lost=tape.lost, poke=float(poke), order=order,

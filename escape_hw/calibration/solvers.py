@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.departures import MirrorDepartures
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure, Progress, Reporter
@@ -78,8 +79,9 @@ class Solution:
     """Where a descent ended, alike for every solver.
 
     ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``, ``learned`` what the data say about the
-    scatter of the random effects, where there are any; ``scatter`` is what is to be added to the covariance
-    of the registration ``(5, 5)``. ``extras`` is what was fitted beside it.
+    scatter of the random effects, and ``departures`` those of the mirror, where there are any; ``scatter`` is
+    what is to be added to the covariance of the registration ``(5, 5)``; ``extras`` is what was fitted beside
+    it.
     """
 
     system: Linearised
@@ -91,6 +93,7 @@ class Solution:
     scatter: NDArray[np.float64] | None = None
     learned: Callable[[], Learned] | None = None
     extras: tuple[FoundExtra, ...] = ()
+    departures: MirrorDepartures | None = None
 
 
 def solve(
@@ -181,6 +184,7 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
         system, state.alpha, state.gain, 1 + state.width, settled,
         lambda: problem.zonal(state), learned=lambda: problem.learned(state, system),
         extras=problem.extras_found(state),
+        departures=problem.departures(state, system),
     )  # fmt: skip
 
 

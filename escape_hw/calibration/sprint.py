@@ -10,7 +10,7 @@ batches, the original's gain for every mode and other variants can be had instea
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ParamSpec
 
 import numpy as np
@@ -34,7 +34,17 @@ from escape_hw.calibration.parity import parity_hint
 from escape_hw.calibration.robust import ROUNDS, trust
 from escape_hw.calibration.solvers import LARGEST, Descent, Solution, solve
 from escape_hw.calibration.weighted import WeightedMatrix
-from escape_hw.config.models import LOSSES, MODES_CHOICES, SOLVERS, Extra, Loss, ModesChoice, Solver
+from escape_hw.config.models import (
+    ACTUATORS,
+    LOSSES,
+    MODES_CHOICES,
+    SOLVERS,
+    Actuators,
+    Extra,
+    Loss,
+    ModesChoice,
+    Solver,
+)
 from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 
 P = ParamSpec("P")
@@ -79,6 +89,7 @@ def fit_steps(
     learn: bool = False,
     reach: bool = True,
     also: Sequence[Extra] = (),
+    actuators: Actuators = "found",
 ) -> Procedure[SprintFit]:
     """Registration, gain and their standard errors from an interaction matrix.
 
@@ -121,6 +132,9 @@ def fit_steps(
         descent is from ``start`` alone, on all modes at once.
     also
         What to fit beside the registration (:mod:`~.extra_unknowns`), by the solver ``"effects"``.
+    actuators
+        ``"found"``: the estimate keeps what was found of every actuator, and a matrix made from it has it,
+        too. ``"alike"``: it does not, and the matrix is that of the model's actuators. The fit is the same.
 
     Returns
     -------
@@ -137,7 +151,7 @@ def fit_steps(
     ConfigError
         The model does not know what is asked for in ``also``.
     ValueError
-        A learning rate outside (0, 1]; no such solver, choice or loss.
+        A learning rate outside (0, 1]; no such solver, choice, loss or actuators.
     """
     if not 0 < learning_rate <= 1:
         raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
@@ -149,6 +163,7 @@ def fit_steps(
             f"calibration.solver = '{solver}' fits gain and registration alone; what calibration.also "
             "asks for takes solver = 'effects'"
         )
+    _known("actuators", actuators, ACTUATORS)
     begin = start or Registration()
     # The products are many and small.
     with hold_to_one_thread():
@@ -169,6 +184,8 @@ def fit_steps(
             weighted = whole.trusting(shares)
             found = yield from solve(descent, weighted, found.alpha, False)
         estimate = _estimate(descent, weighted, found, covariance)
+    if actuators == "alike":
+        estimate = replace(estimate, departures=None)
     yield descent.progress(estimate.sigma)
     return SprintFit(estimate, found.zonal, found.learned)
 
@@ -300,5 +317,6 @@ def _estimate(
         float(np.mean(np.square(residual))),
         tuple(warnings),
         notes,
+        found.departures,
         {one.unknown.name: one.measured(sigma) for one in found.extras},
     )

@@ -34,7 +34,7 @@ from escape_hw.calibration.whitening import (
     known_past,
     prediction_error_filter,
 )
-from escape_hw.config.models import Extra, Loss, Solver
+from escape_hw.config.models import Actuators, Extra, Loss, Solver
 from escape_hw.errors import TooFewFrames
 
 #: Rounds of registration, response, whitener and scatter; a fifth changes nothing that matters.
@@ -133,6 +133,7 @@ def telemetry_sprint(
     solver: Solver = "effects",
     loss: Loss = "squares",
     also: Sequence[Extra] = (),
+    actuators: Actuators = "found",
 ) -> Procedure[TelemetryFit]:
     """Registration, gain and temporal response from a stretch of telemetry.
 
@@ -155,7 +156,7 @@ def telemetry_sprint(
         Where to start; from afar by default.
     known
         A temporal response to go on with for as long as the frames tell it no better.
-    learning_rate, solver, loss, also
+    learning_rate, solver, loss, also, actuators
         As for :func:`~escape_hw.calibration.sprint.sprint`; a solver that needs modes will not do.
 
     Raises
@@ -185,7 +186,7 @@ def telemetry_sprint(
         fit = yield from fit_steps(
             frames.columns(frame, response.weights, matrix, variance), model,
             solver=solver, loss=loss, start=start, learning_rate=learning_rate,
-            covariance=covariance, priors=priors, reach=start is None, also=also,
+            covariance=covariance, priors=priors, reach=start is None, also=also, actuators=actuators,
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal() @ frame.m2c

@@ -56,8 +56,7 @@ def loop(
 
 def _show(one: Session, result: LoopResult, record: BenchRecord, document: dict[str, Any]) -> None:
     from escape_hw.cli.views import bands, products_view, rich_table
-    from escape_hw.report.content import METHOD_LABELS
-    from escape_hw.report.tables import strehl_table
+    from escape_hw.report.tables import METHOD_LABELS, strehl_table
 
     label = METHOD_LABELS.get(result.method, result.method)
     one.show(bands(record.simulated, result.partial), rich_table(strehl_table({label: result})))

@@ -8,7 +8,7 @@ from typing import Any
 from escape_hw.errors import ServerGone
 from escape_hw.remote import requests as ask
 from escape_hw.remote.address import resolve
-from escape_hw.remote.keys import client_keys
+from escape_hw.remote.keys import client_keys, keys_hint
 from escape_hw.remote.run import Run
 from escape_hw.remote.state import Lease, Product
 from escape_hw.remote.viewer import SLOW_S, Viewer
@@ -167,7 +167,11 @@ def connect(address: str, *, control: bool = False, take_over: bool = False, nam
         The address means nothing, or there are no keys for it.
     """
     endpoint = resolve(address)
-    connection = Connection(endpoint, name, client_keys(endpoint.requests))
+    keys = client_keys(endpoint.requests)
+    try:
+        connection = Connection(endpoint, name, keys)
+    except ServerGone as error:
+        raise ServerGone(f"{error}{keys_hint(endpoint.requests, keys)}") from None
     try:
         if control or take_over:
             connection.acquire(take_over)

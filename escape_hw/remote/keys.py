@@ -152,6 +152,19 @@ def client_keys(address: str) -> tuple[bytes, bytes, bytes] | None:
     return trusted, own.public, own.secret
 
 
+def keys_hint(address: str, keys: tuple[bytes, bytes, bytes] | None) -> str:
+    """What keys may have to do with a server that does not answer: it tells strangers nothing."""
+    if address.startswith("ipc://"):
+        return ""
+    host = address.removeprefix("tcp://").rpartition(":")[0]
+    if keys is None:
+        return f" If it asks for keys: escape keys trust {host} KEY"
+    return (
+        f" Does it let this key in (there: escape keys allow NAME '{keys[1].decode()}'), and is its own "
+        "still the one that is trusted here (escape keys list)?"
+    )
+
+
 def _file(kind: str, name: str) -> Path:
     if not _NAME.fullmatch(name):
         raise ConfigError(f"{name!r}: a name has letters, digits, '.', '_' and '-', at most 64")

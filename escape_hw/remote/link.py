@@ -26,8 +26,8 @@ _POLL_MS = 500
 #: Largest answer that is taken, bytes.
 _LARGEST = 256 << 20
 
-#: The answer, and the bytes beside it.
-Answer = tuple[Any, bytes]
+#: The answer, the bytes beside it, and the number of the state that holds what was done.
+Answer = tuple[Any, bytes, int]
 Keys = tuple[bytes, bytes, bytes]
 
 
@@ -169,7 +169,8 @@ class Link:
         try:
             reply = json.loads(parts[1])
             if reply["ok"]:
-                answer.set_result((reply["answer"], parts[2] if len(parts) > 2 else b""))
+                data = parts[2] if len(parts) > 2 else b""
+                answer.set_result((reply["answer"], data, int(reply.get("serial", 0))))
             else:
                 answer.set_exception(from_wire(reply["error"]))
         except (IndexError, KeyError, ValueError) as error:

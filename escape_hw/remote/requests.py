@@ -224,3 +224,5 @@ REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)
 
 #: Requests that need the lease.
 WRITING = (Start, Pause, Resume, CloseLoop, SetLoop, LoadProduct, Record, ClearFault, Shutdown)
+#: Those after which the state is another one.
+CHANGING = (*WRITING[:-1], Acquire, Release, OpenLoop, Flatten, Abort)

@@ -82,7 +82,7 @@ class Rates(Part):
 
     frame_hz: float = 0.0
     frames: int = 0
-    #: Frames the camera made and nobody got.
+    #: Frames the camera made and nobody got, of the loop or procedure that runs or ran last.
     lost: int = 0
 
 

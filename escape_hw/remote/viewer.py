@@ -40,6 +40,8 @@ TIMEOUT_S, SLOW_S = 3.0, 30.0
 #: A server that tells its state five times a second and was not heard of for so long is gone.
 _STALE_S = 2.0
 _LINES = 5000
+#: Longest wait for the event that belongs to an answer, seconds.
+_EVENT_S = 1.0
 
 
 class Viewer:
@@ -91,7 +93,7 @@ class Viewer:
     def _hello(self) -> None:
         name, host = (re.sub(r"[^\w .+@:-]", "-", text)[:80] for text in (self._name, socket.gethostname()))
         hello = ask.Hello(client=self.client, schema_version=SCHEMA, name=name, host=host, pid=os.getpid())
-        answer, _ = self._link.ask(hello.model_dump(mode="json"), TIMEOUT_S)
+        answer, _, _ = self._link.ask(hello.model_dump(mode="json"), TIMEOUT_S)
         self._known = True
         with self._changed:
             self._state = State.model_validate(answer)
@@ -131,7 +133,12 @@ class Viewer:
         return {"verb": "heartbeat", "client": self.client} if self._known else None
 
     def _ask(self, request: ask.Request, timeout_s: float = TIMEOUT_S) -> tuple[Any, bytes]:
-        return self._link.ask(request.model_dump(mode="json"), timeout_s)
+        answer, data, serial = self._link.ask(request.model_dump(mode="json"), timeout_s)
+        if isinstance(request, ask.CHANGING):
+            # Events come another way than answers: who looks at the state next finds what was done.
+            with self._changed:
+                self._changed.wait_for(lambda: self._state.serial >= serial, _EVENT_S)
+        return answer, data
 
     def _event(self, topic: str, document: dict[str, Any]) -> None:
         with self._changed:

@@ -21,19 +21,7 @@ from escape_hw.io.gains import KIND_GAINS, load_gains
 from escape_hw.io.psf import KIND_PSF, load_loop
 from escape_hw.io.run_folder import read_result
 from escape_hw.io.telemetry import KIND_TELEMETRY
-
-#: How methods are called in figures and tables.
-METHOD_LABELS = {
-    "push-pull": "push-pull",
-    "modulated": "modulation",
-    "docrime": "DO-CRIME",
-    "docrime-whitened": "DO-CRIME",
-    "docrime-closed": "DO-CRIME, closed loop",
-    "push-pull-fast": "fast push-pull",
-    "push-pull-fast-closed": "fast push-pull, closed loop",
-    "escape": "ESCAPE",
-    "simulated": "simulation",
-}
+from escape_hw.report.tables import METHOD_LABELS
 
 
 @dataclass(slots=True)

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from escape_hw.api.gains import GainsResult, OpticalGains
 from escape_hw.report import style
-from escape_hw.report.content import METHOD_LABELS
+from escape_hw.report.tables import METHOD_LABELS
 
 
 def optical_gains(result: GainsResult) -> Figure:

@@ -12,6 +12,19 @@ from escape_hw.api.gains import GainsResult
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import LoopResult, Measured, RegistrationEstimate
 
+#: How methods are called in figures and tables.
+METHOD_LABELS = {
+    "push-pull": "push-pull",
+    "modulated": "modulation",
+    "docrime": "DO-CRIME",
+    "docrime-whitened": "DO-CRIME",
+    "docrime-closed": "DO-CRIME, closed loop",
+    "push-pull-fast": "fast push-pull",
+    "push-pull-fast-closed": "fast push-pull, closed loop",
+    "escape": "ESCAPE",
+    "simulated": "simulation",
+}
+
 #: Names and units as the paper's Table 1 writes them.
 TITLES = {
     "shift_x": ("Shift X", "% of Sub Aperture"),

@@ -100,7 +100,7 @@ class LoopTask:
     def keep(self, folder: RunFolder, record: BenchRecord, result: LoopResult, wall_seconds: float) -> Kept:
         """See :meth:`~escape_hw.runtime.task.Task.keep`."""
         from escape_hw.io.documents import loop_document
-        from escape_hw.report.content import METHOD_LABELS
+        from escape_hw.report.tables import METHOD_LABELS
         from escape_hw.runtime import criteria
         from escape_hw.runtime.keep import finish, keep_loop, keep_telemetry
 

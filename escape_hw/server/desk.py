@@ -108,6 +108,9 @@ class Desk:
             self._reply(number, error=error)
         else:
             if answer is not LATER:
+                if isinstance(request, ask.CHANGING):
+                    # What was done is told before it is confirmed.
+                    self._engine.pulse.beat()
                 self._reply(number, answer=answer)
 
     def _reply(self, number: int, answer: object = None, error: BaseException | None = None) -> None:
@@ -129,7 +132,11 @@ class Desk:
         engine.offers.task(request.procedure, request.arguments, engine.shelf)
         if not engine.bench.is_open:
             raise RequestRefused("the devices are not open; nothing can be planned before they are")
-        return engine.planner.plan(request.procedure, arguments).model_dump(mode="json")
+        plan = engine.planner.plan(request.procedure, arguments)
+        if engine.board.orders is not None:
+            later = jobs.RETURNS if needs_loop(request.procedure, arguments) else "open the loop first"
+            plan = plan.model_copy(update={"warnings": (*plan.warnings, f"the loop is closed: {later}")})
+        return plan.model_dump(mode="json")
 
     # ------------------------------------------------------------ safety
     def _open_loop(self, request: ask.OpenLoop, number: int) -> object:
@@ -161,16 +168,18 @@ class Desk:
     def _start(self, request: ask.Start, number: int) -> object:
         engine = self._engine
         with engine.board.lock:
-            engine.board.require_idle()
             arguments = engine.offers.arguments(request.procedure, request.arguments)
+            loop = needs_loop(request.procedure, arguments)
+            before = jobs.loop_to_return_to(engine) if loop else None
+            if before is None:
+                engine.board.require_idle()
             task = engine.offers.task(request.procedure, request.arguments, engine.shelf)
             config = jobs.configured(engine, task)
             task.load(config)
             run = engine.next_run
             engine.next_run += 1
-            engine.board.needs_loop = needs_loop(request.procedure, arguments)
-            jobs.announce(engine, run, request.procedure, arguments)
-        engine.post(lambda: jobs.do_task(engine, task, config))
+            jobs.announce(engine, run, request.procedure, arguments, loop)
+        engine.post(lambda: jobs.do_task(engine, task, config, before))
         return run
 
     def _pause(self, request: ask.Pause, number: int) -> object:
@@ -194,8 +203,8 @@ class Desk:
         engine = self._engine
         with engine.board.lock:
             engine.board.require_idle()
-            jobs.close_loop(engine, request)
-        return None
+            jobs.close_loop(engine, request, lambda: self._reply(number))
+        return LATER
 
     def _set_loop(self, request: ask.SetLoop, number: int) -> object:
         engine = self._engine
@@ -216,6 +225,7 @@ class Desk:
 
         def clear() -> None:
             engine.clear_fault()
+            engine.pulse.beat()
             self._reply(number)
 
         engine.post(clear)

@@ -18,6 +18,7 @@ from escape_hw.remote.address import Endpoint
 from escape_hw.remote.faults import to_wire
 from escape_hw.remote.keys import KeyPair
 from escape_hw.remote.requests import REQUESTS, AnyRequest, complaint
+from escape_hw.remote.state import State
 
 log = logging.getLogger(__name__)
 
@@ -65,10 +66,12 @@ class Door:
     ----------
     refused
         Messages that were no requests.
+    serial
+        Of the newest state that was told; stands in every answer, for clients that look at the state next.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        self._context, self.refused = context, 0
+        self._context, self.refused, self.serial = context, 0, 0
         self._gates: list[tuple[zmq.Socket[bytes], zmq.Socket[bytes]]] = []
 
     @property
@@ -152,7 +155,8 @@ class Door:
         self._send(route, {"ok": False, "error": known}, None)
 
     def _send(self, route: Route, reply: Mapping[str, Any], data: bytes | None) -> None:
-        parts = [route.connection, route.number, json.dumps(reply, allow_nan=False).encode()]
+        text = json.dumps({**reply, "serial": self.serial}, allow_nan=False)
+        parts = [route.connection, route.number, text.encode()]
         try:
             router = self._gates[route.gate][0]
             router.send_multipart(parts if data is None else [*parts, data], zmq.NOBLOCK)
@@ -161,6 +165,8 @@ class Door:
 
     def publish(self, topic: str, document: BaseModel | Mapping[str, Any]) -> None:
         """Tell everybody who listens."""
+        if isinstance(document, State):
+            self.serial = document.serial
         text = document.model_dump_json() if isinstance(document, BaseModel) else json.dumps(plain(document))
         for _, events in self._gates:
             try:

@@ -241,7 +241,9 @@ class Engine:
     def observe(self, progress: Progress) -> None:
         """Tell how far what runs is, and halt when asked."""
         board, running = self.board, self.board.running
-        if running is not None:
+        if board.orders is not None:
+            board.loop_metrics = dict(progress.metrics)
+        elif running is not None:
             left = progress.remaining_s
             board.running = running.model_copy(
                 update={
@@ -252,8 +254,6 @@ class Engine:
                 }
             )  # fmt: skip
             self.channel.post({"progress": board.running.model_dump(mode="json")})
-        elif board.orders is not None:
-            board.loop_metrics = dict(progress.metrics)
         if progress.arrays:
             self.publisher.arrays(progress.arrays, stage=progress.stage, done=float(progress.done))
         if board.paused:

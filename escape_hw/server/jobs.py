@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
@@ -31,8 +32,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: What becomes of a closed loop when a procedure closes one of its own.
+RETURNS = "it is opened for this, and closed again as it was when this has come to its end"
 #: Products that the shelf takes.
-_SHELVED = ("im", "docrime", "gains", "loop")
+_SHELVED = ("im", "escape", "docrime", "gains", "loop")
 
 
 def configured(engine: Engine, task: Task[Any]) -> SystemConfig:
@@ -40,16 +43,27 @@ def configured(engine: Engine, task: Task[Any]) -> SystemConfig:
     return load_text(engine.setup.config_text, overrides=task.overrides)
 
 
-def announce(engine: Engine, run: int, name: str, arguments: dict[str, Any]) -> None:
-    """Say that a procedure begins; nothing else is started from here on."""
+def loop_to_return_to(engine: Engine) -> LoopChoice | None:
+    """The closed loop as it is, for whoever closes one of his own meanwhile; ``None``: it is open."""
     board = engine.board
-    board.stop, board.paused = Flag(), False
+    if board.orders is None or board.fault is not None or board.running is not None:
+        return None
+    return board.loop
+
+
+def announce(engine: Engine, run: int, name: str, arguments: dict[str, Any], loop: bool) -> None:
+    """Say that a procedure begins, and whether it closes the loop; nothing else is started from here on."""
+    board = engine.board
+    if board.orders is not None:
+        log.info("the loop is closed: %s", RETURNS)
+        board.orders.open()
+    board.stop, board.paused, board.needs_loop = Flag(), False, loop
     board.running = Running(id=run, name=name, arguments=arguments, stage="starting", started_utc=utc_text())
     board.phase = Phase.PROCEDURE
 
 
-def do_task(engine: Engine, task: Task[Any], config: SystemConfig) -> None:
-    """Do a task to its end, keep its result, and say how it ended."""
+def do_task(engine: Engine, task: Task[Any], config: SystemConfig, before: LoopChoice | None = None) -> None:
+    """Do a task to its end, keep its result, and say how it ended; then the loop is as ``before``."""
     board, bench = engine.board, engine.bench
     running = board.running
     if running is None:
@@ -68,8 +82,10 @@ def do_task(engine: Engine, task: Task[Any], config: SystemConfig) -> None:
     why = f": {ended.message}" if ended.message else ""
     log.log(level, "run %d: %s %s%s", ended.id, ended.name, ended.finish.value, why)
     _shelve(engine, ended)
-    board.last, board.running = ended, None
-    board.phase = Phase.IDLE if board.fault is None else Phase.FAULT
+    with board.lock:
+        board.last, board.running = ended, None
+        board.phase = Phase.IDLE if board.fault is None else Phase.FAULT
+        _return_to(engine, ended, before)
     # Whoever hears of the end finds its products in the state already.
     engine.pulse.beat()
     engine.channel.post({"ended": ended.model_dump(mode="json")})
@@ -105,6 +121,8 @@ def _run(engine: Engine, task: Task[Any], running: Running) -> Ended:
 
 def _measured(engine: Engine, task: Task[Any], folder: RunFolder) -> tuple[Kept, Aborted | None]:
     """Run the procedure and keep what it measured, a partial result as well."""
+    if engine.board.fault is not None:
+        raise Aborted(f"nothing was begun: {engine.board.fault.reason}")
     began, stop = time.monotonic(), None
     record = BenchRecord.of(engine.bench)
     try:
@@ -143,9 +161,11 @@ def _place(engine: Engine, task: Task[Any], run: int) -> Path:
 
 
 def _shelve(engine: Engine, ended: Ended) -> None:
+    # A matrix that was computed goes before the one it was computed from.
+    main = ("escape",) if "escape" in ended.products else ("im", "loop", ended.name)
     for key, path in ended.products.items():
         if key in _SHELVED:
-            name = f"{ended.name}-{ended.id}" + ("" if key in ("im", "loop", ended.name) else f"-{key}")
+            name = f"{ended.name}-{ended.id}" + ("" if key in main else f"-{key}")
             engine.shelf.put(Path(path), name)
 
 
@@ -154,6 +174,19 @@ def _words(arguments: dict[str, Any]) -> str:
 
 
 # ---------------------------------------------------------------- the loop
+def _return_to(engine: Engine, ended: Ended, before: LoopChoice | None) -> None:
+    """Close the loop again as it was, unless somebody stopped what ran or something went wrong."""
+    if before is None:
+        return
+    if ended.finish is not Finish.DONE or engine.board.fault is not None or engine.board.stop.is_set():
+        log.warning("the loop, closed before run %d, stays open", ended.id)
+        return
+    try:
+        close_loop(engine, before)
+    except EscapeError as error:
+        log.error("the loop, closed before run %d, stays open: %s", ended.id, error)
+
+
 def fitting(engine: Engine, name: str) -> MatrixProduct:
     """A matrix off the shelf that fits this bench.
 
@@ -162,13 +195,16 @@ def fitting(engine: Engine, name: str) -> MatrixProduct:
     ConfigError, ProductError, IncompatibleProduct
         There is none of that name, or it belongs elsewhere.
     """
-    product = fitting_matrix(engine.shelf.matrix(name), engine.config)
+    # Real drivers may stand on stand-ins: what is open says whether this is a simulation.
+    product = fitting_matrix(engine.shelf.matrix(name), engine.config, force=engine.bench.simulated)
     refuse_simulated(product, engine.bench, force=False)
     return product
 
 
-def close_loop(engine: Engine, request: CloseLoop) -> None:
-    """Close the loop and keep it closed until it is told to open.
+def close_loop(
+    engine: Engine, request: CloseLoop | LoopChoice, closed: Callable[[], object] = lambda: None
+) -> None:
+    """Close the loop and keep it closed until it is told to open; ``closed`` is called when it is closed.
 
     Raises
     ------
@@ -184,7 +220,7 @@ def close_loop(engine: Engine, request: CloseLoop) -> None:
     )  # fmt: skip
     board.loop, board.orders = wanted, orders
     board.phase, board.stop, board.needs_loop = Phase.LOOP, Flag(), True
-    engine.post(lambda: _keep_loop_closed(engine, orders))
+    engine.post(lambda: _keep_loop_closed(engine, orders, closed))
 
 
 def change_loop(engine: Engine, request: SetLoop) -> None:
@@ -214,15 +250,17 @@ def change_loop(engine: Engine, request: SetLoop) -> None:
     log.info("loop: %s", ", ".join(said) or "as it was")
 
 
-def _wanted(engine: Engine, request: CloseLoop | SetLoop) -> LoopChoice:
+def _wanted(engine: Engine, request: CloseLoop | SetLoop | LoopChoice) -> LoopChoice:
     asked = {key: getattr(request, key) for key in ("matrix", "gain", "leak", "dropped_modes")}
     return replace(engine.board.loop, **{key: value for key, value in asked.items() if value is not None})
 
 
-def _keep_loop_closed(engine: Engine, orders: LoopOrders) -> None:
+def _keep_loop_closed(engine: Engine, orders: LoopOrders, closed: Callable[[], object]) -> None:
     board, bench = engine.board, engine.bench
     bench.wfs.stop()
     board.closed = True
+    engine.pulse.beat()
+    closed()
     log.info("loop closed on '%s', gain %g", board.loop.matrix, board.loop.gain)
     try:
         end = run_procedure(
@@ -239,7 +277,9 @@ def _keep_loop_closed(engine: Engine, orders: LoopOrders) -> None:
     except EscapeError as error:
         engine.make_safe(str(error), "mend it, then clear the fault")
     finally:
-        board.closed = board.needs_loop = False
+        board.closed = False
+        # A procedure that waits for this end has said already whether it needs one.
+        board.needs_loop = board.needs_loop and board.running is not None
         board.orders, board.loop_metrics = None, {}
         if board.phase is Phase.LOOP:
             board.phase = Phase.IDLE

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from escape_hw.calibration.sensor_setup import SETUP_FRAMES
-from escape_hw.config.models import ESTIMATORS, SOLVERS, SystemConfig
+from escape_hw.config.models import ESTIMATORS, LOSSES, MODES_CHOICES, SOLVERS, SystemConfig
 from escape_hw.errors import ConfigError, ProductError
 from escape_hw.remote.state import Arguments, Parameter, ProcedureEntry
 from escape_hw.runtime.calibration_task import CalibrationRequest, CalibrationTask
@@ -18,6 +18,7 @@ from escape_hw.runtime.loop_task import LoopTask
 from escape_hw.runtime.procedures import CLOSED_LOOP
 from escape_hw.runtime.psf_task import PsfTask
 from escape_hw.runtime.sensor_task import SensorTask
+from escape_hw.runtime.sprint_task import SprintTask
 from escape_hw.runtime.task import Task
 from escape_hw.runtime.track_task import TrackTask
 from escape_hw.server.arguments import completed
@@ -63,6 +64,7 @@ _SNR = Parameter(
     name="snr", kind="float", low=0.01, help="Stop when every mode has this signal-to-noise ratio."
 )
 _IM = Parameter(name="im", kind="matrix", help="Interaction matrix to close the loop with.")
+_MEASURED = Parameter(name="im", kind="matrix", help="Interaction matrix that was measured.")
 _CLOSED = Parameter(name="closed_loop", kind="matrix", help="Measure in closed loop, with this matrix.")
 _RESUME = Parameter(name="resume", kind="text", help="Folder of a run that was broken off, to go on with it.")
 _STREHL = Parameter(
@@ -76,6 +78,13 @@ def _gain(config: SystemConfig) -> Parameter:
     )
 
 
+def _solver(config: SystemConfig) -> Parameter:
+    return Parameter(
+        name="solver", kind="choice", default=config.calibration.solver, choices=SOLVERS,
+        help="How SPRINT solves.",
+    )  # fmt: skip
+
+
 def _calibrations(config: SystemConfig) -> list[Offer]:
     c = config.calibration
     accuracy = Parameter(
@@ -84,9 +93,6 @@ def _calibrations(config: SystemConfig) -> list[Offer]:
     )  # fmt: skip
     estimator = Parameter(
         name="estimator", kind="choice", default=c.estimator, choices=ESTIMATORS, help="What SPRINT fits."
-    )
-    solver = Parameter(
-        name="solver", kind="choice", default=c.solver, choices=SOLVERS, help="How SPRINT solves."
     )
     pokes = Parameter(name="pokes", kind="choice", default=c.pokes, choices=_POKES, help="Kind of pokes.")
     plain = Parameter(
@@ -98,7 +104,7 @@ def _calibrations(config: SystemConfig) -> list[Offer]:
     fast = (_frames(c.frames), _poke(c.push_pull_poke), _SNR, _CLOSED)
     found = [
         ("escape", "ESCAPE", "Pokes under turbulence, SPRINT, pseudo-synthetic matrix.",
-         (*white, accuracy, estimator, solver, pokes, _CLOSED)),
+         (*white, accuracy, estimator, _solver(config), pokes, _CLOSED)),
         ("docrime", "DO-CRIME", "Interaction matrix by random pokes, under turbulence or not.",
          (*white, pokes, plain, _CLOSED)),
         ("push-pull", "Push-pull", "Interaction matrix mode by mode; needs a source.", each),
@@ -169,6 +175,11 @@ def _track(arguments: Arguments, shelf: Shelf) -> Task[Any]:
     return TrackTask(_matrix(asked, shelf), **asked)
 
 
+def _sprint(arguments: Arguments, shelf: Shelf) -> Task[Any]:
+    asked: dict[str, Any] = dict(arguments)
+    return SprintTask(_matrix(asked, shelf), settings=asked)
+
+
 def _others(config: SystemConfig) -> list[Offer]:
     gain, t = _gain(config), config.tracking
     leak = Parameter(
@@ -194,7 +205,17 @@ def _others(config: SystemConfig) -> list[Offer]:
     )  # fmt: skip
     exchange = Parameter(name="exchange", kind="bool", default=True, help="Exchange the matrix on the way.")
     effective = gain.model_copy(update={"default": None, "help": "Effective gain; as configured by default."})
+    c = config.calibration
+    choice = Parameter(
+        name="modes_choice", kind="choice", default=c.modes_choice, choices=MODES_CHOICES,
+        help="Which modes SPRINT uses.",
+    )  # fmt: skip
+    loss = Parameter(
+        name="loss", kind="choice", default=c.loss, choices=LOSSES, help="How much SPRINT trusts each slope."
+    )
     found: list[tuple[str, str, str, tuple[Parameter, ...], Callable[[Arguments, Shelf], Task[Any]]]] = [
+        ("sprint", "SPRINT", "Find the registration behind a measured matrix; nothing moves.",
+         (_MEASURED, _solver(config), choice, loss), _sprint),
         ("loop", "Closed loop", "Close the loop for a number of frames, and judge it.",
          (_IM, _frames(5000), gain, leak, dropped, best, _STREHL), _loop),
         ("gains", "Optical gains", "Close the loop on a matrix and scale it to the turbulence.",

@@ -72,7 +72,7 @@ class Pulse:
         self._runs, self._tell, self._telemetry = runs, tell, telemetry
         self._ending = threading.Event()
         self._last: tuple[float, Frame | None] = (0.0, None)
-        self._rate = 0.0
+        self._rate, self._lost = 0.0, 0
         self._clipped: deque[tuple[int, int]] = deque(maxlen=_SECOND + 1)
         self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
 
@@ -128,8 +128,16 @@ class Pulse:
         if frame is not None and now - at > _RATE_S:
             self._last = (now, frame)
             self._rate = 0.0 if before is None else _rate(before, frame)
-        lost = self._bench.wfs.status().lost if self._bench.wfs.is_open else 0
-        return Rates(frame_hz=self._rate, frames=self._publisher.frames, lost=lost)
+        return Rates(frame_hz=self._rate, frames=self._publisher.frames, lost=self._lost_now())
+
+    def _lost_now(self) -> int:
+        """Frames lost; those that pass while the engine only looks now and then, nobody wanted."""
+        board, wfs = self._board, self._bench.wfs
+        if board.orders is not None:
+            self._lost = int(board.loop_metrics.get("lost", 0.0))
+        elif board.running is not None and wfs.is_open:
+            self._lost = wfs.status().lost
+        return self._lost
 
     def _mirror(self) -> Mirror:
         dm, command = self._bench.dm, self._publisher.command

@@ -8,12 +8,23 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
 
 #: Above all that is usual, below the kernel's own threads.
 PRIORITY = 40
 #: Seconds after which another Python thread gives way: at most so long may one hold up the loop.
 SWITCH_S = 0.0005
 _LOCK_PRESENT = 1
+_ISOLATED = Path("/sys/devices/system/cpu/isolated")
+
+
+def isolated_cpus(listed: Path = _ISOLATED) -> tuple[int, ...]:
+    """Processors that this machine keeps free of everything else (boot option ``isolcpus``)."""
+    try:
+        parts = [part.split("-") for part in listed.read_text().strip().split(",") if part]
+        return tuple(cpu for ends in parts for cpu in range(int(ends[0]), int(ends[-1]) + 1))
+    except (OSError, ValueError):
+        return ()
 
 
 @contextlib.contextmanager

@@ -166,7 +166,7 @@ def test_a_note_covers_nothing(
 ) -> None:
     window, toasts = small_window, small_window.toasts
     where = {name: dock.geometry() for name, dock in window.docks.items()}
-    monkeypatch.setattr("escape_gui.widgets.toasts.SHOWN_MS", 30)
+    monkeypatch.setattr("escape_gui.widgets.toasts.SHOWN_MS", 1000)
     toasts.tell(Level.BAD, "Not saved", "the disk is full, " * 40 + "\n/runs/2")
     toasts.tell(Level.GOOD, "Saved", "/runs/3")
     qapp.processEvents()

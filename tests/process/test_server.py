@@ -17,6 +17,7 @@ from serving import SYSTEM, Served, serving, until_idle, wait_for
 from escape_hw.errors import Aborted, ConfigError, LeaseHeld, ProductError, RequestRefused
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Finish, Health, Phase
+from escape_hw.runtime.procedures import METHODS
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +124,65 @@ def test_the_loop_closes_takes_other_settings_and_opens(bench: Connection, matri
     bench.open_loop()
     assert bench.state.mirror.peak == 0.0
     wait_for(lambda: bench.state.phase is Phase.IDLE, "idle")
+
+
+def test_who_looks_after_asking_sees_what_was_done(bench: Connection, matrix: str) -> None:
+    for number in range(5):
+        gain = 0.2 + 0.01 * number
+        bench.close_loop(matrix, gain=gain)
+        assert (bench.state.loop.closed, bench.state.loop.gain, bench.state.phase) == (True, gain, Phase.LOOP)
+        bench.set_loop(gain=gain + 0.1)
+        assert bench.state.loop.gain == gain + 0.1
+        bench.open_loop()
+        assert (bench.state.loop.closed, bench.state.mirror.peak) == (False, 0.0)
+        until_idle(bench)
+    run = bench.start("docrime", frames=10_000_000)
+    assert bench.state.procedure is not None
+    assert (bench.state.procedure.id, bench.state.phase) == (run.id, Phase.PROCEDURE)
+    bench.abort()
+
+
+def test_a_closed_loop_is_closed_again_after_a_procedure_with_a_loop_of_its_own(
+    bench: Connection, matrix: str
+) -> None:
+    bench.close_loop(matrix, gain=0.35, leak=0.001, dropped_modes=5)
+    asked = {"im": matrix, "frames": 300, "gain": 0.2, "strehl": False}
+    assert "closed again as it was" in bench.check("loop", asked).warnings[-1]
+    assert "open the loop first" in bench.check("docrime", {}).warnings[-1]
+    result = bench.calibrate("loop", **asked)
+    assert result.frames == 300
+    wait_for(lambda: bench.state.loop.closed and bench.state.phase is Phase.LOOP, "the loop is closed again")
+    loop = bench.state.loop
+    assert (loop.matrix, loop.gain, loop.leak, loop.dropped_modes) == (matrix, 0.35, 0.001, 5)
+    wait_for(lambda: bench.state.mirror.peak > 0, "a shape on the mirror")
+    # Who stops it wants the mirror flat, and finds it so.
+    run = bench.start("loop", **{**asked, "frames": 10_000_000})
+    wait_for(lambda: bench.state.procedure is not None and bench.state.procedure.done > 100, "frames")
+    bench.abort()
+    with pytest.raises(Aborted):
+        run.wait(60)
+    until_idle(bench)
+    assert bench.state.mirror.peak == 0.0
+    assert not bench.state.loop.closed
+
+
+def test_sprint_on_a_stored_matrix(bench: Connection, matrix: str) -> None:
+    plan = bench.check("sprint", {"im": matrix})
+    assert (plan.frames, plan.stroke) == (0, 0.0)
+    run = bench.start("sprint", im=matrix)
+    result = run.wait(120)
+    assert result.registration.converged
+    shift = result.registration.measured()["shift_x"]
+    assert abs(shift.value + 16) < 5 * shift.sigma < 10
+    # The model's matrix is the one to close the loop with.
+    made = {one.name: one.summary for one in bench.state.products}
+    assert made[f"sprint-{run.id}"].startswith("escape,")
+    assert made[f"sprint-{run.id}-im"].startswith("docrime")
+
+
+def test_every_procedure_of_the_command_line_is_offered(bench: Connection) -> None:
+    offered = {one.name for one in bench.procedures()}
+    assert {*METHODS, "sprint", "loop", "gains", "track"} <= offered
 
 
 def test_a_closed_loop_run_and_its_result(bench: Connection, matrix: str) -> None:

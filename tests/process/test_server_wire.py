@@ -16,6 +16,7 @@ import pytest
 import zmq
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from running import ESCAPE
 from serving import SYSTEM, Served, serving, until_idle, wait_for
 
 from escape_hw.errors import ConfigError, ServerGone
@@ -198,37 +199,58 @@ def test_nobody_is_found_where_no_server_is(served: Served) -> None:
 
 
 @pytest.fixture
-def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A home without keys."""
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    return tmp_path
+def homes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """Configuration of whoever serves, and of whoever connects, which is that of this process."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "client"))
+    return tmp_path / "server", tmp_path / "client"
 
 
-def test_without_an_allowed_key_a_client_gets_nothing(system: Path, folders: Path) -> None:
-    own, port = keys.make_keys(), PORT + 10
-    keys.allow("first", own.public.decode())
-    keys.trust("127.0.0.2", own.public.decode())
-    more = {"XDG_CONFIG_HOME": os.environ["XDG_CONFIG_HOME"]}
+def escape_keys(home: Path, *words: str) -> dict:
+    """``escape keys`` as a user with that home types it."""
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(home)}
+    command = [*ESCAPE, "keys", *words, "--json"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_with_keys_from_another_machine_and_nothing_without(
+    system: Path, homes: tuple[Path, Path], tmp_path: Path
+) -> None:
+    servers, clients = homes
+    port = PORT + 10
     address = f"tcp://127.0.0.2:{port}"
+    server, client = (escape_keys(home, "make")["public"].encode() for home in homes)
+    escape_keys(servers, "allow", "client", client.decode())
+    more = {"XDG_CONFIG_HOME": str(servers)}
     with (
-        serving(system, "--port", port, "--bind", "0.0.0.0", folder=folders / "s", more=more) as served,
+        serving(system, "--port", port, "--bind", "0.0.0.0", folder=tmp_path / "s", more=more) as served,
         served.connect() as local,
     ):
         until_idle(local)
-        with connect(address) as far:
+        with pytest.raises(ServerGone, match=r"If it asks for keys: escape keys trust 127\.0\.0\.2 KEY"):
+            connect(address)
+        escape_keys(clients, "trust", "127.0.0.2", server.decode())
+        with connect(address, control=True) as far:
             wait_for(lambda: far.latest("frames") is not None, "a frame")
+            assert far.check("docrime", {"frames": 300}).frames == 300
+            wait_for(lambda: far.state.serial > 1 and far.holds_lease, "events")
+        secret = keys.own_keys().secret
         stranger = zmq.curve_keypair()
-        for public, secret, server in (
-            (*stranger, own.public),  # a key that is not allowed
-            (own.public, own.secret, stranger[0]),  # the wrong server
+        for public, hidden, other in (
+            (*stranger, server),  # a key that is not allowed
+            (client, secret, stranger[0]),  # the wrong server
             (None, None, None),  # no key at all
         ):
-            assert heard(address, public, secret, server) == 0
+            assert heard(address, public, hidden, other) == 0
         # Whom the operator lets in is in at once, and out again.
-        keys.allow("stranger", stranger[0].decode())
-        wait_for(lambda: heard(address, *stranger, own.public) > 0, "the stranger is let in")
-        keys.forget("stranger")
-        assert heard(address, *stranger, own.public) == 0
+        escape_keys(servers, "allow", "stranger", stranger[0].decode())
+        wait_for(lambda: heard(address, *stranger, server) > 0, "the stranger is let in")
+        escape_keys(servers, "forget", "stranger")
+        assert heard(address, *stranger, server) == 0
+        escape_keys(servers, "forget", "client")
+        with pytest.raises(ServerGone, match=r"Does it let this key in \(there: escape keys allow NAME"):
+            connect(address)
         assert local.state.fault is None
 
 

@@ -81,8 +81,9 @@ class FakeProcedures:
     def escape(self, bench: FakeBench, **options: Any):
         return self._calibrate(bench, "escape", **options)
 
-    def sprint(self, matrix: Any, model: Any, **options: Any):
+    def sprint_steps(self, matrix: Any, model: Any, **options: Any):
         self.calls.append(("sprint", {"method": matrix.method, **options}))
+        yield from steps("SPRINT")
         return fake.registration()
 
     def closed_loop(self, bench: FakeBench, matrix: Any, grid: Any, **options: Any):
@@ -124,7 +125,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         "push_pull": ("push_pull",),
         "docrime": ("docrime",),
         "escape": ("escape",),
-        "sprint": ("sprint",),
+        "sprint": ("sprint_steps",),
         "closed_loop": ("closed_loop",),
         "gain_search": ("best_gain",),
         "model_psf": ("measure_model_psf",),

@@ -2,7 +2,8 @@
 
 A file ``NAME.im.shm`` holds the metadata, the data, keywords, semaphores and their book-keeping, one after
 the other. Since 2.00 (June 2023) semaphores live in the file itself; later releases of 2.x begin every
-section at a multiple of eight bytes. Little-endian 64-bit Linux is assumed, as there.
+section at a multiple of eight bytes, and ``DAO_COMPAT`` lengthens the metadata. Little-endian 64-bit Linux is
+assumed, as there.
 """
 
 from __future__ import annotations
@@ -26,7 +27,13 @@ SEMAPHORE_BYTES = 32
 _FOLDERS = ("/milk/shm", "/tmp")
 _SUFFIX = ".im.shm"
 _NAME_BYTES = 80
-_PROCESS_TRACES, _TRACE_BYTES, _KEYWORD_BYTES, _RING_ENTRY_BYTES = 10, 64, 128, 48
+_PROCESS_TRACES, _KEYWORD_BYTES, _RING_ENTRY_BYTES = 10, 128, 48
+#: A record of what triggered a writer, and where in it the semaphore's number stands (-1: none).
+TRACE_BYTES, TRACE_SEMAPHORE = 64, 48
+#: Time stamp and counter of one slice of a circular buffer.
+STAMP_BYTES, COUNT_BYTES = 16, 8
+#: Bits of ``imagetype``: slices follow each other in time, and each has time stamps of its own.
+_CIRCULAR, _CIRCULAR_MASK, _STAMPED, _STAMPED_MASK = 0x1, 0xF, 0x20001, 0xF000F
 #: Data types by their code.
 DTYPES: dict[int, np.dtype[np.generic]] = {
     code: np.dtype(name)
@@ -41,7 +48,7 @@ class _Time(ctypes.Structure):
 
 
 class Metadata(ctypes.Structure):
-    """The first 384 bytes (``IMAGE_METADATA``)."""
+    """The first 384 bytes (``IMAGE_METADATA``), which are the same in all of 2.x."""
 
     _fields_ = (
         ("version", ctypes.c_char * 32),
@@ -79,6 +86,8 @@ class Metadata(ctypes.Structure):
 
 
 HEADER_BYTES = ctypes.sizeof(Metadata)
+#: What ``DAO_COMPAT`` adds: four numbers and a list of 512 about writes in parts.
+_DAO_BYTES = 4 * 4 + 512 * 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,24 +96,38 @@ class Sections:
 
     Parameters
     ----------
+    data
+        The array.
     semaphores
         The semaphores, ``sem`` times :data:`SEMAPHORE_BYTES`.
     log
         The semaphore for loggers.
     readers, writers
         Numbers of the processes that wait for and post each semaphore, 4 bytes each.
+    traces
+        What triggered the writers, ``n_traces`` times :data:`TRACE_BYTES`.
+    acquired, written, counts
+        Time stamps and counters of the slices of a circular buffer.
+    ring
+        Copies of the newest arrays, ``ring_size`` of them.
     total
         Size of the file.
     """
 
+    data: int
     semaphores: int
     log: int
     readers: int
     writers: int
+    traces: int
+    acquired: int
+    written: int
+    counts: int
+    ring: int
     total: int
 
 
-def sections(head: Metadata, step: int) -> Sections:
+def sections(head: Metadata, step: int, header_bytes: int = HEADER_BYTES) -> Sections:
     """Where the sections of a file lie.
 
     Parameters
@@ -113,25 +136,30 @@ def sections(head: Metadata, step: int) -> Sections:
         Its metadata.
     step
         Sections begin at multiples of this: 8 in later releases, 1 in the first of 2.00.
+    header_bytes
+        Length of the metadata.
     """
-    n, at, starts = int(head.sem), HEADER_BYTES, []
-    slices = int(head.size[2]) if head.naxis == 3 and (step > 1 or head.imagetype & 0xF000F == 0x20001) else 0
+    n, at, starts = int(head.sem), header_bytes, []
+    stamped = int(head.size[2]) if head.imagetype & _STAMPED_MASK == _STAMPED else 0
     for length in (
         int(head.data_bytes), _KEYWORD_BYTES * int(head.n_keywords), SEMAPHORE_BYTES * n, SEMAPHORE_BYTES,
-        4 * n, 4 * n, 4 * n, 4 * n, _TRACE_BYTES * int(head.n_traces), 16 * slices, 16 * slices, 8 * slices,
-        _RING_ENTRY_BYTES * int(head.ring_size), int(head.data_bytes) * int(head.ring_size),
+        4 * n, 4 * n, 4 * n, 4 * n, TRACE_BYTES * int(head.n_traces), STAMP_BYTES * stamped,
+        STAMP_BYTES * stamped, COUNT_BYTES * stamped, _RING_ENTRY_BYTES * int(head.ring_size),
+        int(head.data_bytes) * int(head.ring_size),
     ):  # fmt: skip
         starts.append(at)
         at += math.ceil(length / step) * step
-    return Sections(starts[2], starts[3], starts[4], starts[5], at)
+    data, _, semaphores, log, readers, writers, _, _, traces, acquired, written, counts, _, ring = starts
+    return Sections(data, semaphores, log, readers, writers, traces, acquired, written, counts, ring, at)
 
 
 def found_sections(head: Metadata, file_bytes: int) -> Sections | None:
     """The sections of a file of that size; ``None`` where it is laid out in no way known here."""
-    for step in (8, 1):
-        found = sections(head, step)
-        if found.total == file_bytes:
-            return found
+    for header_bytes in (HEADER_BYTES, HEADER_BYTES + _DAO_BYTES):
+        for step in (8, 1):
+            found = sections(head, step, header_bytes)
+            if found.total == file_bytes:
+                return found
     return None
 
 
@@ -166,7 +194,7 @@ def fresh_metadata(name: str, shape: tuple[int, ...], dtype: DTypeLike, version:
     for axis, length in enumerate(reversed(shape)):
         head.size[axis] = length
     head.imagetype = 2  # mathematical data, as the library's own default
-    head.shared, head.location, head.status = 1, -1, 1
+    head.shared, head.location = 1, -1
     head.sem, head.n_traces = SEMAPHORES, _PROCESS_TRACES
     head.data_bytes = math.prod(shape) * wanted.itemsize
     head.creator_pid = os.getpid()
@@ -175,8 +203,18 @@ def fresh_metadata(name: str, shape: tuple[int, ...], dtype: DTypeLike, version:
 
 
 def shape_of(head: Metadata) -> tuple[int, ...]:
-    """Shape of the arrays, rows first."""
+    """Shape of the whole image, rows first."""
     return tuple(int(n) for n in reversed(head.size[: head.naxis]))
+
+
+def is_circular(head: Metadata) -> bool:
+    """Whether the slices along the first of three axes were written one after the other."""
+    return bool(head.naxis == 3 and head.imagetype & _CIRCULAR_MASK == _CIRCULAR)
+
+
+def is_stamped(head: Metadata) -> bool:
+    """Whether every slice has time stamps and a counter of its own."""
+    return is_circular(head) and head.imagetype & _STAMPED_MASK == _STAMPED
 
 
 def problem_of(head: Metadata, file_bytes: int) -> str | None:
@@ -189,8 +227,11 @@ def problem_of(head: Metadata, file_bytes: int) -> str | None:
     if head.datatype not in DTYPES or not 1 <= head.naxis <= 3:
         return f"its metadata are damaged (type {head.datatype}, {head.naxis} axes)"
     bytes_ = math.prod(shape_of(head)) * DTYPES[head.datatype].itemsize
-    if bytes_ != head.data_bytes or HEADER_BYTES + bytes_ > file_bytes or bytes_ == 0:
-        return f"its metadata do not fit its {file_bytes} bytes (was milk compiled with DAO_COMPAT?)"
+    if bytes_ != head.data_bytes or bytes_ == 0 or found_sections(head, file_bytes) is None:
+        return (
+            f"its {file_bytes} bytes fit no layout that is known here (was milk compiled with "
+            "IMAGESTRUCT_WRITEHISTORY?)"
+        )
     return None
 
 

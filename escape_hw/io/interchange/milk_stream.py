@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import mmap
 import os
 import time
@@ -12,25 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from escape_hw.errors import ProductError, StorageError
+from escape_hw.errors import ProductError
 from escape_hw.io.interchange import milk_layout as layout
+from escape_hw.io.interchange.milk_semaphores import Semaphores
+from escape_hw.io.interchange.milk_slices import Slices
 from escape_hw.io.interchange.stream import Publication, StreamLost
 from escape_hw.io.storage import storage_error
 
 #: Seconds between looks at the counter where no semaphore is free, and before a torn read is given up.
 _LOOK_S, _TORN_S = 5e-5, 1.0
-#: Longest wait on a semaphore before the counter is looked at again: not every writer posts.
-_SLICE_S = 0.05
-#: Bytes that a semaphore must be aligned to, or the kernel refuses to wait on it.
-_ALIGNED = 4
-_FREE = -1
+#: milk makes its images readable and writable for everybody, whatever the umask.
+_MODE = 0o666
 
 
 class MilkStream:
     """An open image; see :class:`~escape_hw.io.interchange.stream.Stream`.
 
     Made by :meth:`open` or :meth:`create`. A reader waits on one of the image's semaphores, which it marks
-    as its own and gives back on closing.
+    as its own and gives back on closing. Of a circular buffer, the arrays are its slices.
 
     Parameters
     ----------
@@ -43,11 +41,13 @@ class MilkStream:
     def __init__(self, name: str, memory: mmap.mmap) -> None:
         self.name, self._memory = name, memory
         self._head = layout.Metadata.from_buffer(memory)
-        self.shape = layout.shape_of(self._head)
         self.dtype: DTypeLike = layout.DTYPES[self._head.datatype]
-        self._data: NDArray[Any] = np.ndarray(self.shape, self.dtype, memory, layout.HEADER_BYTES)
         sections = layout.found_sections(self._head, len(memory))
-        self._semaphores = None if sections is None else _Semaphores(memory, sections, self._head.sem)
+        if sections is None:
+            raise ValueError(f"image '{name}': {layout.problem_of(self._head, len(memory))}")
+        self._slices = Slices(memory, self._head, sections)
+        self.shape = self._slices.shape
+        self._semaphores = Semaphores(memory, sections, self._head.sem)
 
     @classmethod
     def open(cls, name: str) -> MilkStream:
@@ -79,6 +79,8 @@ class MilkStream:
     ) -> MilkStream:
         """Make an image, in place of one of that name; whoever holds that keeps its old file.
 
+        Everybody may write to it, as to those that milk makes.
+
         Parameters
         ----------
         name, shape, dtype
@@ -95,26 +97,31 @@ class MilkStream:
         """
         head = layout.fresh_metadata(name, shape, dtype, version)
         sections, path = layout.sections(head, 8), layout.shm_path(name)
+        # Nobody sees it before it is whole.
+        draft = path.with_name(f"{path.name}.{os.getpid()}")
         try:
-            path.unlink(missing_ok=True)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+            draft.unlink(missing_ok=True)
+            descriptor = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_EXCL, _MODE)
             try:
+                os.fchmod(descriptor, _MODE)
                 os.truncate(descriptor, sections.total)
                 head.inode = os.fstat(descriptor).st_ino
                 memory = mmap.mmap(descriptor, sections.total)
             finally:
                 os.close(descriptor)
+            now = time.clock_gettime_ns(time.CLOCK_TAI)
+            for moment in (head.creationtime, head.lastaccesstime):
+                moment.seconds, moment.nanoseconds = divmod(now, 1_000_000_000)
+            memory[: layout.HEADER_BYTES] = bytes(head)
+            made = cls(name, memory)
+            made._semaphores.initialise()
+            made._slices.initialise()
+            draft.replace(path)
         except OSError as error:
-            raise _unwritable(path, error) from error
-        now = time.clock_gettime_ns(time.CLOCK_TAI)
-        for moment in (head.creationtime, head.lastaccesstime):
-            moment.seconds, moment.nanoseconds = divmod(now, 1_000_000_000)
-        _Semaphores(memory, sections, head.sem).initialise()
-        # The version comes last: until it is there, nobody opens the image.
-        claimed, head.version = head.version, b""
-        memory[: layout.HEADER_BYTES] = bytes(head)
-        memory[: len(claimed)] = claimed
-        return cls(name, memory)
+            with contextlib.suppress(OSError):
+                draft.unlink(missing_ok=True)
+            raise storage_error(path, error) from error
+        return made
 
     @property
     def count(self) -> int:
@@ -127,7 +134,7 @@ class MilkStream:
         while True:
             count, seconds, nanoseconds = head.cnt0, head.writetime.seconds, head.writetime.nanoseconds
             if not head.write:
-                data = self._data.copy()
+                data = self._slices.newest().copy()
                 if head.cnt0 == count and not head.write:
                     return Publication(data, int(count), _unix_ns(seconds, nanoseconds))
             if time.monotonic() > deadline:
@@ -141,7 +148,7 @@ class MilkStream:
             left = deadline - time.monotonic()
             if left <= 0:
                 return None
-            if self._semaphores is None or not self._semaphores.wait(left):
+            if not self._semaphores.wait(left):
                 time.sleep(min(_LOOK_S, left))
         return self.latest()
 
@@ -151,107 +158,27 @@ class MilkStream:
             raise ValueError(f"image '{self.name}' has shape {self.shape}, the array {np.shape(data)}")
         head = self._head
         head.write = 1
-        self._data[...] = data
+        self._slices.put(data)
         now = divmod(time.clock_gettime_ns(time.CLOCK_TAI), 1_000_000_000)
         for moment in (head.atime, head.writetime):
             moment.seconds, moment.nanoseconds = now
         head.cnt0 += 1
+        self._slices.stamp()
         head.write = 0
-        if self._semaphores is not None:
-            self._semaphores.post()
+        self._semaphores.post()
 
     def close(self) -> None:
         """See :meth:`~escape_hw.io.interchange.stream.Stream.close`; gives its semaphore back."""
         if self._memory.closed:
             return
-        if self._semaphores is not None:
-            self._semaphores.release()
+        self._semaphores.release()
         # Views keep the memory from being unmapped.
-        del self._head, self._data, self._semaphores
+        del self._head, self._slices, self._semaphores
         self._memory.close()
 
     def unlink(self) -> None:
         """Remove the image for everybody who has not opened it yet."""
         layout.shm_path(self.name).unlink(missing_ok=True)
-
-
-class _Semaphores:
-    """The semaphores of an image, and who waits for them."""
-
-    def __init__(self, memory: mmap.mmap, sections: layout.Sections, n: int) -> None:
-        self._anchor = ctypes.c_char.from_buffer(memory)
-        base = ctypes.addressof(self._anchor)
-        self._every = [base + sections.semaphores + layout.SEMAPHORE_BYTES * k for k in range(n)]
-        self._log = base + sections.log
-        self._readers = np.ndarray((n,), np.int32, memory, sections.readers)
-        self._writers = np.ndarray((n,), np.int32, memory, sections.writers)
-        self._usable = sections.semaphores % _ALIGNED == 0
-        self._mine: int | None = None
-        self._library = _library()
-
-    def initialise(self) -> None:
-        """Make them, all at zero and free."""
-        for address in (*self._every, self._log):
-            self._library.sem_init(ctypes.c_void_p(address), 1, 0)
-        self._readers[:] = self._writers[:] = _FREE
-
-    def post(self) -> None:
-        """Wake whoever waits."""
-        self._writers[:] = os.getpid()
-        if not self._usable:
-            return
-        value = ctypes.c_int()
-        for address in (*self._every, self._log):
-            at = ctypes.c_void_p(address)
-            self._library.sem_getvalue(at, ctypes.byref(value))
-            if value.value < layout.SEMAPHORE_MAX:
-                self._library.sem_post(at)
-
-    def wait(self, timeout_s: float) -> bool:
-        """Wait for a post, for a while at most; false at once where there is no semaphore to wait on.
-
-        The first call only claims a semaphore: what was posted before does not count, so look again.
-        """
-        if self._mine is None:
-            self._mine = self._claim()
-            return self._mine is not None
-        until = time.time() + min(timeout_s, _SLICE_S)
-        moment = (ctypes.c_int64 * 2)(int(until), int(until % 1 * 1e9))
-        self._library.sem_timedwait(ctypes.c_void_p(self._every[self._mine]), ctypes.byref(moment))
-        return True
-
-    def release(self) -> None:
-        """Give the own semaphore back."""
-        if self._mine is not None:
-            self._readers[self._mine] = _FREE
-            self._mine = None
-
-    def _claim(self) -> int | None:
-        """A semaphore that nobody waits for, marked as this process's, and emptied."""
-        for k, pid in enumerate(self._readers if self._usable else ()):
-            if not _alive(int(pid)):
-                self._readers[k] = os.getpid()
-                while self._library.sem_trywait(ctypes.c_void_p(self._every[k])) == 0:
-                    pass
-                return k
-        return None
-
-
-def _alive(pid: int) -> bool:
-    if pid <= 0:
-        return False
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _library() -> Any:
-    """The C library of this process, whose semaphores milk uses, too."""
-    return ctypes.CDLL(None, use_errno=True)
 
 
 def _unix_ns(seconds: int, nanoseconds: int) -> int:
@@ -261,9 +188,3 @@ def _unix_ns(seconds: int, nanoseconds: int) -> int:
     ahead = time.clock_gettime_ns(time.CLOCK_TAI) - time.time_ns()
     # Both clocks were read one after the other; what differs is whole seconds, or nothing.
     return seconds * 1_000_000_000 + nanoseconds - round(ahead / 1e9) * 1_000_000_000
-
-
-def _unwritable(path: Any, error: OSError) -> StorageError:
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
-    return storage_error(path, error)

@@ -12,7 +12,7 @@ from escape_hw.bench import Bench
 from escape_hw.errors import ConfigError
 from escape_hw.io.fits import MatrixProduct
 from escape_hw.io.run_folder import RunFolder
-from escape_hw.report.content import METHOD_LABELS
+from escape_hw.report.tables import METHOD_LABELS
 from escape_hw.runtime.keep import keep_calibration, keep_gains, key_of
 from escape_hw.runtime.records import BenchRecord
 from escape_hw.runtime.reproduce import Comparison, three_matrices
