@@ -86,6 +86,21 @@ class DoubtfulModel(Protocol):
 
 
 @runtime_checkable
+class MovablePupil(Protocol):
+    """A model that knows what its matrices become when the pupil stands elsewhere on the sensor."""
+
+    def with_pupil_shift(self, shift_x: float, shift_y: float) -> SyntheticModel:
+        """The same sensor with the pupil shifted on it, and the mirror with the pupil.
+
+        Parameters
+        ----------
+        shift_x, shift_y
+            In % of a sub-aperture, positive to higher columns and rows.
+        """
+        ...
+
+
+@runtime_checkable
 class DifferentiableModel(SyntheticModel, Protocol):
     """A synthetic model that also gives few modes at a time, and its derivatives in closed form.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,7 +42,8 @@ class Registration:
         Scaling along x and along y, in % (OOPAO's names).
     anamorphosis_angle
         In degrees: the radial scaling acts along the direction at minus this angle from +x towards
-        +y (OOPAO's sense). SPRINT does not fit it, so arrays and tables leave it out.
+        +y (OOPAO's sense). Arrays and tables leave it out: SPRINT fits the scalings along x and y and,
+        where it is asked to, a shear beside them (:meth:`sheared`).
     """
 
     shift_x: float = 0.0
@@ -75,6 +76,41 @@ class Registration:
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         scaling = np.diag([1 + self.radial_scaling / 100, 1 + self.tangential_scaling / 100])
         return np.asarray(turn.T @ scaling @ turn) if self.anamorphosis_angle else scaling
+
+    def sheared(self, shear: float) -> Registration:
+        """The same with a shear: ``S`` with ``shear / 100`` beside its diagonal.
+
+        Scalings along x and y, and a shear, are all that a symmetric ``S`` can be. The result has
+        its scalings along the principal axes, and the angle between these and x and y.
+
+        Parameters
+        ----------
+        shear
+            In %: the scaling along one diagonal less that along the other, by half.
+        """
+        stretch = self.stretch + np.array([[0.0, shear], [shear, 0.0]]) / 100
+        # Half the angle by which the larger axis leans from x towards y.
+        lean = 0.5 * np.arctan2(2 * stretch[0, 1], stretch[0, 0] - stretch[1, 1])
+        mean = (stretch[0, 0] + stretch[1, 1]) / 2
+        half = np.hypot((stretch[0, 0] - stretch[1, 1]) / 2, stretch[0, 1])
+        return replace(
+            self,
+            radial_scaling=float(100 * (mean + half - 1)),
+            tangential_scaling=float(100 * (mean - half - 1)),
+            anamorphosis_angle=float(-np.rad2deg(lean)),
+        )
+
+    @property
+    def along_axes(self) -> tuple[Registration, float]:
+        """The same with scalings along x and y, and the shear in % that :meth:`sheared` gives back."""
+        stretch = 100 * (self.stretch - np.eye(2))
+        straight = replace(
+            self,
+            radial_scaling=float(stretch[0, 0]),
+            tangential_scaling=float(stretch[1, 1]),
+            anamorphosis_angle=0.0,
+        )
+        return straight, float(stretch[0, 1])
 
     def affine(self, sub_aperture_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Matrix ``(2, 2)`` and offset ``(2,)`` in metres that place the actuators.

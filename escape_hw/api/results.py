@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -67,6 +68,8 @@ class RegistrationEstimate:
         Scale of the influence functions' width relative to nominal.
     notes
         What to know of it that is no reason to distrust it, such as parameters that go together.
+    extras
+        What was fitted beside the registration, by name (``calibration.also``).
     departures
         How the mirror differs from the model's; ``None`` where SPRINT did not look.
     """
@@ -81,6 +84,7 @@ class RegistrationEstimate:
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     departures: MirrorDepartures | None = None
+    extras: Mapping[str, Measured] = field(default_factory=dict)
 
     @property
     def sigma(self) -> NDArray[np.float64]:
@@ -98,7 +102,8 @@ class RegistrationEstimate:
     def _repr_html_(self) -> str:
         """For notebooks: the parameters with their errors and units, and how SPRINT came there."""
         found = {
-            name: f"{one.value:.3f} ± {one.sigma:.3f} {one.unit}" for name, one in self.measured().items()
+            name: f"{one.value:.3f} ± {one.sigma:.3f} {one.unit}"
+            for name, one in {**self.measured(), **self.extras}.items()
         }
         rows = {
             **found,

@@ -153,6 +153,9 @@ class SubApertureGrid(SensorGeometry):
         this sensor is to match.
     background
         Level of the dark pixels in counts that was subtracted when no dark frame was at hand.
+    air_px
+        The part of that motion that lasts from frame to frame, which is the turbulence's and not the
+        pokes'; rms along an axis in pixels, 0 if unknown.
     """
 
     kind: ClassVar[str] = "shack-hartmann"
@@ -172,6 +175,7 @@ class SubApertureGrid(SensorGeometry):
     counts: float = 0.0
     motion_px: float = 0.0
     background: float = 0.0
+    air_px: float = 0.0
 
     def centres_px(self) -> NDArray[np.float64]:
         """Centres ``(n_valid, 2)`` of the valid lenslets as (x, y) in pixels."""
@@ -187,8 +191,13 @@ class SubApertureGrid(SensorGeometry):
     def with_motion(
         self, rms: float, pokes: float = 0.0, looks: float = 0.0, steady: float = 0.0
     ) -> SubApertureGrid:
-        """See :meth:`SensorGeometry.with_motion`; the spots move more than the slopes say."""
-        return replace(self, motion_px=MOTION_FACTOR * rms)
+        """See :meth:`SensorGeometry.with_motion`; the spots move more than the slopes say.
+
+        What is known of the air stays where a measurement tells nothing of it, as in a closed loop, which
+        takes away the motion of the spots but not the turbulence within a lenslet.
+        """
+        air = MOTION_FACTOR * rms * float(np.sqrt(steady)) if steady else self.air_px
+        return replace(self, motion_px=MOTION_FACTOR * rms, air_px=air)
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> SubApertureGrid:
         """See :meth:`SensorGeometry.with_mean_slopes`: a lattice through the mean spots.

@@ -21,6 +21,9 @@ _WORDS = {
     "tangential_scaling": "tangential scaling",
     "width": "width of the influence functions",
     "pedestal": "pedestal of the influence functions",
+    "anamorphosis": "anamorphosis",
+    "pupil_shift_x": "pupil shift x",
+    "pupil_shift_y": "pupil shift y",
 }
 #: What stands behind the usual ones.
 _REASONS = (
@@ -36,6 +39,11 @@ _REASONS = (
         "scalings stretch the influence functions, too",
     ),
     ({"shift x", "shift y", "rotation"}, "lit on one side only, a turn looks like a shift"),
+    (
+        {"shift x", "shift y", "pupil shift x", "pupil shift y"},
+        "the mirror moves with the pupil's images, and only their rims say which of them it was",
+    ),
+    ({"rotation", "anamorphosis"}, "lit along one axis only, a shear looks like a turn"),
 )  # fmt: skip
 
 

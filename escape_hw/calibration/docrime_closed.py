@@ -27,12 +27,12 @@ from escape_hw.calibration.docrime import (
     snr_judge,
 )
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
-from escape_hw.calibration.loop_run import CLOSING_S, LoopRecord, RunningLoop
+from escape_hw.calibration.loop_run import CLOSING_S, LoopRecord, RunningLoop, require_undiverged
 from escape_hw.calibration.poke_patterns import Pattern, RandomPokes, random_pattern
 from escape_hw.calibration.preview import Preview
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor, random_amplitudes
 from escape_hw.calibration.stopping import Judge, Looks, Target
-from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
+from escape_hw.errors import Aborted, ConfigError, TooFewFrames
 from escape_hw.io.state_file import RunState
 
 #: Frames after which a running loop asks whether the estimate will do.
@@ -127,7 +127,7 @@ class ClosedLoopPokes:
                 beside.finish()
         finally:
             bench.dm.flatten()
-        self._require_closed()
+        require_undiverged(self._loop.record)
         if partial:
             self._kept_and_judged(always=True)
         return partial
@@ -158,15 +158,6 @@ class ClosedLoopPokes:
             if self._stopped:
                 procedure.close()
                 return False
-
-    def _require_closed(self) -> None:
-        record = self._loop.record
-        if record.diverged:
-            raise CalibrationError(
-                f"the loop diverged after {record.frames} frames and was opened: most actuators stood at "
-                "their limits. Lower loop.gain or raise loop.dropped_modes; if that does not help, the "
-                "matrix does not belong to this state of the bench, or the delay is longer than thought"
-            )
 
 
 def docrime_closed_run(

@@ -16,6 +16,7 @@ from escape_hw.calibration.docrime import docrime_run, least_frames, matrix_of
 from escape_hw.calibration.docrime_closed import docrime_closed_run
 from escape_hw.calibration.docrime_solution import DocrimeSolution
 from escape_hw.calibration.escape_few import escape_from_few
+from escape_hw.calibration.escape_few_closed import escape_closed_from_few
 from escape_hw.calibration.pseudo_synthetic import synthesise
 from escape_hw.calibration.sensor_setup import modal_basis
 from escape_hw.calibration.solvers import BY_MODES
@@ -84,7 +85,10 @@ def escape(
         )
     from_matrix = estimator == "matrix" or not whiten or by_modes
     n_frames = c.frames if frames is None else frames
-    if closing is None and not from_matrix and n_frames < least_frames(c, bench.config.basis.n_modes):
+    n_modes = bench.config.basis.n_modes if closing is None else closing.matrix.n_modes
+    if whiten and not from_matrix and n_frames < least_frames(c, n_modes):
+        if closing is not None:
+            return (yield from escape_closed_from_few(bench, closing, frames=n_frames, poke=poke))
         return (yield from escape_from_few(bench, frames=n_frames, poke=poke, grid=grid))
     m2c = modal_basis(bench) if closing is None else closing.matrix.m2c
 
@@ -150,6 +154,7 @@ def _fit(
             learning_rate=c.learning_rate,
             covariance=solution.covariance,
             learn=True,
+            also=c.also,
         )
     )
 

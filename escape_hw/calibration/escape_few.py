@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult
@@ -15,7 +16,8 @@ from escape_hw.calibration.poke_patterns import random_pattern
 from escape_hw.calibration.poke_session import PokeSession
 from escape_hw.calibration.pseudo_synthetic import synthesise
 from escape_hw.calibration.sensor_setup import SETUP_FRAMES, modal_basis, random_amplitudes
-from escape_hw.calibration.telemetry_sprint import MIN_ROWS, telemetry_sprint, time_line
+from escape_hw.calibration.telemetry_sprint import MIN_ROWS, TelemetryFit, telemetry_sprint, time_line
+from escape_hw.config.models import CalibrationSection
 from escape_hw.errors import Aborted, TooFewFrames
 
 #: Frames per past frame of the whitening filter, so that there are enough to find it on.
@@ -53,11 +55,7 @@ def escape_from_few(
         Stopped early; frames this few are worth nothing by halves.
     """
     c = bench.config.calibration
-    order = min(c.whiten_order, max(1, some_frames(frames) // _FRAMES_PER_ORDER))
-    least = MIN_ROWS + min(order, 1)
-    if frames < least:
-        raise TooFewFrames(f"{frames} frames are too few for a registration; ask for at least {least} frames")
-    poke = c.poke if poke is None else poke
+    order, poke = order_for(c, frames), c.poke if poke is None else poke
     m2c = modal_basis(bench)
     amplitude = random_amplitudes(bench, m2c, poke)
     session = PokeSession(bench, m2c, grid, min(SETUP_FRAMES, frames), None, keep=True)
@@ -74,28 +72,76 @@ def escape_from_few(
     frame = measured_matrix(bench, found, m2c, np.zeros(shape), np.zeros(shape), "telemetry")
     fit = yield from telemetry_sprint(
         time_line(*record, before=2 * c.whiten_order + c.lags), frame, bench.model(found),
-        order=order, lags=c.lags, learning_rate=c.learning_rate, solver=c.solver, loss=c.loss,
+        order=order, lags=c.lags, learning_rate=c.learning_rate, solver=c.solver, loss=c.loss, also=c.also,
         actuators=c.actuators,
     )  # fmt: skip
     lost = int(record[0][-1] - record[0][0]) + 1 - record[0].size
-    made = synthesise(bench, found, fit.estimate, m2c)
+    result = few_frames_result(
+        bench, fit, found, m2c, frames=int(record[0].size), lost=lost, poke=float(poke), order=order,
+        shortened=session.shortened,
+    )  # fmt: skip
+    return replace(
+        result,
+        grid=session.finished_grid(),
+        mean_frame=session.mean_frame,
+        notes=(*result.notes, *session.notes()),
+    )
+
+
+def order_for(c: CalibrationSection, frames: int) -> int:
+    """Order of the whitening filter that so many frames can carry.
+
+    Raises
+    ------
+    TooFewFrames
+        Fewer than a noise level can be told from.
+    """
+    order = min(c.whiten_order, max(1, some_frames(frames) // _FRAMES_PER_ORDER))
+    least = MIN_ROWS + min(order, 1)
+    if frames < least:
+        raise TooFewFrames(f"{frames} frames are too few for a registration; ask for at least {least} frames")
+    return order
+
+
+def few_frames_result(
+    bench: Bench,
+    fit: TelemetryFit,
+    grid: SensorGeometry,
+    m2c: NDArray[np.float64],
+    *,
+    frames: int,
+    lost: int,
+    poke: float,
+    order: int,
+    shortened: int,
+) -> CalibrationResult:
+    """The pseudo-synthetic matrix of a registration that came straight from telemetry.
+
+    Parameters
+    ----------
+    bench, grid, m2c
+        An open bench, the geometry that the model is built on, and the modes ``(n_act, n_modes)``.
+    fit
+        What the telemetry says.
+    frames, lost, poke, order, shortened
+        Frames taken and lost, poke (rms surface, fraction of full stroke), order of the whitening filter,
+        and commands that the limits cut.
+    """
+    made = synthesise(bench, grid, fit.estimate, m2c)
     metrics = {
-        **made.matrix.metrics, "frames": int(record[0].size), "lost_frames": lost, "poke": float(poke),
-        "shortened": session.shortened, "delay_frames": fit.response.delay, "whitening_order": order,
+        **made.matrix.metrics, "frames": frames, "lost_frames": lost, "poke": poke,
+        "shortened": shortened, "delay_frames": fit.response.delay, "whitening_order": order,
     }  # fmt: skip
     return replace(
         made,
         matrix=replace(made.matrix, metrics=metrics),
-        grid=session.finished_grid(),
-        frames=int(record[0].size),
+        frames=frames,
         lost_frames=lost,
-        sky_seconds=frames / bench.wfs.settings.frame_rate_hz,
+        sky_seconds=(frames + lost) / bench.wfs.settings.frame_rate_hz,
         response=fit.response,
-        mean_frame=session.mean_frame,
         notes=(
             *fit.estimate.warnings,
             *fit.estimate.notes,
             "too few frames for a measured matrix: the registration comes straight from the telemetry",
-            *session.notes(),
         ),
     )

@@ -13,6 +13,7 @@ from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.evidence import believed
+from escape_hw.calibration.extra_unknowns import ExtraUnknown, FoundExtra
 from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.weighted import WeightedMatrix
 
@@ -81,6 +82,8 @@ class Problem:
     bends
         What commands may be multiplied with by one standard deviation ``(n_act, n_act)`` each, such as
         optical gains that differ between modes; fitted beside the model's own variants.
+    extras
+        What else is asked for; fitted after the model's own variants, before the bends.
     """
 
     def __init__(
@@ -89,8 +92,10 @@ class Problem:
         model: SyntheticModel,
         priors: Priors,
         bends: Sequence[NDArray[np.float64]] = (),
+        extras: Sequence[ExtraUnknown] = (),
     ) -> None:
         self.weighted, self.bends, self.priors = weighted, tuple(bends), priors
+        self.extras = tuple(extras)
         self.mean_width = priors.mean_width
         self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
@@ -130,8 +135,21 @@ class Problem:
 
     @property
     def n_variants(self) -> int:
-        """Shares of variants and bends among the unknowns."""
-        return len(self.variants) + len(self.bends)
+        """Shares of variants, extra unknowns and bends among the unknowns."""
+        return len(self.variants) + len(self.extras) + len(self.bends)
+
+    def extras_found(self, state: State) -> tuple[FoundExtra, ...]:
+        """The extra unknowns at a state."""
+        first = len(self.variants)
+        return tuple(
+            FoundExtra(one, SHAPE + 1 + first + k, float(state.variant[first + k]))
+            for k, one in enumerate(self.extras)
+        )
+
+    def _changes(self, state: State) -> list[NDArray[np.float64]]:
+        """What one share of each extra unknown does to the zonal matrix, not weighted."""
+        here, w, first = Registration.from_array(state.alpha), 1.0 + state.width, len(self.variants)
+        return [one.per_share(here, w, float(state.variant[first + k])) for k, one in enumerate(self.extras)]
 
     def _shapes(self, state: State) -> _Shapes:
         """The zonal matrix of a state and what it is made of, weighted."""
@@ -140,6 +158,7 @@ class Problem:
         by_width = moved[5] * w
         by_shape = weigh(self.model.zonal_matrix(here, w * PEDESTAL)) - zonal
         variants = [weigh(v.zonal_matrix(here, w)) - zonal for v in self.variants]
+        variants += [weigh(change) for change in self._changes(state)]
         variants += [zonal @ bend for bend in self.bends]
         shaped = zonal + state.shape * by_shape + state.actuator_width * by_width
         for share, difference in zip(state.variant, variants, strict=True):
@@ -199,8 +218,10 @@ class Problem:
         zonal, moved = zonal_jacobian(self.model, here, w)
         shaped = zonal + state.actuator_width * moved[5] * w
         shaped += state.shape * (self.model.zonal_matrix(here, w * PEDESTAL) - zonal)
-        for share, variant in zip(state.variant, self.variants, strict=True):
-            shaped += share * (variant.zonal_matrix(here, w) - zonal)
+        changes = [variant.zonal_matrix(here, w) - zonal for variant in self.variants]
+        changes += self._changes(state)
+        for share, change in zip(state.variant, changes, strict=True):
+            shaped += share * change
         half = len(zonal) // 2
         shaped += state.sampling[self.lines, None] * np.concatenate([moved[0, :half], moved[1, half:]])
         return np.asarray(state.gain * (1 + state.slope_gain)[:, None] * shaped * (1 + state.actuator_gain))

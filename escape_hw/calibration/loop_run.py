@@ -16,6 +16,7 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.sensor import SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import LightWatch, next_frame, reachable
+from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.command_shape import shaper
 from escape_hw.pipeline.controller import Controller
 from escape_hw.pipeline.frame_stack import FrameStack
@@ -78,6 +79,22 @@ class LoopRecord:
     command: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
 
+def require_undiverged(record: LoopRecord) -> None:
+    """Refuse to go on with a loop that had to be opened.
+
+    Raises
+    ------
+    CalibrationError
+        It diverged; says what to do.
+    """
+    if record.diverged:
+        raise CalibrationError(
+            f"the loop diverged after {record.frames} frames and was opened: most actuators stood at "
+            "their limits. Lower loop.gain or raise loop.dropped_modes; if that does not help, the "
+            "matrix does not belong to this state of the bench, or the delay is longer than thought"
+        )
+
+
 class RunningLoop:
     """A loop that can be run in stretches without being opened between them.
 
@@ -115,6 +132,7 @@ class RunningLoop:
         science: bool = False,
     ) -> None:
         self.bench, self.control, self.slopes_of, self.record = bench, control, slopes_of, LoopRecord()
+        self.m2c = m2c
         self.timing = LoopTiming()
         self._shape_of, self._to_modes = shaper(m2c), np.linalg.pinv(m2c)
         self._light = LightWatch(bench.wfs.name, slopes_of.grid)

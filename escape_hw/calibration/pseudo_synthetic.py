@@ -15,6 +15,7 @@ from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix
 from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.extra_unknowns import extra_unknowns, family_of
 from escape_hw.calibration.found_mirror import found_jacobian
 
 
@@ -37,8 +38,13 @@ def pseudo_synthetic(
     matrix, sigma : ndarray, ``(n_slopes, n_modes)``
         The errors are those of registration, gain and the actuators' gains, propagated to first order.
     """
-    gain = estimate.gain.value
+    gain, width = estimate.gain.value, estimate.width.value
     unit, derivatives, unequal = found_jacobian(model, estimate, m2c)
+    apart = estimate.departures
+    acted = m2c if apart is None else (1 + apart.gain)[:, None] * m2c
+    for one in extra_unknowns(model, tuple(dict.fromkeys(map(family_of, estimate.extras)))):
+        share = estimate.extras[one.name].value / one.scatter
+        unit += share * (one.per_share(estimate.registration, width, share) @ acted)
     jacobian = gain * derivatives[:5]
     variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
     variance += np.square(unit * estimate.gain.sigma) + gain**2 * unequal

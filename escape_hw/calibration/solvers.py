@@ -19,6 +19,7 @@ from escape_hw.calibration.batches import BatchProblem
 from escape_hw.calibration.capture import capture, low_modes
 from escape_hw.calibration.covariance import Linearised
 from escape_hw.calibration.diagonal import DiagonalProblem
+from escape_hw.calibration.extra_unknowns import ExtraUnknown, FoundExtra
 from escape_hw.calibration.light import SMALL, LightFit, LightProblem
 from escape_hw.calibration.linearisation import Learned, Problem
 from escape_hw.calibration.misfit import Priors
@@ -43,6 +44,8 @@ class Descent:
         The measured matrix, the model, and which columns to fit.
     solver, learning_rate, max_iterations, priors
         As for :func:`~escape_hw.calibration.sprint.sprint`.
+    extras
+        What to fit beside the registration.
     """
 
     matrix: InteractionMatrix
@@ -52,6 +55,7 @@ class Descent:
     learning_rate: float
     max_iterations: int
     priors: Priors
+    extras: tuple[ExtraUnknown, ...] = ()
     history: list[SprintIteration] = field(default_factory=list)
     report: Reporter = field(init=False)
 
@@ -76,7 +80,8 @@ class Solution:
 
     ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``, ``learned`` what the data say about the
     scatter of the random effects, and ``departures`` those of the mirror, where there are any; ``scatter`` is
-    what is to be added to the covariance of the registration ``(5, 5)``.
+    what is to be added to the covariance of the registration ``(5, 5)``; ``extras`` is what was fitted beside
+    it.
     """
 
     system: Linearised
@@ -87,6 +92,7 @@ class Solution:
     zonal: Callable[[], NDArray[np.float64]]
     scatter: NDArray[np.float64] | None = None
     learned: Callable[[], Learned] | None = None
+    extras: tuple[FoundExtra, ...] = ()
     departures: MirrorDepartures | None = None
 
 
@@ -128,7 +134,7 @@ def solve(
         light = yield from _watched(LightProblem(weighted, model, rate, frozen).descend(start, most), descent)
     if descent.solver != "effects":
         return _of_light(light, model)
-    problem = Problem(weighted, model, descent.priors)
+    problem = Problem(weighted, model, descent.priors, extras=descent.extras)
     return (yield from _with_effects(problem, Registration.from_array(start), descent))
 
 
@@ -177,6 +183,7 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
     return Solution(
         system, state.alpha, state.gain, 1 + state.width, settled,
         lambda: problem.zonal(state), learned=lambda: problem.learned(state, system),
+        extras=problem.extras_found(state),
         departures=problem.departures(state, system),
     )  # fmt: skip
 

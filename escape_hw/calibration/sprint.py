@@ -9,7 +9,7 @@ batches, the original's gain for every mode and other variants can be had instea
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ParamSpec
 
@@ -26,6 +26,7 @@ from escape_hw.calibration.capture import EXPLAINED
 from escape_hw.calibration.covariance import sandwich
 from escape_hw.calibration.degeneracy import degeneracies
 from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.extra_unknowns import extra_unknowns
 from escape_hw.calibration.linearisation import GAIN, WIDTH, Learned
 from escape_hw.calibration.misfit import Priors
 from escape_hw.calibration.mode_choice import choose_modes
@@ -39,11 +40,12 @@ from escape_hw.config.models import (
     MODES_CHOICES,
     SOLVERS,
     Actuators,
+    Extra,
     Loss,
     ModesChoice,
     Solver,
 )
-from escape_hw.errors import CalibrationError, IncompatibleProduct
+from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 
 P = ParamSpec("P")
 
@@ -86,6 +88,7 @@ def fit_steps(
     priors: Priors | None = None,
     learn: bool = False,
     reach: bool = True,
+    also: Sequence[Extra] = (),
     actuators: Actuators = "found",
 ) -> Procedure[SprintFit]:
     """Registration, gain and their standard errors from an interaction matrix.
@@ -127,6 +130,8 @@ def fit_steps(
     reach
         Whether to come from afar first, low modes before high ones (:mod:`~.capture`). Without it the
         descent is from ``start`` alone, on all modes at once.
+    also
+        What to fit beside the registration (:mod:`~.extra_unknowns`), by the solver ``"effects"``.
     actuators
         ``"found"``: the estimate keeps what was found of every actuator, and a matrix made from it has it,
         too. ``"alike"``: it does not, and the matrix is that of the model's actuators. The fit is the same.
@@ -143,6 +148,8 @@ def fit_steps(
         Matrix and model have different actuators or sub-apertures.
     CalibrationError
         The matrix holds no signal.
+    ConfigError
+        The model does not know what is asked for in ``also``.
     ValueError
         A learning rate outside (0, 1]; no such solver, choice, loss or actuators.
     """
@@ -151,13 +158,21 @@ def fit_steps(
     _known("solver", solver, SOLVERS)
     _known("choice", choice, MODES_CHOICES)
     _known("loss", loss, LOSSES)
+    if also and solver != "effects":
+        raise ConfigError(
+            f"calibration.solver = '{solver}' fits gain and registration alone; what calibration.also "
+            "asks for takes solver = 'effects'"
+        )
     _known("actuators", actuators, ACTUATORS)
     begin = start or Registration()
     # The products are many and small.
     with hold_to_one_thread():
         columns = _columns(matrix, model, modes, choice, begin)
         _check(matrix, model, columns)
-        descent = Descent(matrix, model, columns, solver, learning_rate, max_iterations, priors or Priors())
+        extras = extra_unknowns(model, also)
+        descent = Descent(
+            matrix, model, columns, solver, learning_rate, max_iterations, priors or Priors(), extras
+        )
         weighted = WeightedMatrix.of(matrix, columns)
         found = yield from solve(descent, weighted, begin.to_array(), reach)
         if learn and found.learned is not None:
@@ -265,7 +280,9 @@ def _estimate(
     model, history = descent.model, tuple(descent.history)
     residual = found.system.residual
     covariance = sandwich(weighted, found.system, noise)
-    notes = degeneracies(covariance[: len(_NAMES), : len(_NAMES)], _NAMES[: len(covariance)])
+    named = {name: k for k, name in enumerate(_NAMES[: len(covariance)])}
+    named.update({one.unknown.name: one.place for one in found.extras})
+    notes = degeneracies(covariance[np.ix_([*named.values()], [*named.values()])], [*named])
     if found.scatter is not None:
         covariance[1:6, 1:6] += found.scatter
     if isinstance(model, DoubtfulModel):
@@ -301,4 +318,5 @@ def _estimate(
         tuple(warnings),
         notes,
         found.departures,
+        {one.unknown.name: one.measured(sigma) for one in found.extras},
     )

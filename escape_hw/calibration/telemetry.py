@@ -44,6 +44,11 @@ class Telemetry:
         return int(self.rows.shape[1] - self.n_slopes) // (2 if self.closed else 1)
 
     @property
+    def commands(self) -> NDArray[np.float32]:
+        """``(n_times, n_modes)``; in closed loop the controller's part and the poke together."""
+        return self.rows[:, self.n_slopes : self.n_slopes + self.n_modes]
+
+    @property
     def pokes(self) -> NDArray[np.float32]:
         """``(n_times, n_modes)``; in open loop these are the commands."""
         return self.rows[:, self.rows.shape[1] - self.n_modes :]

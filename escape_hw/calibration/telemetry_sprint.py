@@ -10,7 +10,8 @@ the second, the first becomes a matrix whose columns have equal and independent 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,8 @@ from escape_hw.api.procedure import Procedure
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.calibration.docrime import MOST_CORRELATED
-from escape_hw.calibration.fading_sums import LEAST, turned
+from escape_hw.calibration.fading_sums import turned
+from escape_hw.calibration.live_response import contradicts
 from escape_hw.calibration.misfit import Priors
 from escape_hw.calibration.sprint import fit_steps
 from escape_hw.calibration.telemetry import Telemetry
@@ -32,11 +34,13 @@ from escape_hw.calibration.whitening import (
     known_past,
     prediction_error_filter,
 )
-from escape_hw.config.models import Actuators, Loss, Solver
+from escape_hw.config.models import Actuators, Extra, Loss, Solver
 from escape_hw.errors import TooFewFrames
 
 #: Rounds of registration, response, whitener and scatter; a fifth changes nothing that matters.
 _ROUNDS = 4
+#: In closed loop the matrix that closes it stands behind the first round, and has to be forgotten.
+_CLOSED_ROUNDS = 6
 #: Whitened frames without which no noise level is worth stating.
 MIN_ROWS = 12
 #: Whitened frames at which the measured correlation of the slopes' noise counts half.
@@ -124,9 +128,11 @@ def telemetry_sprint(
     order: int,
     lags: int,
     start: Registration | None = None,
+    known: TemporalResponse | None = None,
     learning_rate: float = 1.0,
     solver: Solver = "effects",
     loss: Loss = "squares",
+    also: Sequence[Extra] = (),
     actuators: Actuators = "found",
 ) -> Procedure[TelemetryFit]:
     """Registration, gain and temporal response from a stretch of telemetry.
@@ -134,9 +140,11 @@ def telemetry_sprint(
     Parameters
     ----------
     data
-        From :func:`time_line`, with at least ``2 order + lags`` rows in front.
+        From :func:`time_line`, with at least ``2 order + lags`` rows in front; or of a closed loop, with
+        the commands of as many rows in front.
     frame
-        Any matrix of this sensor and basis: its mask, basis and provenance are used, its data are not.
+        A matrix of this sensor and basis: its mask, basis and provenance are used. Its data are used in
+        closed loop alone, where they are the one that closes it.
     model
         The synthetic model on the same sub-apertures.
     order
@@ -146,7 +154,9 @@ def telemetry_sprint(
         Frames over which the temporal response is estimated.
     start
         Where to start; from afar by default.
-    learning_rate, solver, loss, actuators
+    known
+        A temporal response to go on with for as long as the frames tell it no better.
+    learning_rate, solver, loss, also, actuators
         As for :func:`~escape_hw.calibration.sprint.sprint`; a solver that needs modes will not do.
 
     Raises
@@ -157,9 +167,9 @@ def telemetry_sprint(
         The slopes do not follow the pokes.
     """
     filters = [np.ones(1), np.array([1.0, -1.0])][: 2 if order else 1]
-    matrix: NDArray[np.float64] | None = None
+    matrix = frame.data.astype(np.float64) if data.closed else None
     priors, decided = Priors(), 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(_CLOSED_ROUNDS if data.closed else _ROUNDS):
         frames = _Whitened.of(data, filters, lags)
         n = len(frames.slopes)
         if n < MIN_ROWS:
@@ -167,22 +177,16 @@ def telemetry_sprint(
                 f"{n} whitened frames are too few for a registration; "
                 f"at least {MIN_ROWS + min(order, 1)} frames are needed, most of them in a row"
             )
-        response = _first_response(frames) if matrix is None else _response(frames, matrix)
-        slopes, seen = frames.slopes, frames.through(response.weights)
-        left = slopes if matrix is None else slopes - seen @ matrix.T
+        response = _first_response(frames) if matrix is None else _response(frames, matrix, known)
+        slopes = frames.slopes
+        left = slopes if matrix is None else slopes - frames.seen(response.weights) @ matrix.T
         freedom = max(n - 1 - decided / slopes.shape[1], 1.0)
         variance = np.square(left).sum(axis=0) / freedom
         covariance = _shrunk(left) if left.shape[1] <= MOST_CORRELATED else None
-        gram = seen.T @ seen
-        measured = replace(
-            frame,
-            data=(slopes.T @ seen @ np.linalg.pinv(gram, rcond=LEAST, hermitian=True)).astype(np.float32),
-            sigma=np.zeros(frame.data.shape, np.float32),
-        )
-        columns = independent_columns(measured, gram, variance)
         fit = yield from fit_steps(
-            columns, model, solver=solver, loss=loss, start=start, learning_rate=learning_rate,
-            covariance=covariance, priors=priors, reach=start is None, actuators=actuators,
+            frames.columns(frame, response.weights, matrix, variance), model,
+            solver=solver, loss=loss, start=start, learning_rate=learning_rate,
+            covariance=covariance, priors=priors, reach=start is None, also=also, actuators=actuators,
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal() @ frame.m2c
@@ -196,9 +200,13 @@ def telemetry_sprint(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Whitened:
-    """Whitened slopes ``(n, n_slopes)`` and pokes by lag ``(lags, n, n_modes)``, constants taken out."""
+    """Whitened slopes ``(n, n_slopes)``, commands and pokes by lag ``(lags, n, n_modes)``, without constants.
+
+    In open loop the commands are the pokes.
+    """
 
     slopes: NDArray[np.float64]
+    commands: NDArray[np.float64]
     pokes: NDArray[np.float64]
 
     @classmethod
@@ -212,11 +220,33 @@ class _Whitened:
             rows = filter_by_past(values, filters, past)
             return np.asarray(rows - constant @ (constant.T @ rows))
 
-        return cls(white(data.slopes), np.stack([white(delayed(data.pokes, lag)) for lag in range(lags)]))
+        def by_lag(values: NDArray[np.floating]) -> NDArray[np.float64]:
+            return np.stack([white(delayed(values, lag)) for lag in range(lags)])
 
-    def through(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pokes as the slopes saw them ``(n, n_modes)``."""
-        return np.asarray(np.tensordot(response, self.pokes, axes=1))
+        commands = by_lag(data.commands)
+        return cls(white(data.slopes), commands, by_lag(data.pokes) if data.closed else commands)
+
+    def seen(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Commands as the slopes saw them ``(n, n_modes)``."""
+        return np.asarray(np.tensordot(response, self.commands, axes=1))
+
+    def columns(
+        self,
+        frame: InteractionMatrix,
+        response: NDArray[np.float64],
+        matrix: NDArray[np.float64] | None,
+        variance: NDArray[np.float64],
+    ) -> InteractionMatrix:
+        """What the frames say of the matrix, in columns with equal and independent noise.
+
+        In closed loop the pokes are the instruments of the commands, and what the best matrix makes of
+        the controller's part is taken out beforehand (:mod:`~.fading_sums`).
+        """
+        seen, poked = self.seen(response), np.tensordot(response, self.pokes, axes=1)
+        gram, cross = poked.T @ poked, self.slopes.T @ poked
+        if matrix is not None and self.commands is not self.pokes:
+            cross = cross - matrix @ (seen.T @ poked - gram)
+        return turned(frame, cross, gram, gram, variance)
 
 
 def delayed(pokes: NDArray[np.floating], lag: int) -> NDArray[np.floating]:
@@ -228,7 +258,7 @@ def _unexplained(
     data: Telemetry, matrix: NDArray[np.float64], response: TemporalResponse
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """What a matrix leaves of the slopes ``(n_times, n_slopes)``, and which rows are there."""
-    seen = sum(weight * delayed(data.pokes, lag) for lag, weight in enumerate(response.weights))
+    seen = sum(weight * delayed(data.commands, lag) for lag, weight in enumerate(response.weights))
     left = data.slopes - np.asarray(seen) @ matrix.T
     return (left - left[data.present].mean(axis=0)).astype(np.float32), data.present
 
@@ -241,21 +271,31 @@ def _first_response(frames: _Whitened) -> TemporalResponse:
     return TemporalResponse(weights, np.ones(len(power)))
 
 
-def _response(frames: _Whitened, matrix: NDArray[np.float64]) -> TemporalResponse:
-    """Weights of the lags from what a matrix predicts, scaled to sum 1, with errors by frames."""
-    predicted = frames.pokes @ matrix.T
+def _response(
+    frames: _Whitened, matrix: NDArray[np.float64], known: TemporalResponse | None
+) -> TemporalResponse:
+    """Weights of the lags from what a matrix predicts, scaled to sum 1, with errors by frames.
+
+    In closed loop what the pokes alone make are the instruments of what the commands make. A known
+    response stays while its errors are smaller and nothing speaks against it.
+    """
+    predicted = frames.commands @ matrix.T
+    poked = predicted if frames.commands is frames.pokes else frames.pokes @ matrix.T
     lags = len(predicted)
-    flat = predicted.reshape(lags, -1)
-    bread = np.linalg.inv(flat @ flat.T)
-    weights = bread @ (flat @ frames.slopes.ravel())
+    flat, by_pokes = predicted.reshape(lags, -1), poked.reshape(lags, -1)
+    bread = np.linalg.inv(by_pokes @ flat.T)
+    weights = bread @ (by_pokes @ frames.slopes.ravel())
     left = frames.slopes - np.tensordot(weights, predicted, axes=1)
     # Neighbouring slopes err together, whitened frames do not.
-    scores = np.einsum("lts,ts->lt", predicted, left)
+    scores = np.einsum("lts,ts->lt", poked, left)
     total = float(weights.sum())
     weights = weights / total
     scaled = (np.eye(lags) - weights[:, None]) @ bread / total
     covariance = scaled @ (scores @ scores.T) @ scaled.T
-    return TemporalResponse(weights, np.sqrt(np.diag(covariance)))
+    measured = TemporalResponse(weights, np.sqrt(np.diag(covariance)))
+    if known is not None and known.sigma.max() < measured.sigma.max() and not contradicts(measured, known):
+        return known
+    return measured
 
 
 def _shrunk(residuals: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -60,6 +60,7 @@ def calibrate(
     solver: options.Solver = None,
     modes_choice: options.ModesChoice = None,
     loss: options.Loss = None,
+    also: options.Also = None,
     resume: Annotated[
         Path | None,
         typer.Option("--resume", metavar="RUN", help="Go on with a run that was broken off (its folder)."),
@@ -84,6 +85,7 @@ def calibrate(
         request = CalibrationRequest.of(asked, resume)
         changes: dict[str, object] = {
             "pokes": pokes, "solver": solver, "modes_choice": modes_choice, "loss": loss,
+            "also": options.listed(also),
         }  # fmt: skip
         task = CalibrationTask(request, resume=resume, force=force, settings=changes)
         choice = options.Choice.of(_system(system, resume), set, seed, mode)

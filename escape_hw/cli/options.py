@@ -31,6 +31,21 @@ Solver = Annotated[
         "--solver", help="SPRINT: effects, light, frozen, batches or diagonal (default: configured)."
     ),
 ]
+Also = Annotated[
+    str | None,
+    typer.Option(
+        "--also", help="What SPRINT fits beside the registration: anamorphosis, pupil_shift (comma between)."
+    ),
+]
+
+
+def listed(names: str | None) -> str | None:
+    """Names with commas between them as a list for an override; ``None`` stays."""
+    if names is None:
+        return None
+    return str([name.strip() for name in names.split(",") if name.strip()])
+
+
 ModesChoice = Annotated[
     str | None,
     typer.Option("--modes-choice", help="SPRINT's modes: snr, first, d-optimal or a-optimal."),

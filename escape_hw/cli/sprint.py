@@ -22,6 +22,7 @@ def sprint(
     solver: options.Solver = None,
     modes_choice: options.ModesChoice = None,
     loss: options.Loss = None,
+    also: options.Also = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -30,7 +31,7 @@ def sprint(
         from escape_hw.runtime.sprint_task import SprintTask
 
         choice = options.Choice.of(system, set, seed, mode).calibrating(
-            solver=solver, modes_choice=modes_choice, loss=loss
+            solver=solver, modes_choice=modes_choice, loss=loss, also=options.listed(also)
         )
         config = one.configured(choice)
         task = SprintTask(im)

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from escape_hw.config.device_models import DeviceConfig, DevicesConfig, Mode
 from escape_hw.config.modulator_models import with_tilt
-from escape_hw.config.section import Breach, Section, enforce
+from escape_hw.config.section import Breach, Listed, Section, enforce
 from escape_hw.config.sensor_models import AnySensor, PyramidSection, SensorSection
 from escape_hw.config.server_models import ServerSection
 from escape_hw.config.telescope_models import TelescopeSection
@@ -34,6 +34,7 @@ SOLVERS: tuple[str, ...] = get_args(Solver)
 ModesChoice = Literal["snr", "first", "d-optimal", "a-optimal"]
 #: How SPRINT chooses its modes.
 MODES_CHOICES: tuple[str, ...] = get_args(ModesChoice)
+Extra = Literal["anamorphosis", "pupil_shift"]
 Loss = Literal["squares", "huber"]
 #: What SPRINT minimises.
 LOSSES: tuple[str, ...] = get_args(Loss)
@@ -148,6 +149,11 @@ class CalibrationSection(Section):
     )
     loss: Loss = Field(
         "squares", description="SPRINT: 'squares', or 'huber' where some sub-apertures are not to be trusted"
+    )
+    also: Listed[tuple[Extra, ...]] = Field(
+        (),
+        description="SPRINT: what to fit beside the registration: 'anamorphosis' (shear of the mirror), "
+        "'pupil_shift' (of a pyramid's images since they were found)",
     )
     learning_rate: float = Field(1.0, gt=0, le=1, description="SPRINT: share of each step that is taken")
     model: str = Field(

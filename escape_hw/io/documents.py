@@ -75,6 +75,7 @@ def registration_document(estimate: RegistrationEstimate | None) -> dict[str, An
         "gain": estimate.gain.value,
         "gain_sigma": estimate.gain.sigma,
         "width": estimate.width.to_dict(),
+        "extras": {name: value.to_dict() for name, value in estimate.extras.items()},
         "iterations": len(estimate.iterations),
         "converged": estimate.converged,
         "chi2": estimate.chi2,

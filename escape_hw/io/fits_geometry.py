@@ -70,6 +70,7 @@ def _pack_lenslets(geometry: SensorGeometry) -> _Packed:
         "ORIGINX": float(grid.origin_px[0]),
         "ORIGINY": float(grid.origin_px[1]),
         "MOTION": float(grid.motion_px),
+        "AIR": float(grid.air_px),
     }
     return grid.references_px, cards, []
 
@@ -83,6 +84,8 @@ def _unpack_lenslets(
         origin_px=(float(header["ORIGINX"]), float(header["ORIGINY"])),
         references_px=references,
         motion_px=float(header["MOTION"]),
+        # Products of earlier versions have none.
+        air_px=float(header.get("AIR", 0.0)),
         **common,
     )
 

@@ -70,11 +70,11 @@ def unpack_response(path: Path, hdus: fits.HDUList) -> TemporalResponse | None:
 
 def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
     """Parameters with errors, their covariance, and the iterations that led there."""
-    rows = [*estimate.measured().values(), estimate.gain, estimate.width]
+    rows = [*estimate.measured().values(), estimate.gain, estimate.width, *estimate.extras.values()]
     alpha = fits_file.table(
         "ALPHA",
         {
-            "NAME": np.array([*PARAMETERS, "gain", "width"]),
+            "NAME": np.array([*PARAMETERS, "gain", "width", *estimate.extras]),
             "VALUE": np.array([row.value for row in rows]),
             "SIGMA": np.array([row.sigma for row in rows]),
             "UNIT": np.array([fits_file.plain(row.unit) for row in rows]),
@@ -125,6 +125,7 @@ def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate 
         return None
     value, sigma = _column(hdus, "ALPHA", "VALUE"), _column(hdus, "ALPHA", "SIGMA")
     units = [str(unit) for unit in hdus["ALPHA"].data["UNIT"]]
+    names = [str(name) for name in hdus["ALPHA"].data["NAME"]]
     notes = unpack_metrics(path, hdus, "ALPHANOT")
     fits_file.need(path, hdus, "SPRINT")
     columns = [_column(hdus, "SPRINT", name.upper()) for name in PARAMETERS]
@@ -149,6 +150,9 @@ def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate 
         warnings=tuple(str(note) for note in notes["warnings"]),
         # Products of earlier versions have none.
         notes=tuple(str(note) for note in notes.get("notes", ())),
+        extras={
+            names[k]: Measured(float(value[k]), float(sigma[k]), units[k]) for k in range(n + 2, len(names))
+        },
         departures=_unpack_departures(hdus),
     )
 

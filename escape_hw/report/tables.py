@@ -32,6 +32,9 @@ TITLES = {
     "rotation": ("Rotation", "deg"),
     "radial_scaling": ("Radial Scaling", "% of Diameter"),
     "tangential_scaling": ("Tangential Scaling", "% of Diameter"),
+    "anamorphosis": ("Anamorphosis", "% of Diameter"),
+    "pupil_shift_x": ("Pupil Shift X", "% of Sub Aperture"),
+    "pupil_shift_y": ("Pupil Shift Y", "% of Sub Aperture"),
 }
 
 
@@ -84,17 +87,22 @@ def registration_table(
             headings.append("Δ / σ")
     if planted is not None:
         headings.append("planted")
+    truth: dict[str, float] = {}
+    if planted is not None:
+        straight, shear = planted.along_axes
+        truth = {**straight.to_dict(), "anamorphosis": shear}
+    extras = [name for name in TITLES if any(name in estimate.extras for estimate in estimates.values())]
     rows = []
-    for name in PARAMETERS:
+    for name in (*PARAMETERS, *extras):
         title, unit = TITLES[name]
         row = [f"{title} [{unit}]"]
         for estimate in estimates.values():
-            value = estimate.measured()[name]
-            row.append(with_error(value))
+            value = {**estimate.measured(), **estimate.extras}.get(name)
+            row.append("–" if value is None else with_error(value))
             if planted is not None:
-                row.append(_pull(value, getattr(planted, name)))
+                row.append("–" if value is None or name not in truth else _pull(value, truth[name]))
         if planted is not None:
-            row.append(f"{getattr(planted, name):g}".replace("-", "−"))
+            row.append(f"{truth[name]:g}".replace("-", "−") if name in truth else "–")
         rows.append(tuple(row))
     return Table(tuple(headings), tuple(rows))
 

@@ -84,6 +84,7 @@ class SprintTask:
             loss=settings.loss,
             actuators=settings.actuators,
             learning_rate=settings.learning_rate,
+            also=settings.also,
         )
         return replace(product.result, matrix=measured, measured=None, registration=estimate)
 

@@ -157,6 +157,7 @@ class System(LoopBench):
             loss=settings.loss,
             actuators=settings.actuators,
             learning_rate=settings.learning_rate,
+            also=settings.also,
         )
 
 

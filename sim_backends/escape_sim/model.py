@@ -111,6 +111,11 @@ class ShackHartmannModel:
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
+        if registration.anamorphosis_angle:
+            # A slanted Gaussian has no factors along x and y.
+            at = self._slopes.nodes_m
+            surfaces = self._influence(width).surfaces(registration, self.sub_aperture_m, at, at)
+            return np.asarray(self._slopes.slopes(np.moveaxis(surfaces, 0, 2).copy()) * self._metres)
         factors = self._factors(registration, width, np.float64)
         return np.asarray(self._slopes.zonal(factors)[0] * self._metres)
 

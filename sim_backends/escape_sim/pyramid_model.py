@@ -152,6 +152,11 @@ class PyramidModel:
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`; single precision."""
+        if registration.anamorphosis_angle:
+            # A slanted Gaussian has no factors along x and y.
+            at = self._nodes
+            surfaces = self._influence(width).surfaces(registration, self.sub_aperture_m, at, at)
+            return self._slopes(np.moveaxis(surfaces, 0, 2))
         factors = self._factors(registration, width)
         return self._slopes(np.einsum("ya,xa->yxa", factors.along_y[0], factors.along_x[0]))
 
@@ -181,6 +186,12 @@ class PyramidModel:
         # By the place along x and y, and by the logarithm of the width along either.
         by = np.concatenate([factors.place, np.repeat(factors.spread[:, :, None], self.n_act, 2)], axis=1)
         return parts[0], np.einsum("pka,ksa->psa", by, np.stack(parts[1:]), optimize=True)
+
+    def with_pupil_shift(self, shift_x: float, shift_y: float) -> PyramidModel:
+        """The same air and the same mirror behind shifted images, see :class:`MovablePupil`."""
+        by = np.array([shift_x, shift_y]) / 100 * self._pupils.diameter_px / self._pupil.n_sub
+        pupils = replace(self._pupils, centres_px=self._pupils.centres_px + by)
+        return PyramidModel(self._config, pupils, modulation=self._modulation, turbulence=self.turbulence)
 
     def variants(self) -> list[PyramidModel]:
         """The sensor under stronger turbulence, with an oval modulation, and with misplaced images."""

@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 
 #: Steps (rows down, columns right) from a window to the lenslets whose light it sees.
 STEPS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
+#: Shapes of the wavefront within a lenslet that turbulence is made of there; the rest is a thousandth.
+_SHAPES = 14
+#: Variance of a spot's motion along an axis for a lenslet as wide as r0, in (lambda / d)^2 (Fried 1975).
+_MOTION = 0.17
+#: Outer scale of the turbulence in pupil diameters.
+_OUTER_SCALE = 4.0
 #: Nodes of the average over spot motion, and the step of their lattice: neighbouring Fibonacci numbers.
 _NODES, _STEP = 34, 21
 
@@ -34,7 +40,9 @@ def slope_weights(
     Pixels below the threshold drop out of both sums, and the threshold is subtracted from those
     above. Which pixels these are changes as the spot moves, so the derivative is averaged over a
     Gaussian motion of the spots of ``grid.motion_px`` rms along each axis; without the average the
-    response would depend on how each lenslet happens to fall on the pixels.
+    response would depend on how each lenslet happens to fall on the pixels. And it is averaged over what
+    turbulence there is within a lenslet (:func:`lenslet_turbulence`), which lifts the wings of the spots
+    above the threshold: without it more of them would seem cut off, and scalings come out too small.
 
     Parameters
     ----------
@@ -52,9 +60,12 @@ def slope_weights(
     """
     views = _Views(config, grid, pupil)
     moves = grid.motion_px * gaussian_lattice() if grid.motion_px else np.zeros((1, 2))
+    blur = np.zeros((len(moves), pupil.n_pix, pupil.n_pix))
+    if grid.motion_px and grid.air_px:
+        blur = np.sqrt(_strength(config, grid)) * lenslet_turbulence(pupil.n_pix)
     out = {step: np.zeros((2, grid.n_valid, pupil.n_pix, pupil.n_pix)) for step in STEPS}
-    for dx, dy in moves.tolist():
-        views.accumulate(out, dx, dy, 1 / len(moves))
+    for (dx, dy), phase in zip(moves.tolist(), blur, strict=True):
+        views.accumulate(out, dx, dy, phase, 1 / len(moves))
     wave = 2 * np.pi / config.system.wavelength_m
     return {step: block * wave for step, block in out.items()}
 
@@ -72,6 +83,43 @@ def gaussian_lattice() -> NDArray[np.float64]:
     paired = (i * _STEP + (_STEP - 1) // 2) % _NODES
     places = ndtri((np.stack([i, paired], axis=1) + 0.5) / _NODES)
     return np.asarray(places / places.std(axis=0))
+
+
+def lenslet_turbulence(samples: int) -> NDArray[np.float64]:
+    """Wavefronts within a square lenslet as wide as r0, without piston and tilt, in radians.
+
+    Kolmogorov turbulence of structure function ``6.88 (r / r0)^(5/3)``, one wavefront for each place of
+    :func:`gaussian_lattice`: its shapes are independent of one another and of the places, and opposite places
+    have wavefronts turned by half a turn, so that on the whole no side of the lenslet is preferred.
+
+    Parameters
+    ----------
+    samples
+        Across the lenslet.
+
+    Returns
+    -------
+    ndarray, ``(n_places, samples, samples)``
+    """
+    u = (np.arange(samples) - (samples - 1) / 2) / samples
+    x, y = (at.ravel() for at in np.meshgrid(u, u))
+    apart = np.hypot(x[:, None] - x, y[:, None] - y)
+    tilts = np.linalg.qr(np.stack([np.ones_like(x), x, y], axis=1))[0]
+    rest = np.eye(x.size) - tilts @ tilts.T
+    power, shapes = np.linalg.eigh(rest @ (-0.5 * 6.88 * apart ** (5 / 3)) @ rest)
+    half = gaussian_lattice()[: _NODES // 2]
+    drawn = np.random.default_rng(5).standard_normal((len(half), _SHAPES))
+    drawn = np.linalg.qr(np.concatenate([half, drawn], axis=1))[0][:, 2:] * np.sqrt(len(half))
+    made = (drawn * np.sqrt(power[-_SHAPES:])) @ shapes[:, -_SHAPES:].T
+    first = made.reshape(-1, samples, samples)
+    return np.concatenate([first, first[::-1, ::-1, ::-1]])
+
+
+def _strength(config: SystemConfig, grid: SubApertureGrid) -> float:
+    """``(d / r0)^(5/3)`` of the turbulence on a lenslet, from how far the air moves its spot."""
+    sensor = config.sensor_as(ShackHartmannSection)
+    large = 1 - (1 / (_OUTER_SCALE * sensor.n_sub)) ** (1 / 3)
+    return float((grid.air_px / sensor.spot_px) ** 2 / (_MOTION * large))
 
 
 class _Views:
@@ -130,15 +178,21 @@ class _Views:
         return matrix.astype(self._complex)
 
     def accumulate(
-        self, out: dict[tuple[int, int], NDArray[np.float64]], dx: float, dy: float, share: float
+        self,
+        out: dict[tuple[int, int], NDArray[np.float64]],
+        dx: float,
+        dy: float,
+        phase: NDArray[np.float64],
+        share: float,
     ) -> None:
-        """Add ``share`` times the derivatives with all spots moved by ``(dx, dy)`` pixels."""
+        """Add ``share`` times the derivatives, spots moved by ``(dx, dy)`` pixels and blurred by a phase."""
+        blur = np.exp(1j * phase).astype(self._complex)
         tilt = [np.exp(2j * np.pi * d * self._samples / self._spot).astype(self._complex) for d in (dy, dx)]
         fields = {}
         image = np.zeros(self._inside.shape, self._real)
         for step in STEPS:
             fy, fx = self._along[step]
-            amplitude = self._blocks[step] * tilt[0].conj()[:, None] * tilt[1].conj()[None, :]
+            amplitude = self._blocks[step] * (tilt[0].conj()[:, None] * tilt[1].conj()[None, :] * blur)
             e = np.matmul(np.matmul(fy.transpose(0, 2, 1), amplitude), fx)
             image += e.real**2 + e.imag**2
             fields[step] = (amplitude, e)

@@ -15,7 +15,7 @@ from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geomet
 from escape_sim.influence import InfluenceFunctions
 from escape_sim.model import ShackHartmannModel, nominal_grid
 from escape_sim.shack_hartmann import ShackHartmannOptics
-from escape_sim.slope_weights import STEPS, slope_weights
+from escape_sim.slope_weights import STEPS, gaussian_lattice, lenslet_turbulence, slope_weights
 
 MOVED = Registration(35.0, -22.0, 1.3, 1.5, -2.0)
 #: Commands of the finite differences: spots move by a few hundredths of a pixel.
@@ -184,3 +184,44 @@ def test_a_grid_of_another_size_is_refused(config):
     grid = nominal_grid(config)
     with pytest.raises(ValueError, match="23"):
         ShackHartmannModel(config, replace(grid, valid=grid.valid[:23, :23]))
+
+
+def test_turbulence_within_a_lenslet_has_no_side_and_kolmogorovs_variance():
+    phases = lenslet_turbulence(8)
+    places = gaussian_lattice()
+    np.testing.assert_allclose(phases[::-1, ::-1, ::-1], phases, atol=1e-12)
+    u = np.linspace(-1, 1, 8)
+    flat = phases.reshape(len(phases), -1)
+    for shape in (np.ones((8, 8)), np.broadcast_to(u, (8, 8)), np.broadcast_to(u[:, None], (8, 8))):
+        np.testing.assert_allclose(flat @ shape.ravel(), 0, atol=1e-10)
+    # Noll (1976): 0.134 rad^2 are left without piston and tilt on a round aperture; a square one has corners.
+    assert 0.12 < np.square(phases).mean() < 0.16
+    # Where a spot stands says nothing about the wavefront within its lenslet.
+    half = len(places) // 2
+    np.testing.assert_allclose(places[:half].T @ flat[:half], 0, atol=1e-9)
+
+
+def test_a_blurred_spot_follows_a_tilt_as_a_sharp_one_does():
+    """Turbulence within the lenslets changes what happens there, not how spots move as a whole."""
+    config = load_system("razor-shwfs", overrides=["sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]"])
+    grid = replace(nominal_grid(config), counts=2500.0, motion_px=0.9)
+    pupil = pupil_geometry(config)
+    still, blurred = (slope_weights(config, replace(grid, air_px=air), pupil) for air in (0.0, 0.7))
+    near = np.abs(blurred[0, 0] - still[0, 0]).max() / np.abs(still[0, 0]).max()
+    # It changes the answer, and not by much.
+    assert 0.01 < near < 1
+    # A tilt of the whole wavefront moves every spot as it does without turbulence, or nearly.
+    x = np.tile(pupil.coordinates_m, (pupil.coordinates_m.size, 1))
+    tilt = x.reshape(pupil.n_sub, pupil.n_pix, pupil.n_sub, pupil.n_pix).transpose(0, 2, 1, 3)
+    inner = np.zeros_like(grid.valid)
+    inner[4:8, 4:8] = True
+    rows, columns = np.nonzero(grid.valid)
+
+    def response(weights):
+        total = np.zeros(rows.size)
+        for (down, right), block in weights.items():
+            i, j = np.clip(rows + down, 0, 11), np.clip(columns + right, 0, 11)
+            total += np.einsum("spq,spq->s", block[0], tilt[i, j])
+        return total[inner[grid.valid]]
+
+    np.testing.assert_allclose(response(blurred), response(still), rtol=0.15)

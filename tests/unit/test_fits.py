@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from escape_hw.api.results import Measured
 from escape_hw.errors import IncompatibleProduct, ProductError, StorageError
 from escape_hw.io import fits_file, provenance, storage
 from escape_hw.io.fits import load_matrix, save_matrix
@@ -69,6 +70,7 @@ def test_matrix_comes_back_as_it_was(tmp_path):
     steps = [[dataclasses.asdict(step) for step in r.registration.iterations] for r in (product, result)]
     assert steps[0] == steps[1]
     assert product.registration.warnings == result.registration.warnings
+    assert product.registration.extras == {}
     np.testing.assert_array_equal(product.registration.covariance, result.registration.covariance)
     mirrors = [dataclasses.asdict(r.registration.departures) for r in (product, result)]
     np.testing.assert_equal(*mirrors)
@@ -79,6 +81,17 @@ def test_matrix_comes_back_as_it_was(tmp_path):
     assert product.result.notes == result.notes
     assert product.config_text == CONFIG
     assert product.sha256 == provenance.sha256_of(path)
+
+
+def test_what_was_fitted_beside_the_registration_comes_back(tmp_path):
+    extras = {
+        "anamorphosis": Measured(1.5, 0.1, "% of the diameter"),
+        "pupil_shift_x": Measured(-3.0, 2.0, "% of a sub-aperture"),
+    }
+    plain = fake.calibration("escape")
+    registration = dataclasses.replace(plain.registration, extras=extras)
+    path = save_matrix(tmp_path / "im.fits", dataclasses.replace(plain, registration=registration), ORIGIN)
+    assert load_matrix(path).registration.extras == extras
 
 
 def test_header_tells_the_origin(saved):

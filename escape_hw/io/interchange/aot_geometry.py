@@ -48,6 +48,7 @@ def facts_of(geometry: SensorGeometry) -> dict[str, float | str]:
         "ORIGINX": float(grid.origin_px[0]),
         "ORIGINY": float(grid.origin_px[1]),
         "MOTION": float(grid.motion_px),
+        "AIR": float(grid.air_px),
     }
 
 
@@ -95,6 +96,7 @@ def lenslets(
         flux=flux,
         counts=float(facts.get("COUNTS", 0.0)),
         motion_px=float(facts.get("MOTION", 0.0)),
+        air_px=float(facts.get("AIR", 0.0)),
         background=float(facts.get("BACKGND", 0.0)),
     )
 

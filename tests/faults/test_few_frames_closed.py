@@ -1,0 +1,94 @@
+"""The registration from a tenth of a second of a running loop: right over seeds, refusals in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_bench import PLANTED, assert_flat, small
+
+from escape_hw.calibration.escape import escape
+from escape_hw.errors import Aborted, CalibrationError, TooFewFrames
+
+SEEDS = range(4)
+#: Fewer than a matrix of 30 modes takes (82).
+FRAMES = 50
+
+
+def measured(closing, *more, seed=1, frames=FRAMES, poke=0.02, **options):
+    with small(*more) as bench:
+        bench.rng = np.random.default_rng(seed)
+        try:
+            return bench.run(escape(bench, frames=frames, poke=poke, closing=closing, **options))
+        finally:
+            assert_flat(bench)
+
+
+@pytest.fixture(scope="module")
+def closing(good):
+    return good.run.result
+
+
+def pull(found) -> np.ndarray:
+    return (found.registration.registration.to_array() - PLANTED) / found.registration.sigma
+
+
+@pytest.mark.parametrize(
+    "name", ["as it is", "lost frames", "vibration", "a matrix half as large", "commands cut by the limits"]
+)
+def test_right_within_its_errors_whatever_the_loop_does(closing, name):
+    more = {
+        "lost frames": ["twin.loss_probability=0.03"],
+        "vibration": ["twin.vibration.amplitude_rad=[6e-5]", "twin.vibration.frequency_hz=[31.0]"],
+        "commands cut by the limits": ["devices.dm.limits.max_stroke=0.2"],
+    }.get(name, [])
+    if name == "a matrix half as large":
+        closing = replace(closing, matrix=replace(closing.matrix, data=closing.matrix.data / 2))
+    pulls = []
+    for seed in SEEDS:
+        found = measured(closing, *more, seed=seed)
+        assert found.registration.converged, found.registration.warnings
+        assert found.measured is None
+        assert found.matrix.metrics["frames"] == FRAMES
+        assert (found.matrix.metrics["shortened"] > 0) == (name == "commands cut by the limits")
+        pulls.append(pull(found))
+    assert np.abs(pulls).max() < 5
+    assert np.mean(np.square(pulls)) < 3
+
+
+def test_smaller_pokes_and_more_frames_give_larger_errors_and_smaller_ones(closing):
+    strong, weak = measured(closing), measured(closing, poke=0.004)
+    assert (weak.registration.sigma[:3] > 1.5 * strong.registration.sigma[:3]).all()
+    assert np.abs(pull(weak)).max() < 5
+
+
+def test_it_is_the_answer_of_the_frames_and_not_of_the_matrix_that_closes_the_loop(closing, good):
+    """A closing matrix for a mirror that stands elsewhere, and says so: the answer is the same."""
+    from escape_hw.api.registration import Registration
+    from escape_hw.calibration.derivatives import modal_matrix
+
+    moved = PLANTED + np.array([15.0, -15.0, 0.3, 0.5, -0.5])
+    m2c = closing.matrix.m2c
+    gain = np.linalg.norm(closing.matrix.data) / np.linalg.norm(
+        modal_matrix(good.model, Registration.from_array(PLANTED), m2c)
+    )
+    wrong = gain * modal_matrix(good.model, Registration.from_array(moved), m2c)
+    found = measured(replace(closing, matrix=replace(closing.matrix, data=wrong.astype(np.float32))))
+    assert np.abs(pull(found)).max() < 4.5
+
+
+def test_what_is_refused_and_what_ends_it(closing):
+    with small() as bench:
+        with pytest.raises(TooFewFrames, match="at least 13 frames"):
+            bench.run(escape(bench, frames=12, closing=closing))
+        assert bench.dm.sent_count == 0
+    with pytest.raises(CalibrationError, match="diverged"):
+        measured(replace(closing, matrix=replace(closing.matrix, data=-closing.matrix.data)), frames=80)
+    with small() as bench:
+        running = escape(bench, frames=60, closing=closing)
+        for _ in range(3):
+            next(running)
+        with pytest.raises(Aborted, match="too few for a registration"):
+            running.throw(Aborted("stop"))
+        assert_flat(bench)

@@ -1,0 +1,71 @@
+"""A tenth of a second in open loop on a bench that is not well: right within the errors, or refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_bench import PLANTED, assert_flat, small
+
+from escape_hw.calibration.escape import escape
+from escape_hw.errors import CalibrationError
+
+FRAMES, SEEDS = 50, (1, 2, 3)
+FAULTS = {
+    "lost frames": ["twin.loss_probability=0.1"],
+    "vibration": ["twin.vibration.amplitude_rad=[6e-5]", "twin.vibration.frequency_hz=[31.0]"],
+    "clipped pokes": ["devices.dm.limits.max_stroke=0.05"],
+    "dead actuators that nobody knows": [],
+    "disabled actuators": ["devices.dm.limits.disabled=[3,18]"],
+}
+
+
+def measured(*more: str, seed: int, dead: tuple[int, ...] = ()):
+    with small(*more) as bench:
+        bench.rng = np.random.default_rng(seed)
+        real = bench.dm._send
+
+        def send(command):
+            reached = command.copy()
+            reached[list(dead)] = 0.0
+            real(reached)
+
+        bench.dm._send = send
+        try:
+            return bench.run(escape(bench, frames=FRAMES))
+        finally:
+            assert_flat(bench)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_right_within_its_errors(name):
+    pulls = []
+    for seed in SEEDS:
+        found = measured(*FAULTS[name], seed=seed, dead=(18, 25) if "dead" in name else ())
+        assert found.registration.converged, found.registration.warnings
+        if name == "clipped pokes":
+            assert found.matrix.metrics["shortened"] > FRAMES / 2
+        pulls.append((found.registration.registration.to_array() - PLANTED) / found.registration.sigma)
+    assert np.abs(pulls).max() < 5
+    assert np.mean(np.square(pulls)) < 4
+
+
+def refused_or_not_converged(*more: str, seed: int) -> bool:
+    try:
+        registration = measured(*more, seed=seed).registration
+    except CalibrationError as error:
+        return "noise" in str(error)
+    return not registration.converged and bool(registration.warnings)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("twin.latency_s=0.006", "calibration.lags=3"),
+        ("twin.latency_s=0.006",),
+        ("devices.dm.stroke_m=1e-12",),
+    ],
+    ids=["answers after all lags", "answers with the last lag", "does not answer"],
+)
+def test_no_calibration_comes_of_it(more):
+    for seed in SEEDS[:2]:
+        assert refused_or_not_converged(*more, seed=seed)

@@ -1,0 +1,141 @@
+"""What SPRINT fits beside the registration, against planted truths: there, and not there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_pyramid import configuration as small_pyramid
+from small_system import configuration as small_lenslets
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.pseudo_synthetic import pseudo_synthetic
+from escape_hw.calibration.sprint import sprint
+from escape_hw.errors import ConfigError
+from escape_hw.runtime.system import System
+from escape_sim.model import make_model
+
+SEEDS = range(6)
+SHEAR = 1.5
+SYSTEMS = {"lenslets": small_lenslets, "pyramid": small_pyramid}
+
+
+@pytest.fixture(scope="module", params=SYSTEMS)
+def model(request):
+    return make_model(SYSTEMS[request.param](), None)
+
+
+def plant(seed: int) -> Registration:
+    rng = np.random.default_rng(seed)
+    return Registration.from_array(rng.uniform(-1, 1, 5) * [20, 20, 0.5, 1.5, 1.5])
+
+
+def noisy(zonal: np.ndarray, model, seed: int, noise: float = 0.02) -> InteractionMatrix:
+    """A matrix of single actuators with so much noise, relative to its rms."""
+    sigma = np.full(zonal.shape, noise * zonal.std(), np.float32)
+    data = zonal + sigma * np.random.default_rng(100 + seed).standard_normal(zonal.shape)
+    geometry = getattr(model, "_pupils", None) or model._grid
+    return InteractionMatrix(
+        data.astype(np.float32), sigma, np.eye(model.n_act), geometry.valid, "x", "docrime", True
+    )
+
+
+def errors(estimate, truth: Registration) -> np.ndarray:
+    return estimate.registration.to_array() - truth.to_array()
+
+
+@pytest.mark.parametrize("shear", [-4.0, 0.0, 0.7, 3.0])
+def test_a_shear_and_its_axes_are_the_same_stretch(shear):
+    given = Registration(3.0, -2.0, 1.1, 2.5, -1.2)
+    leaning = given.sheared(shear)
+    np.testing.assert_allclose(leaning.stretch, given.stretch + np.array([[0, shear], [shear, 0]]) / 100)
+    straight, back = leaning.along_axes
+    assert back == pytest.approx(shear, abs=1e-12)
+    np.testing.assert_allclose(straight.to_array(), given.to_array(), atol=1e-12)
+    assert not straight.anamorphosis_angle
+
+
+def test_a_shear_is_recovered_within_its_error(model):
+    pulls, blind = [], []
+    for seed in SEEDS:
+        truth = plant(seed)
+        matrix = noisy(model.zonal_matrix(truth.sheared(SHEAR)), model, seed)
+        found = sprint(matrix, model, also=("anamorphosis",))
+        assert found.converged, found.warnings
+        shear = found.extras["anamorphosis"]
+        assert shear.sigma < 0.2 * SHEAR
+        pulls.append([(shear.value - SHEAR) / shear.sigma, *(errors(found, truth) / found.sigma)])
+        blind.append(found.chi2 < sprint(matrix, model).chi2)
+    assert np.mean(np.square(pulls)) < 2.5
+    assert np.abs(pulls).max() < 4.5
+    # The matrix is not explained as well without it.
+    assert all(blind)
+
+
+def test_where_there_is_no_shear_asking_for_one_does_no_harm(model):
+    pulls, wider = [], []
+    for seed in SEEDS:
+        truth = plant(seed)
+        matrix = noisy(model.zonal_matrix(truth), model, seed)
+        plain, found = sprint(matrix, model), sprint(matrix, model, also=("anamorphosis",))
+        shear = found.extras["anamorphosis"]
+        pulls.append(shear.value / shear.sigma)
+        assert (np.abs(errors(found, truth)) < 4.5 * found.sigma).all()
+        wider.append(found.sigma / plain.sigma)
+    assert np.mean(np.square(pulls)) < 3
+    assert (np.median(wider, axis=0) < 1.3).all()
+
+
+def test_a_shear_is_in_the_pseudo_synthetic_matrix(model):
+    truth = plant(1)
+    sheared = model.zonal_matrix(truth.sheared(SHEAR))
+    matrix = noisy(sheared, model, 1)
+
+    def missed(estimate):
+        made, _ = pseudo_synthetic(model, estimate, np.eye(model.n_act))
+        return np.square(made - sheared).sum() / np.square(sheared).sum()
+
+    assert missed(sprint(matrix, model, also=("anamorphosis",))) < 0.2 * missed(sprint(matrix, model))
+
+
+def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
+    config = small_pyramid()
+    model = make_model(config, None)
+    pulls = []
+    for seed in SEEDS:
+        truth, moved = plant(seed), np.random.default_rng(seed).uniform(-15, 15, 2)
+        matrix = noisy(model.with_pupil_shift(*moved).zonal_matrix(truth), model, seed)
+        found = sprint(matrix, model, also=("pupil_shift",))
+        assert found.converged, found.warnings
+        shift = [found.extras[name] for name in ("pupil_shift_x", "pupil_shift_y")]
+        own = [(one.value - there) / one.sigma for one, there in zip(shift, moved, strict=True)]
+        pulls.append([*own, *(errors(found, truth) / found.sigma)])
+        assert max(one.sigma for one in shift) < 10
+    assert np.mean(np.square(pulls)) < 2.5
+    assert np.abs(pulls).max() < 5
+
+
+def test_on_the_twin_a_planted_shear_is_found_and_told():
+    pulls = []
+    for seed in (1, 2, 3):
+        leaning = Registration(-16.0, -71.0, -0.77, 2.9, 0.0).sheared(SHEAR)
+        planted = [f"twin.registration.{name}={value!r}" for name, value in leaning.to_dict().items()]
+        config = small_lenslets(*planted, 'calibration.also=["anamorphosis"]', seed=seed)
+        with System.from_config(config) as bench:
+            found = bench.calibrate(frames=400).registration
+        shear = found.extras["anamorphosis"]
+        pulls.append((shear.value - SHEAR) / shear.sigma)
+        assert shear.sigma < 0.5
+    assert np.abs(pulls).max() < 4
+
+
+def test_what_a_model_or_solver_does_not_know_is_refused():
+    model = make_model(small_lenslets(), None)
+    matrix = noisy(model.zonal_matrix(Registration()), model, 0)
+    with pytest.raises(ConfigError, match="knows no shift of the pupil"):
+        sprint(matrix, model, also=("pupil_shift",))
+    with pytest.raises(ConfigError, match="takes solver = 'effects'"):
+        sprint(matrix, model, also=("anamorphosis",), solver="light")
+    assert not replace(sprint(matrix, model)).extras
