@@ -26,7 +26,7 @@ from escape_hw.calibration.gain_bootstrap import GainsRun, bootstrap_gains
 from escape_hw.calibration.gain_loop import GainLoop
 from escape_hw.calibration.gain_smoothing import smoothed
 from escape_hw.calibration.optical_gain import projector, slope_weights
-from escape_hw.calibration.poke_cost import strehl_loss, within_budget
+from escape_hw.calibration.poke_cost import noise_gain, strehl_loss, within_budget
 from escape_hw.calibration.sensor_setup import poke_amplitudes
 from escape_hw.pipeline.strehl import strehl
 from escape_hw.runtime.system import System, open_system
@@ -176,20 +176,24 @@ def pokes(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     _, baseline = calibrated(bench, options)
     psf = bench.take_model_psf(frames=5)
     whole = poke_amplitudes(bench, baseline.matrix.m2c, options.poke)
-    optics = bench.dm.info.stroke_m, bench.config.system.wavelength_m
+    loop = bench.config.loop
+    delay = float(baseline.matrix.metrics.get("delay_frames", 2.0))
+    optics = (
+        bench.dm.info.stroke_m, bench.config.system.wavelength_m, noise_gain(loop.gain, loop.leak, delay)
+    )  # fmt: skip
     # Not zero, of which no estimator takes: a thousandth, which costs nothing.
     kinds = {"none": 1e-3 * whole, "budget": within_budget(whole, 0.01, *optics), "whole": whole}
     document: dict[str, Any] = {name: {"predicted": strehl_loss(a, *optics)} for name, a in kinds.items()}
     for name, amplitude in kinds.items():
         # Each on a bench of its own with the same seed: the same turbulence from the first frame on.
         with open_system(options.system, seed=bench.config.system.seed, set=options.set) as fresh:
-            loop = GainLoop(fresh, baseline, {}, science=True)
-            loop.control.set_gain(fresh.config.loop.gain)
+            poked = GainLoop(fresh, baseline, {}, science=True)
+            poked.control.set_gain(loop.gain)
             try:
-                loop.start()
-                stretch = fresh.run(loop.measure(options.frames, amplitude, name))
+                poked.start()
+                stretch = fresh.run(poked.measure(options.frames, amplitude, name))
             finally:
-                loop.open_again()
+                poked.open_again()
         one = strehl(stretch.record.science.images(), psf).peak
         document[name] |= {"strehl": [one.value, one.sigma], "poke": float(amplitude.max())}
     return document

@@ -31,7 +31,7 @@ from escape_hw.api.procedure import Progress
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.closed_loop import integrator_for
-from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.found_mirror import found_matrix
 from escape_hw.calibration.loop_run import RunningLoop
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor
 from escape_hw.calibration.track import track
@@ -126,9 +126,7 @@ def moved_to(bench: System, start: CalibrationResult, here: Registration) -> NDA
     """The start's matrix moved to a registration ``(n_slopes, n_modes)``, each mode as strong as it was."""
     known, matrix, model = start.registration, start.matrix, bench.model(start.grid)
     assert known is not None
-    then, now = (
-        modal_matrix(model, where, matrix.m2c, known.width.value) for where in (known.registration, here)
-    )
+    then, now = (found_matrix(model, where, known, matrix.m2c) for where in (known.registration, here))
     return np.asarray(now * ((then * matrix.data).sum(axis=0) / np.square(then).sum(axis=0)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from escape_hw.api.departures import MirrorDepartures
 from escape_hw.api.gains import ClosureStep, GainRound, GainsResult, OpticalGains
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
@@ -95,6 +96,9 @@ def registration(scale: float = 1.0, seed: int = 3) -> RegistrationEstimate:
         iterations=tuple(steps),
         chi2=1.04,
         warnings=("tangential_scaling is consistent with zero",),
+        departures=MirrorDepartures(
+            rng.normal(0, 0.05, 97), np.full(97, 0.004), rng.normal(0, 0.02, 97), pedestal=0.03
+        ),
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.departures import MirrorDepartures
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
 from escape_hw.api.sensor import SensorGeometry
@@ -66,6 +67,8 @@ class RegistrationEstimate:
         Scale of the influence functions' width relative to nominal.
     notes
         What to know of it that is no reason to distrust it, such as parameters that go together.
+    departures
+        How the mirror differs from the model's; ``None`` where SPRINT did not look.
     """
 
     registration: Registration
@@ -77,6 +80,7 @@ class RegistrationEstimate:
     chi2: float
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    departures: MirrorDepartures | None = None
 
     @property
     def sigma(self) -> NDArray[np.float64]:

@@ -146,6 +146,7 @@ def _fit(
             choice=c.modes_choice,
             solver=c.solver,
             loss=c.loss,
+            actuators=c.actuators,
             learning_rate=c.learning_rate,
             covariance=solution.covariance,
             learn=True,

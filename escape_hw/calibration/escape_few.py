@@ -75,6 +75,7 @@ def escape_from_few(
     fit = yield from telemetry_sprint(
         time_line(*record, before=2 * c.whiten_order + c.lags), frame, bench.model(found),
         order=order, lags=c.lags, learning_rate=c.learning_rate, solver=c.solver, loss=c.loss,
+        actuators=c.actuators,
     )  # fmt: skip
     lost = int(record[0][-1] - record[0][0]) + 1 - record[0].size
     made = synthesise(bench, found, fit.estimate, m2c)

@@ -8,22 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.departures import PEDESTAL, MirrorDepartures
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.derivatives import modal_matrix, zonal_jacobian
+from escape_hw.calibration.evidence import believed
 from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.weighted import WeightedMatrix
 
-#: Width of the broad pedestal that influence functions may stand on, relative to their own.
-_PEDESTAL = 1.7
 #: Places of the common parameters among the unknowns; the registration has places 1 to 5.
 GAIN, WIDTH, SHAPE = 0, 6, 7
 
 
 #: Random effects of which there are many of a kind, in the order of the unknowns ...
 _EFFECTS = ("sampling", "actuator_gain", "actuator_width", "slope_gain")
-#: ... and the share of its usual scatter below which none is taken to fall.
-_LEAST_SCATTER = 0.05
+#: ... and the shares of their usual scatter below and above which none is taken to be.
+_LEAST_SCATTER, _MOST_SCATTER = 0.05, 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ class Problem:
         here, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
         zonal, moved = (weigh(part) for part in zonal_jacobian(self.model, here, w))
         by_width = moved[5] * w
-        by_shape = weigh(self.model.zonal_matrix(here, w * _PEDESTAL)) - zonal
+        by_shape = weigh(self.model.zonal_matrix(here, w * PEDESTAL)) - zonal
         variants = [weigh(v.zonal_matrix(here, w)) - zonal for v in self.variants]
         variants += [zonal @ bend for bend in self.bends]
         shaped = zonal + state.shape * by_shape + state.actuator_width * by_width
@@ -198,7 +198,7 @@ class Problem:
         here, w = Registration.from_array(state.alpha), 1.0 + state.width
         zonal, moved = zonal_jacobian(self.model, here, w)
         shaped = zonal + state.actuator_width * moved[5] * w
-        shaped += state.shape * (self.model.zonal_matrix(here, w * _PEDESTAL) - zonal)
+        shaped += state.shape * (self.model.zonal_matrix(here, w * PEDESTAL) - zonal)
         for share, variant in zip(state.variant, self.variants, strict=True):
             shaped += share * (variant.zonal_matrix(here, w) - zonal)
         half = len(zonal) // 2
@@ -228,6 +228,32 @@ class Problem:
             scatter[name] = max(float(np.sqrt(found)), least)
         decided = float(np.sum(1 - variance * self.precision))
         return Learned(replace(self.priors, **scatter), decided)
+
+    def departures(self, state: State, system: NormalEquations) -> MirrorDepartures:
+        """How the mirror of a solution differs from the model's.
+
+        Parameters
+        ----------
+        state, system
+            Solution, and the problem about it.
+        """
+        # Slopes' gains, eliminated first, come last.
+        inner = len(system.whole)
+        n_act = self.model.n_act
+        kinds = slice(inner - 2 * n_act, inner - n_act), slice(inner - n_act, inner)
+        usual = Priors()
+        bounds = [
+            (_LEAST_SCATTER * each, _MOST_SCATTER * each)
+            for each in (usual.actuator_gain, usual.actuator_width)
+        ]
+        # Where the model does not fit, single actuators are to be believed less.
+        rms = float(np.sqrt(np.mean(np.square(system.residual))))
+        value, sigma = believed(
+            system.whole, state.offset(self.mean_width)[:inner], self.precision[:inner], kinds, bounds,
+            max(rms, self.weighted.noise(system.residual)),
+        )  # fmt: skip
+        gains, widths = kinds
+        return MirrorDepartures(value[gains], sigma[gains], value[widths], state.shape)
 
     def move(self, state: State, step: NDArray[np.floating]) -> State:
         """The state after a step, in the order of the unknowns."""

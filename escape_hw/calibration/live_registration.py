@@ -18,8 +18,8 @@ from escape_hw.api.model import DoubtfulModel, SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, TemporalResponse
 from escape_hw.calibration.covariance import sandwich
-from escape_hw.calibration.derivatives import modal_matrix
 from escape_hw.calibration.fading_sums import FadingSums, turned
+from escape_hw.calibration.found_mirror import found_matrix
 from escape_hw.calibration.gain_curve import bends_of, curve_basis
 from escape_hw.calibration.linearisation import GAIN, WIDTH, Problem, State
 from escape_hw.calibration.live_response import ResponseSums
@@ -55,8 +55,8 @@ class LiveEstimate:
     change
         Covariance of the registration ``(5, 5)`` without what errs alike at all times: that of a change.
     gains, gains_sigma
-        Gain of every mode ``(n_modes,)``: :attr:`matrix` projected on the synthetic model, so what unequal
-        actuators and slopes take from a mode is in it; and its error as a change.
+        Gain of every mode ``(n_modes,)``: :attr:`matrix` projected on the synthetic model, so what slopes
+        take from a mode is in it, and what actuators take beyond the departures; and its error as a change.
     rate
         Drift per second ``(6,)``: gain, then the registration.
     surprise
@@ -98,7 +98,8 @@ class LiveRegistration:
         The synthetic model on the same sub-apertures.
     start
         Registration to start from, within SPRINT's linear reach. Its width of the influence functions,
-        which small pokes hardly show, is taken over with its error.
+        which small pokes hardly show, is taken over with its error, and what it says of single actuators is
+        what a matrix at the live registration will have.
     order, lags
         Of the whitening filter and the temporal response, in frames.
     memory
@@ -127,6 +128,8 @@ class LiveRegistration:
         self._frame, self._model, self._start = frame, model, start.registration
         scatter = min(Priors().width, max(start.width.sigma, _WIDTH_SIGMA))
         self._priors = Priors(width=scatter, mean_width=start.width.value - 1)
+        # Small pokes tell little of single actuators: what the calibration found of them stays.
+        self._mirror = start.departures
         self._order, self._lags, self._response = order, lags, response
         self._basis = curve_basis(frame.n_modes, curved)
         self._bends = bends_of(frame.m2c, self._basis)
@@ -254,8 +257,6 @@ class LiveRegistration:
         left /= columns.sigma
         gain, timing = present.value[GAIN], value[GAIN] * self._weights.gain_sigma(response)
         gain_sigma = float(np.hypot(np.sqrt(present.covariance[GAIN, GAIN]), timing))
-        unit = modal_matrix(self._model, self._start, self._frame.m2c, 1 + state.width)
-        gains = np.asarray((self._now * unit).sum(axis=0) / np.square(unit).sum(axis=0))
         width_sigma = float(np.sqrt(np.linalg.inv(system.information())[WIDTH, WIDTH]))
         estimate = RegistrationEstimate(
             Registration.from_array(present.value[1:6]),
@@ -265,7 +266,10 @@ class LiveRegistration:
             True,
             (),
             float(np.mean(np.square(system.residual))),
+            departures=self._mirror,
         )
+        unit = found_matrix(self._model, self._start, estimate, self._frame.m2c)
+        gains = np.asarray((self._now * unit).sum(axis=0) / np.square(unit).sum(axis=0))
         return LiveEstimate(
             estimate, present.moving[1:6, 1:6], gains, self._gains_sigma(present, timing), present.rate[:6],
             float(np.abs(present.surprise).max()),

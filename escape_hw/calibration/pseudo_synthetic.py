@@ -13,7 +13,8 @@ from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix
-from escape_hw.calibration.derivatives import modal_jacobian, modal_matrix
+from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.found_mirror import found_jacobian
 
 
 def pseudo_synthetic(
@@ -26,20 +27,20 @@ def pseudo_synthetic(
     model
         The synthetic model.
     estimate
-        Result of SPRINT.
+        Result of SPRINT; what it found of single actuators is in the matrix.
     m2c
         Modal basis ``(n_act, n_modes)``.
 
     Returns
     -------
     matrix, sigma : ndarray, ``(n_slopes, n_modes)``
-        The errors are those of registration and gain, propagated to first order.
+        The errors are those of registration, gain and the actuators' gains, propagated to first order.
     """
-    width, gain = estimate.width.value, estimate.gain.value
-    unit, derivatives = modal_jacobian(model, estimate.registration, m2c, width)
+    gain = estimate.gain.value
+    unit, derivatives, unequal = found_jacobian(model, estimate, m2c)
     jacobian = gain * derivatives[:5]
     variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
-    variance += np.square(unit * estimate.gain.sigma)
+    variance += np.square(unit * estimate.gain.sigma) + gain**2 * unequal
     return gain * unit, np.sqrt(np.maximum(variance, 0))
 
 

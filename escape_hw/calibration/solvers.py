@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.departures import MirrorDepartures
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.procedure import Procedure, Progress, Reporter
@@ -74,8 +75,8 @@ class Solution:
     """Where a descent ended, alike for every solver.
 
     ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``, ``learned`` what the data say about the
-    scatter of the random effects, where there are any; ``scatter`` is what is to be added to the covariance
-    of the registration ``(5, 5)``.
+    scatter of the random effects, and ``departures`` those of the mirror, where there are any; ``scatter`` is
+    what is to be added to the covariance of the registration ``(5, 5)``.
     """
 
     system: Linearised
@@ -86,6 +87,7 @@ class Solution:
     zonal: Callable[[], NDArray[np.float64]]
     scatter: NDArray[np.float64] | None = None
     learned: Callable[[], Learned] | None = None
+    departures: MirrorDepartures | None = None
 
 
 def solve(
@@ -175,6 +177,7 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
     return Solution(
         system, state.alpha, state.gain, 1 + state.width, settled,
         lambda: problem.zonal(state), learned=lambda: problem.learned(state, system),
+        departures=problem.departures(state, system),
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ batches, the original's gain for every mode and other variants can be had instea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ParamSpec
 
 import numpy as np
@@ -33,7 +33,16 @@ from escape_hw.calibration.parity import parity_hint
 from escape_hw.calibration.robust import ROUNDS, trust
 from escape_hw.calibration.solvers import LARGEST, Descent, Solution, solve
 from escape_hw.calibration.weighted import WeightedMatrix
-from escape_hw.config.models import LOSSES, MODES_CHOICES, SOLVERS, Loss, ModesChoice, Solver
+from escape_hw.config.models import (
+    ACTUATORS,
+    LOSSES,
+    MODES_CHOICES,
+    SOLVERS,
+    Actuators,
+    Loss,
+    ModesChoice,
+    Solver,
+)
 from escape_hw.errors import CalibrationError, IncompatibleProduct
 
 P = ParamSpec("P")
@@ -77,6 +86,7 @@ def fit_steps(
     priors: Priors | None = None,
     learn: bool = False,
     reach: bool = True,
+    actuators: Actuators = "found",
 ) -> Procedure[SprintFit]:
     """Registration, gain and their standard errors from an interaction matrix.
 
@@ -117,6 +127,9 @@ def fit_steps(
     reach
         Whether to come from afar first, low modes before high ones (:mod:`~.capture`). Without it the
         descent is from ``start`` alone, on all modes at once.
+    actuators
+        ``"found"``: the estimate keeps what was found of every actuator, and a matrix made from it has it,
+        too. ``"alike"``: it does not, and the matrix is that of the model's actuators. The fit is the same.
 
     Returns
     -------
@@ -131,13 +144,14 @@ def fit_steps(
     CalibrationError
         The matrix holds no signal.
     ValueError
-        A learning rate outside (0, 1]; no such solver, choice or loss.
+        A learning rate outside (0, 1]; no such solver, choice, loss or actuators.
     """
     if not 0 < learning_rate <= 1:
         raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
     _known("solver", solver, SOLVERS)
     _known("choice", choice, MODES_CHOICES)
     _known("loss", loss, LOSSES)
+    _known("actuators", actuators, ACTUATORS)
     begin = start or Registration()
     # The products are many and small.
     with hold_to_one_thread():
@@ -155,6 +169,8 @@ def fit_steps(
             weighted = whole.trusting(shares)
             found = yield from solve(descent, weighted, found.alpha, False)
         estimate = _estimate(descent, weighted, found, covariance)
+    if actuators == "alike":
+        estimate = replace(estimate, departures=None)
     yield descent.progress(estimate.sigma)
     return SprintFit(estimate, found.zonal, found.learned)
 
@@ -284,4 +300,5 @@ def _estimate(
         float(np.mean(np.square(residual))),
         tuple(warnings),
         notes,
+        found.departures,
     )

@@ -32,7 +32,7 @@ from escape_hw.calibration.whitening import (
     known_past,
     prediction_error_filter,
 )
-from escape_hw.config.models import Loss, Solver
+from escape_hw.config.models import Actuators, Loss, Solver
 from escape_hw.errors import TooFewFrames
 
 #: Rounds of registration, response, whitener and scatter; a fifth changes nothing that matters.
@@ -127,6 +127,7 @@ def telemetry_sprint(
     learning_rate: float = 1.0,
     solver: Solver = "effects",
     loss: Loss = "squares",
+    actuators: Actuators = "found",
 ) -> Procedure[TelemetryFit]:
     """Registration, gain and temporal response from a stretch of telemetry.
 
@@ -145,7 +146,7 @@ def telemetry_sprint(
         Frames over which the temporal response is estimated.
     start
         Where to start; from afar by default.
-    learning_rate, solver, loss
+    learning_rate, solver, loss, actuators
         As for :func:`~escape_hw.calibration.sprint.sprint`; a solver that needs modes will not do.
 
     Raises
@@ -181,7 +182,7 @@ def telemetry_sprint(
         columns = independent_columns(measured, gram, variance)
         fit = yield from fit_steps(
             columns, model, solver=solver, loss=loss, start=start, learning_rate=learning_rate,
-            covariance=covariance, priors=priors, reach=start is None,
+            covariance=covariance, priors=priors, reach=start is None, actuators=actuators,
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal() @ frame.m2c

@@ -26,7 +26,7 @@ from escape_hw.api.tracking import Alarm, TrackResult
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import Motion, next_frame
 from escape_hw.calibration.closed_loop import integrator_for
-from escape_hw.calibration.derivatives import modal_matrix
+from escape_hw.calibration.found_mirror import found_matrix
 from escape_hw.calibration.gain_curve import SCATTER
 from escape_hw.calibration.live_registration import LiveEstimate, LiveRegistration
 from escape_hw.calibration.loop_run import RunningLoop
@@ -155,7 +155,9 @@ class _Tracker:
         c, t = bench.config.calibration, bench.config.tracking
         self.bench, self.grid, self.exchange, self.psf = bench, grid, exchange, model_psf
         self.control = integrator_for(bench, matrix, grid, gain=gain)
-        start = registration or sprint(matrix, bench.model(grid), learning_rate=c.learning_rate)
+        start = registration or sprint(
+            matrix, bench.model(grid), learning_rate=c.learning_rate, actuators=c.actuators
+        )
         if not start.converged:
             raise CalibrationError(f"no registration to begin with: {'; '.join(start.warnings)}")
         self.amplitude = poke_amplitudes(bench, matrix.m2c, poke)
@@ -187,7 +189,7 @@ class _Tracker:
             memory=self.memory, step_s=STEP_S, response=self.response,
             curved=len(SCATTER) if bench.config.sensor.kind == "pyramid" else 0,
         )  # fmt: skip
-        unit = modal_matrix(self.model, start.registration, matrix.m2c, start.width.value)
+        unit = found_matrix(self.model, start.registration, start, matrix.m2c)
         self.begun = (unit * matrix.data).sum(axis=0) / np.square(unit).sum(axis=0)
         self.used = replace(self.used, gain=float(self.begun.mean()))
 

@@ -37,6 +37,8 @@ MODES_CHOICES: tuple[str, ...] = get_args(ModesChoice)
 Loss = Literal["squares", "huber"]
 #: What SPRINT minimises.
 LOSSES: tuple[str, ...] = get_args(Loss)
+Actuators = Literal["found", "alike"]
+ACTUATORS: tuple[str, ...] = get_args(Actuators)
 
 
 class SystemSection(Section):
@@ -138,6 +140,11 @@ class CalibrationSection(Section):
         description="SPRINT: 'effects' (with what the model does not know), 'light' (gain and registration), "
         "'frozen' (the same, derivatives of the start), 'batches' (the paper's, few modes at a time), "
         "'diagonal' (a gain for every mode)",
+    )
+    actuators: Actuators = Field(
+        "found",
+        description="the pseudo-synthetic matrix has the actuators' gains and widths as SPRINT 'found' them, "
+        "or all 'alike', as the drawing has them",
     )
     loss: Loss = Field(
         "squares", description="SPRINT: 'squares', or 'huber' where some sub-apertures are not to be trusted"

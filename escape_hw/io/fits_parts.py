@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
+from escape_hw.api.departures import MirrorDepartures
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, SprintIteration, TemporalResponse
 from escape_hw.errors import ProductError
@@ -101,7 +102,21 @@ def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
         fits_file.image("COVAR", np.asarray(estimate.covariance, np.float64)),
         iterations,
         pack_metrics(notes, "ALPHANOT"),
+        *([] if estimate.departures is None else [_pack_departures(estimate.departures)]),
     ]
+
+
+def _pack_departures(apart: MirrorDepartures) -> fits.BinTableHDU:
+    columns = {"GAIN": apart.gain, "SIGMA": apart.gain_sigma, "WIDTH": apart.width}
+    return fits_file.table("ACTUATOR", columns, PEDESTAL=float(apart.pedestal))
+
+
+def _unpack_departures(hdus: fits.HDUList) -> MirrorDepartures | None:
+    """``None`` where SPRINT did not look, and in products of earlier versions."""
+    if "ACTUATOR" not in hdus:
+        return None
+    gain, sigma, width = (_column(hdus, "ACTUATOR", name) for name in ("GAIN", "SIGMA", "WIDTH"))
+    return MirrorDepartures(gain, sigma, width, float(hdus["ACTUATOR"].header["PEDESTAL"]))
 
 
 def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate | None:
@@ -134,6 +149,7 @@ def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate 
         warnings=tuple(str(note) for note in notes["warnings"]),
         # Products of earlier versions have none.
         notes=tuple(str(note) for note in notes.get("notes", ())),
+        departures=_unpack_departures(hdus),
     )
 
 

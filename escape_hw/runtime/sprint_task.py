@@ -82,6 +82,7 @@ class SprintTask:
             choice=settings.modes_choice,
             solver=settings.solver,
             loss=settings.loss,
+            actuators=settings.actuators,
             learning_rate=settings.learning_rate,
         )
         return replace(product.result, matrix=measured, measured=None, registration=estimate)

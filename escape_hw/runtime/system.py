@@ -155,6 +155,7 @@ class System(LoopBench):
             choice=settings.modes_choice,
             solver=settings.solver,
             loss=settings.loss,
+            actuators=settings.actuators,
             learning_rate=settings.learning_rate,
         )
 

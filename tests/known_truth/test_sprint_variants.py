@@ -103,7 +103,7 @@ def test_informative_modes_beat_the_first_ones(bench):
         choose_modes(matrix, 6, "d-optimal")
 
 
-@pytest.mark.parametrize("option", ["solver", "choice", "loss"])
+@pytest.mark.parametrize("option", ["solver", "choice", "loss", "actuators"])
 def test_what_is_not_known_is_refused(bench, option):
     with pytest.raises(ValueError, match=rf"{option} is 'best'; it is one of"):
         sprint(measured(bench, noise=0.05), bench[0], **{option: "best"})

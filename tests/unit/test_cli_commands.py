@@ -110,6 +110,7 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
         "solver": "effects",
         "choice": "snr",
         "loss": "squares",
+        "actuators": "found",
     }
     assert bench.calls == [("sprint", asked)]
     assert (

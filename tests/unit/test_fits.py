@@ -70,6 +70,8 @@ def test_matrix_comes_back_as_it_was(tmp_path):
     assert steps[0] == steps[1]
     assert product.registration.warnings == result.registration.warnings
     np.testing.assert_array_equal(product.registration.covariance, result.registration.covariance)
+    mirrors = [dataclasses.asdict(r.registration.departures) for r in (product, result)]
+    np.testing.assert_equal(*mirrors)
     np.testing.assert_array_equal(product.result.response.weights, result.response.weights)
     np.testing.assert_array_equal(product.result.mean_frame, result.mean_frame)
     assert (product.result.frames, product.result.lost_frames) == (10_000, 7)
@@ -119,11 +121,12 @@ def test_metrics_keep_value_and_type(tmp_path, small, value):
 
 def test_no_metrics_no_steps_no_config(tmp_path, small):
     matrix = dataclasses.replace(small.matrix, metrics={})
-    estimate = dataclasses.replace(small.registration, iterations=())
+    estimate = dataclasses.replace(small.registration, iterations=(), departures=None)
     result = dataclasses.replace(small, matrix=matrix, registration=estimate, notes=())
     product = load_matrix(save_matrix(tmp_path / "im.fits", result))
     assert product.matrix.metrics == {}
     assert product.registration.iterations == ()
+    assert product.registration.departures is None
     assert product.config_text == ""
 
 

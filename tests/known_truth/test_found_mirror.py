@@ -1,0 +1,166 @@
+"""The pseudo-synthetic matrix of a mirror with unequal actuators, against the mirror that was planted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import small_pyramid
+import small_system
+
+from escape_hw.api.departures import PEDESTAL
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.basis import configured_basis
+from escape_hw.calibration.found_mirror import found_matrix
+from escape_hw.calibration.pseudo_synthetic import pseudo_synthetic
+from escape_hw.calibration.sprint import sprint
+from escape_hw.runtime.system import System
+from escape_sim.model import make_model, nominal_grid
+from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+
+PLANTED = Registration(-16.0, 31.0, -0.77, 1.9, 0.5)
+SEEDS = range(4)
+
+
+@dataclass(frozen=True)
+class Design:
+    """A sensor's model and the basis of its calibration."""
+
+    model: SyntheticModel
+    valid: np.ndarray
+    m2c: np.ndarray
+
+
+def lenslets() -> Design:
+    config = small_system.configuration()
+    model = make_model(config, None)
+    m2c = configured_basis(config, *model.influence_functions(), ())
+    return Design(model, nominal_grid(config).valid, m2c)
+
+
+def pyramid() -> Design:
+    config = small_pyramid.configuration()
+    model = PyramidModel(config, nominal_pupils(config))
+    return Design(
+        model, nominal_pupils(config).valid, configured_basis(config, *model.influence_functions(), ())
+    )
+
+
+@pytest.fixture(scope="module", params=[lenslets, pyramid])
+def design(request: pytest.FixtureRequest) -> Design:
+    made: Callable[[], Design] = request.param
+    return made()
+
+
+def planted(design: Design, seed: int) -> np.ndarray:
+    """Slopes per command of a mirror whose actuators differ, and behind unequal slopes."""
+    model, rng = design.model, np.random.default_rng(seed)
+    gains, widths = rng.normal(1, 0.05, model.n_act), rng.normal(1.04, 0.03, model.n_act)
+    zonal = np.stack([model.zonal_matrix(PLANTED, w)[:, a] for a, w in enumerate(widths)], axis=1)
+    broad = np.stack([model.zonal_matrix(PLANTED, PEDESTAL * w)[:, a] for a, w in enumerate(widths)], axis=1)
+    return np.asarray((0.98 * zonal + 0.02 * broad) * gains)
+
+
+def measured(design: Design, zonal: np.ndarray, noise: float, seed: int) -> InteractionMatrix:
+    """Its matrix, with noise of a share of the elements' rms, behind slopes of unequal gains."""
+    rng = np.random.default_rng(seed + 100)
+    exact = (zonal * rng.normal(1, 0.03, (len(zonal), 1))) @ design.m2c
+    sigma = np.full(exact.shape, noise * exact.std(), np.float32)
+    data = (exact + sigma * rng.standard_normal(exact.shape)).astype(np.float32)
+    return InteractionMatrix(data, sigma, design.m2c, design.valid, "small", "docrime", True)
+
+
+def missed(made: np.ndarray, exact: np.ndarray) -> float:
+    """What a matrix has of the wrong shape: columns have the right length, as optical gains see to."""
+    made = made * ((made * exact).sum(axis=0) / np.square(made).sum(axis=0))
+    return float(np.linalg.norm(made - exact) / np.linalg.norm(exact))
+
+
+def compared(design: Design, noise: float, m2c: np.ndarray | None = None) -> np.ndarray:
+    """Errors ``(n_seeds, 2)`` of the matrix of the found mirror, and of alike actuators."""
+    errors, basis = [], design.m2c if m2c is None else m2c
+    for seed in SEEDS:
+        zonal = planted(design, seed)
+        estimate = sprint(measured(design, zonal, noise, seed), design.model, learn=True)
+        made = [
+            pseudo_synthetic(design.model, one, basis)[0]
+            for one in (estimate, replace(estimate, departures=None))
+        ]
+        errors.append([missed(one, zonal @ basis) for one in made])
+    return np.array(errors)
+
+
+def test_a_well_measured_mirror_is_found(design: Design) -> None:
+    found, alike = compared(design, 0.1).T
+    assert (found < 0.25 * alike).all()
+
+
+def test_a_mirror_that_was_hardly_measured_is_left_alone(design: Design) -> None:
+    """Noise of three times the elements' rms: single actuators cannot be told."""
+    found, alike = compared(design, 3.0).T
+    assert found.mean() < 1.05 * alike.mean()
+    assert (found < 1.2 * alike).all()
+
+
+def test_the_matrix_holds_for_modes_that_were_never_poked(design: Design) -> None:
+    other = np.random.default_rng(1).standard_normal((design.model.n_act, 12))
+    # Single actuators are poked alone by no mode of the calibration.
+    found, alike = compared(design, 0.1, other).T
+    assert (found < 0.6 * alike).all()
+
+
+def test_departures_belong_to_actuators_and_not_to_modes(design: Design) -> None:
+    zonal = planted(design, 0)
+    estimate = sprint(measured(design, zonal, 0.1, 0), design.model)
+    turn = np.random.default_rng(2).standard_normal((design.m2c.shape[1], 5))
+    made, turned = (
+        found_matrix(design.model, estimate.registration, estimate, m2c)
+        for m2c in (design.m2c, design.m2c @ turn)
+    )
+    np.testing.assert_allclose(turned, made @ turn, atol=1e-4 * np.abs(turned).max())
+
+
+def test_its_errors_know_of_single_actuators(design: Design) -> None:
+    zonal = planted(design, 0)
+    estimate = sprint(measured(design, zonal, 1.0, 0), design.model, learn=True)
+    made, sigma = pseudo_synthetic(design.model, estimate, design.m2c)
+    scale = float(np.vdot(made, zonal @ design.m2c) / np.vdot(made, made))
+    pulls = (scale * made - zonal @ design.m2c) / sigma
+    assert 0.2 < np.mean(np.square(pulls)) < 5
+    apart = estimate.departures
+    assert apart is not None
+    sure = replace(estimate, departures=replace(apart, gain_sigma=0 * apart.gain_sigma))
+    assert pseudo_synthetic(design.model, sure, design.m2c)[1].mean() < sigma.mean()
+
+
+def test_alike_is_the_matrix_of_the_drawing(design: Design) -> None:
+    matrix = measured(design, planted(design, 0), 0.1, 0)
+    found = sprint(matrix, design.model)
+    alike = sprint(matrix, design.model, actuators="alike")
+    assert found.departures is not None
+    assert alike.departures is None
+    np.testing.assert_array_equal(alike.registration.to_array(), found.registration.to_array())
+    made = pseudo_synthetic(design.model, alike, design.m2c)[0]
+    drawn = design.model.zonal_matrix(alike.registration, alike.width.value) @ design.m2c
+    np.testing.assert_allclose(made, alike.gain.value * drawn, atol=1e-4 * np.abs(made).max())
+
+
+@pytest.mark.parametrize("frames", [50, 400])
+def test_a_tenth_of_a_second_tells_unequal_actuators(frames: int) -> None:
+    """The whole bench, held against push-pull without turbulence."""
+    errors = []
+    for seed in (1, 2):
+        with System.from_config(small_system.configuration(seed=seed)) as bench:
+            result = bench.calibrate("escape", frames=frames)
+            exact = bench.calibrate("push-pull", grid=result.grid).matrix.data.astype(float)
+            estimate = result.registration
+            assert estimate is not None
+            drawn = replace(estimate, departures=None)
+            alike = pseudo_synthetic(bench.model(result.grid), drawn, result.matrix.m2c)[0]
+            errors.append([missed(result.matrix.data.astype(float), exact), missed(alike, exact)])
+    found, alike_error = np.array(errors).T
+    assert (found < 0.85 * alike_error).all()
