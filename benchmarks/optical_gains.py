@@ -27,6 +27,7 @@ from escape_hw.calibration.gain_loop import GainLoop
 from escape_hw.calibration.gain_smoothing import smoothed
 from escape_hw.calibration.optical_gain import projector, slope_weights
 from escape_hw.calibration.poke_cost import noise_gain, strehl_loss, within_budget
+from escape_hw.calibration.pseudo_synthetic import at_rest
 from escape_hw.calibration.sensor_setup import poke_amplitudes
 from escape_hw.pipeline.strehl import strehl
 from escape_hw.runtime.system import System, open_system
@@ -94,7 +95,11 @@ def gains(bench: System, options: argparse.Namespace) -> dict[str, Any]:
 
 def bootstrapped(bench: System, matrix: CalibrationResult, options: argparse.Namespace) -> GainsRun:
     """The bootstrap from a matrix."""
-    return bench.run(bootstrap_gains(bench, matrix, frames=options.frames, accuracy=options.accuracy))
+    return bench.run(
+        bootstrap_gains(
+            bench, matrix, frames=options.frames, accuracy=options.accuracy, shape=at_rest(bench, matrix)
+        )
+    )
 
 
 def scaled(result: CalibrationResult, factor: float) -> CalibrationResult:

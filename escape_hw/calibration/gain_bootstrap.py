@@ -36,6 +36,8 @@ _COARSE = 2.0
 _TOLERANCE = 0.02
 #: Rounds at most at the last poke.
 _REPEATS = 4
+#: Name of the matrix that only lends its shape, among those beside.
+_SHAPE = "shape"
 #: How often, and by how much, the gain is lowered when a round finds the loop unstable.
 _RETRIES, _LOWER = 3, 0.7
 
@@ -76,6 +78,7 @@ def bootstrap_gains(
     frames: int = 20000,
     gain: float | None = None,
     beside: Mapping[str, InteractionMatrix] | None = None,
+    shape: InteractionMatrix | None = None,
     model_psf: NDArray[np.float32] | None = None,
 ) -> Procedure[GainsRun]:
     """Close the loop on a matrix of unknown scale, and scale it mode by mode to the turbulence there.
@@ -98,6 +101,10 @@ def bootstrap_gains(
         Effective gain of the loop; as configured by default.
     beside
         Other matrices by name, of the same geometry and modes, whose gains are wanted, too.
+    shape
+        A matrix of the same geometry and modes, of any scale, whose columns are better in closed loop
+        (:func:`~escape_hw.calibration.pseudo_synthetic.at_rest`): the one that is scaled in the end, by gains
+        of its own that the same frames tell. The result's gains are those of ``calibration``.
     model_psf
         With it, and with a science camera, every round tells its Strehl ratio.
 
@@ -117,7 +124,7 @@ def bootstrap_gains(
     """
     wanted = bench.config.loop.gain if gain is None else gain
     _require_sense(poke=poke, accuracy=accuracy, budget=budget, gain=wanted)
-    state, others = _State(), dict(beside or {})
+    state, others = _State(), {**(beside or {}), **({} if shape is None else {_SHAPE: shape})}
     loop = GainLoop(bench, calibration, others, science=model_psf is not None)
     before = bench.wfs.status().lost
     try:
@@ -130,7 +137,7 @@ def bootstrap_gains(
         _salvage(loop, state)
     finally:
         loop.open_again()
-    return _run_of(loop, calibration, state, bench.wfs.status().lost - before)
+    return _run_of(loop, calibration, shape, state, bench.wfs.status().lost - before)
 
 
 def _salvage(loop: GainLoop, state: _State) -> None:
@@ -320,11 +327,22 @@ def _raised(loop: GainLoop, state: _State) -> float:
     return noise_gain(state.gain, loop.bench.config.loop.leak, delay)
 
 
-def _run_of(loop: GainLoop, calibration: CalibrationResult, state: _State, lost: int) -> GainsRun:
+def _run_of(
+    loop: GainLoop,
+    calibration: CalibrationResult,
+    shape: InteractionMatrix | None,
+    state: _State,
+    lost: int,
+) -> GainsRun:
     rescaled, notes = calibration, list(state.notes)
+    lent = state.beside.pop(_SHAPE, None)
     if state.rounds and state.applied is not None:
-        sigma = np.hypot(state.applied.best_sigma, state.applied.best * state.applied.common_sigma)
-        matrix = scaled_matrix(calibration.matrix, usable(state.applied), sigma)
+        scaled, gains = calibration.matrix, state.applied
+        # A run that was stopped early may not have told the other's gains.
+        if shape is not None and lent is not None:
+            scaled, gains = shape, lent
+        sigma = np.hypot(gains.best_sigma, gains.best * gains.common_sigma)
+        matrix = scaled_matrix(scaled, usable(gains), sigma)
         rescaled = replace(calibration, matrix=matrix, measured=None, partial=state.partial)
         if not state.rounds[-1].reached:
             notes.append("the last round ended at its number of frames, before the accuracy asked for")

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
@@ -85,6 +86,29 @@ def synthetic_of(
         metrics={"gain": estimate.gain.value},
     )  # fmt: skip
     return replace(measured, matrix=matrix, measured=None, registration=estimate)
+
+
+def at_rest(bench: Bench, calibration: CalibrationResult) -> InteractionMatrix | None:
+    """The pseudo-synthetic matrix for light that hardly moves, as a closed loop leaves it; nothing moves.
+
+    Under the turbulence of the open loop, where its matrix was fitted, a pyramid's answer has another shape.
+
+    Parameters
+    ----------
+    bench
+        Gives the model.
+    calibration
+        With the registration.
+
+    Returns
+    -------
+    InteractionMatrix or None
+        Of the same modes; ``None`` for a matrix that is not pseudo-synthetic.
+    """
+    if calibration.registration is None or calibration.matrix.method != "escape":
+        return None
+    model = bench.model(calibration.grid.with_motion(0.0))
+    return synthetic_of(calibration, model, calibration.registration).matrix
 
 
 def simulated(bench: Bench, grid: SensorGeometry, m2c: NDArray[np.float64]) -> CalibrationResult:

@@ -115,6 +115,9 @@ def everything(
         list[Path] | None,
         typer.Option("--sweep", metavar="RUN", help="A finished sweep to show beside; repeatable."),
     ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Take the parts that are finished in --out as they are.")
+    ] = False,
     set: options.Set = None,
     seed: options.Seed = None,
     json: options.Json = False,
@@ -126,15 +129,20 @@ def everything(
         from escape_hw.io import documents
         from escape_hw.report.index import write_index
         from escape_hw.report.paper_results import write_results
-        from escape_hw.runtime.paper import chosen, sweep_runs
+        from escape_hw.runtime.paper import chosen, finished, sweep_runs
 
         parts: dict[str, Any] = {}
         swept = sweep_runs(sweeps or [])
         try:
             for case in chosen(only):
                 one.tell(f"{case.kind}: {case.title}")
-                choice = options.Choice.of(case.system, set, seed, None)
-                _, parts[case.kind] = _case(one, case.kind, case.shortened(share), choice, out / case.kind)
+                kept = finished(out / case.kind, case.kind) if resume else None
+                if kept is None:
+                    choice = options.Choice.of(case.system, set, seed, None)
+                    _, kept = _case(one, case.kind, case.shortened(share), choice, out / case.kind)
+                else:
+                    one.tell(f"{case.kind}: finished {kept['finished_utc']}, not run again")
+                parts[case.kind] = kept
                 one.show(*checks_view(parts[case.kind]["criteria"]))
         finally:
             if parts:

@@ -69,6 +69,7 @@ class GainsTask:
     def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[GainsRun]:
         """Model PSF where the bench can take one, then the bootstrap."""
         from escape_hw.calibration.gain_bootstrap import bootstrap_gains
+        from escape_hw.calibration.pseudo_synthetic import at_rest
         from escape_hw.runtime.procedures import model_psf
 
         for each in (self.product, *self._others.values()):
@@ -78,7 +79,12 @@ class GainsTask:
             model = yield from model_psf(bench)
         return (
             yield from bootstrap_gains(
-                bench, self.product.result, **self._options, beside=self._beside(), model_psf=model
+                bench,
+                self.product.result,
+                **self._options,
+                beside=self._beside(),
+                shape=at_rest(bench, self.product.result),
+                model_psf=model,
             )
         )
 

@@ -179,10 +179,12 @@ class LoopBench(RunningBench):
             Stopped by Ctrl-C.
         """
         from escape_hw.calibration.gain_bootstrap import bootstrap_gains
+        from escape_hw.calibration.pseudo_synthetic import at_rest
 
         procedure = bootstrap_gains(
-            self, calibration, poke=poke, accuracy=accuracy, frames=frames, model_psf=model_psf
-        )
+            self, calibration, poke=poke, accuracy=accuracy, frames=frames,
+            shape=at_rest(self, calibration), model_psf=model_psf,
+        )  # fmt: skip
         return self.run(procedure, progress=progress)
 
     def sweep(

@@ -94,6 +94,24 @@ def chosen(kinds: Sequence[str] | None) -> list[PaperCase]:
     return [case for kind, case in CASES.items() if not kinds or kind in kinds]
 
 
+def finished(folder: Path, kind: str) -> dict[str, Any] | None:
+    """The document of a part that ran to its end in this folder; ``None`` when there is none.
+
+    Raises
+    ------
+    ProductError
+        What lies there is damaged.
+    ConfigError
+        It is another run.
+    """
+    if not (folder / "result.json").is_file():
+        return None
+    document = read_result(folder)
+    if document.get("command") != f"reproduce {kind}":
+        raise ConfigError(f"{folder} holds the run of 'escape {document.get('command')}'; take another --out")
+    return None if document.get("partial") else {**document, "folder": str(folder)}
+
+
 def sweep_runs(folders: Sequence[Path]) -> dict[str, Path]:
     """Sweeps by the name that the paper's table knows them by: ``sweep-shwfs``, ``sweep-pywfs``.
 

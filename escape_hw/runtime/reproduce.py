@@ -33,8 +33,9 @@ class Comparison:
     """Several calibrations of one system, each with its loop.
 
     ``loops`` are the runs at each matrix's own best gain, ``scans`` the runs that found it, both by
-    label; ``sky_time`` holds error curves over a few random plants; ``notes`` say what went wrong on
-    the way; ``partial`` is true when the operator stopped it early.
+    label; ``rescaled`` is ESCAPE's matrix as the bootstrap of the optical gains leaves it; ``sky_time``
+    holds error curves over a few random plants; ``notes`` say what went wrong on the way; ``partial`` is
+    true when the operator stopped it early.
     """
 
     calibrations: dict[str, CalibrationResult] = field(default_factory=dict)
@@ -42,6 +43,7 @@ class Comparison:
     scans: dict[str, list[LoopResult]] = field(default_factory=dict)
     sky_time: dict[str, Any] | None = None
     gains: GainsResult | None = None
+    rescaled: CalibrationResult | None = None
     notes: list[str] = field(default_factory=list)
     partial: bool = False
 

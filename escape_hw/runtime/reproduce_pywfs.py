@@ -108,13 +108,16 @@ def find_gains(
         The model PSF.
     """
     from escape_hw.calibration.gain_bootstrap import bootstrap_gains
+    from escape_hw.calibration.pseudo_synthetic import at_rest
 
     model = yield from model_psf(bench)
+    found = result.calibrations["ESCAPE"]
     beside = {label: one.matrix for label, one in result.calibrations.items() if label != "ESCAPE"}
     run = yield from bootstrap_gains(
-        bench, result.calibrations["ESCAPE"], beside=beside, frames=frames, accuracy=accuracy, model_psf=model
-    )
-    result.gains, result.partial = run.result, run.result.partial
+        bench, found, beside=beside, frames=frames, accuracy=accuracy, shape=at_rest(bench, found),
+        model_psf=model,
+    )  # fmt: skip
+    result.gains, result.rescaled, result.partial = run.result, run.rescaled, run.result.partial
     return run.rescaled, model
 
 
@@ -149,5 +152,8 @@ def with_and_without_gains(
     every = {"ESCAPE": result.gains.gains, **result.gains.beside}
     for label, one in known.items():
         yield label, one
+        if label == "ESCAPE" and result.rescaled is not None:
+            yield label + WITH_GAINS, result.rescaled
+            continue
         scaled = scaled_matrix(one.matrix, usable(every[label]), every[label].best_sigma)
         yield label + WITH_GAINS, replace(one, matrix=scaled, measured=None)

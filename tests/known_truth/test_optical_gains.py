@@ -16,6 +16,7 @@ from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.gain_bootstrap import GainsRun, bootstrap_gains
 from escape_hw.calibration.gain_loop import GainLoop, Stretch
 from escape_hw.calibration.optical_gain import projector, slope_weights
+from escape_hw.calibration.pseudo_synthetic import at_rest
 from escape_hw.calibration.push_pull import push_pull
 from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 from escape_hw.io.fits import load_matrix, save_matrix
@@ -205,3 +206,32 @@ def test_the_command_keeps_gains_and_matrix(
     assert content.gains["push-pull"].converged
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "Optical gains" in page
+
+
+def test_another_matrix_lends_its_shape(
+    bench: System, baseline: CalibrationResult, opened: CalibrationResult
+) -> None:
+    """The result's gains are those of the matrix that closed the loop; the other one has its own."""
+    shape = scaled(baseline, 2.0).matrix
+    run = bench.run(
+        bootstrap_gains(
+            bench, opened, accuracy=0.2, frames=900, shape=shape, beside={"baseline": baseline.matrix}
+        )
+    )
+    assert list(run.result.beside) == ["baseline"]
+    share = run.rescaled.matrix.data / baseline.matrix.data
+    # Half the gain of the same matrix at half the size.
+    np.testing.assert_allclose(
+        np.median(share, axis=0), np.maximum(run.result.beside["baseline"].best, 0.15), rtol=1e-3
+    )
+    assert np.median(gains_of(run).best) > 1
+
+
+def test_only_a_matrix_of_the_model_has_a_shape_at_rest(bench: System, baseline: CalibrationResult) -> None:
+    assert at_rest(bench, baseline) is None
+    made = bench.calibrate("escape", frames=900)
+    calm = at_rest(bench, made)
+    assert calm is not None
+    np.testing.assert_array_equal(calm.m2c, made.matrix.m2c)
+    # At rest a pyramid answers more strongly than under turbulence.
+    assert np.median(calm.data.std(axis=0) / made.matrix.data.std(axis=0)) > 1.1

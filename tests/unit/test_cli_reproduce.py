@@ -88,3 +88,25 @@ def test_reproduce_all_leads_to_every_report(escape, document, bench, tmp_path):
     assert list(found["parts"]) == ["table1", "maps"]
     assert document("reproduce", "all", "--out", tmp_path / "x", "--only", "mops")[0] == 2
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.usefixtures("reports")
+def test_reproduce_all_goes_on_where_it_was(document, bench, tmp_path):
+    words = ("reproduce", "all", "--out", tmp_path / "all", "--share", 0.1)
+    first = document(*words, "--only", "maps")[1]["parts"]["maps"]
+    calls = len(bench.calls)
+    _, found, err = document(*words, "--only", "maps", "--only", "table1", "--resume")
+    assert "maps: finished" in err
+    assert [name for name, _ in bench.calls[calls:]] == ["escape", "escape"]
+    assert list(found["parts"]) == ["table1", "maps"]
+    assert found["parts"]["maps"]["finished_utc"] == first["finished_utc"]
+    assert 'href="maps/report.html"' in (tmp_path / "all" / "index.html").read_text()
+
+
+@pytest.mark.usefixtures("reports")
+def test_reproduce_all_takes_no_other_run_for_its_own(document, tmp_path):
+    document("reproduce", "table1", "--out", tmp_path / "all" / "maps")
+    words = ("reproduce", "all", "--out", tmp_path / "all", "--only", "maps", "--resume")
+    code, found, _ = document(*words)
+    assert code == 2
+    assert "reproduce table1" in found["error"]["message"]
