@@ -21,9 +21,13 @@ from scripted import ScriptedControl, ScriptedSource
 
 from escape_gui.app import application
 from escape_gui.main_window import MainWindow
+from escape_gui.maps import mask_of
+from escape_gui.panels.modes import ModesPanel
 from escape_gui.session import Session
 from escape_gui.settings import Settings
 from escape_gui.workspaces import WORKSPACES
+from escape_hw.remote.source import Sample
+from escape_hw.remote.state import Phase, Running
 
 BUDGET_MS = 8.0
 TICKS = 150
@@ -32,17 +36,22 @@ PERIOD_S = 0.033
 PREPARED = 8
 
 
-def prepared() -> list[dict[str, object]]:
+def prepared() -> list[dict[str, Sample]]:
     """Sets of entries for all streams."""
     source = ScriptedSource()
     sets = []
     for seed in range(PREPARED):
         source.push_all(seed)
+        rng, valid = np.random.default_rng(seed), mask_of(source.places.valid)
+        matrix = rng.normal(0, 1, (2 * int(valid.sum()), source.places.n_modes)).astype(np.float32)
+        source.push("valid", valid.astype(np.uint8))
+        source.push("matrix", matrix, stage="DO-CRIME")
+        source.push("matrix_sigma", np.full_like(matrix, 0.3))
         sets.append(dict(source.streams))
     return sets
 
 
-def measure(name: str, size: tuple[int, int], sets: list[dict[str, object]]) -> tuple[float, float, float]:
+def measure(name: str, size: tuple[int, int], sets: list[dict[str, Sample]]) -> tuple[float, float, float]:
     """Median and 95th percentile of a tick, and median with drawing, in milliseconds."""
     qt = application()
     session, source = Session(), ScriptedSource()
@@ -51,12 +60,14 @@ def measure(name: str, size: tuple[int, int], sets: list[dict[str, object]]) -> 
     session.use(source, ScriptedControl())
     window.show()
     qt.processEvents()
+    _push(source, sets[0])
+    if name == "calibrate":
+        _calibrating(window, source)
     ticks, drawn = [], []
     due = time.perf_counter()
     for k in range(TICKS):
         entries = sets[k % PREPARED]
-        for stream, sample in entries.items():
-            source.push(stream, sample.data, **sample.meta)
+        _push(source, entries)
         source.change(rates=source.state.rates.model_copy(update={"frames": k}))
         start = time.process_time()
         window.ticker.tick()
@@ -70,6 +81,23 @@ def measure(name: str, size: tuple[int, int], sets: list[dict[str, object]]) -> 
     session.close()
     kept = slice(TICKS // 5, None)
     return float(np.median(ticks[kept])), float(np.percentile(ticks[kept], 95)), float(np.median(drawn[kept]))
+
+
+def _push(source: ScriptedSource, entries: dict[str, Sample]) -> None:
+    for stream, sample in entries.items():
+        source.push(stream, sample.data, **sample.meta)
+
+
+def _calibrating(window: MainWindow, source: ScriptedSource) -> None:
+    """A matrix that grows, one of its modes in detail, and the camera beside it."""
+    running = Running(id=1, name="docrime", arguments={}, stage="DO-CRIME", total=10_000)
+    source.change(procedure=running, phase=Phase.PROCEDURE)
+    window.docks["camera"].raise_()
+    window.ticker.tick(everything=True)
+    modes = window.panels["modes"]
+    assert isinstance(modes, ModesPanel)
+    modes.mosaic.choose(9)
+    assert modes.detail.isVisibleTo(window), "nothing is shown that could be measured"
 
 
 def main() -> None:

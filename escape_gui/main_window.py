@@ -45,7 +45,7 @@ from escape_hw.errors import StorageError
 
 log = logging.getLogger(__name__)
 #: Version of the arrangement Qt stores; layouts of another one are dropped.
-LAYOUT_VERSION = 2
+LAYOUT_VERSION = 3
 
 
 class MainWindow(QMainWindow):

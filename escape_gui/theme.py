@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Literal
 
 from PySide6.QtCore import QObject, Signal
@@ -216,9 +217,11 @@ def style_sheet(theme: Theme) -> str:
         sheet = sheet.replace(f"@{name};", f"{names[name]};").replace(f"@{name} ", f"{names[name]} ")
     for unit in (2, 4, 6, 8, 12, 16, 24):
         sheet = sheet.replace(f"@{unit}px", f"{theme.pixels(unit)}px")
-    return sheet
+    return sheet.replace("@arrow", _ARROW.as_posix())
 
 
+#: Of lists to choose from: Qt's own comes with a frame that belongs to no palette of ours.
+_ARROW = Path(__file__).with_name("down.png")
 _SHEET = """
 QMainWindow, QDialog { background: @window; }
 QMainWindow::separator { background: @window; width: 6px; height: 6px; }
@@ -254,6 +257,8 @@ QLineEdit, QSpinBox, QDoubleSpinBox, QComboBox { background: @field; color: @tex
 QSpinBox::up-button, QSpinBox::down-button, QDoubleSpinBox::up-button, QDoubleSpinBox::down-button
     { width: 0; border: none; }
 QLineEdit:disabled, QSpinBox:disabled, QDoubleSpinBox:disabled, QComboBox:disabled { color: @muted; }
+QComboBox::drop-down { border: none; width: @16px; padding-right: @2px; }
+QComboBox::down-arrow { image: url(@arrow); width: @12px; height: @12px; }
 QComboBox QAbstractItemView { background: @field; color: @text; border: 1px solid @line; }
 QTableView, QPlainTextEdit, QTextBrowser, QListView { background: @field; color: @text;
     border: 1px solid @line; border-radius: 4px; }

@@ -58,7 +58,7 @@ WORKSPACES: tuple[Workspace, ...] = (
         (
             Column((Cell(("devices",), 1.5), Cell(("log",), 1.0)), 1.0),
             Column((Cell(("camera",)),), 1.5),
-            Column((Cell(("mirror",), 1.1), Cell(("psf",), 1.0)), 1.0),
+            Column((Cell(("mirror",), 1.0), Cell(("psf",), 1.2)), 1.0),
         ),
     ),
     Workspace(
@@ -67,9 +67,10 @@ WORKSPACES: tuple[Workspace, ...] = (
         "Interaction matrix, registration, optical gains",
         (
             # The form with its plan and its result takes a whole column of a small screen.
-            Column((Cell(("procedure",)),), 1.0),
-            Column((Cell(("modes",), 1.6), Cell(("camera", "devices", "log"), 1.0)), 1.4),
-            Column((Cell(("sprint",), 1.2), Cell(("gains",), 1.0)), 1.1),
+            Column((Cell(("procedure",)),), 0.95),
+            # Mosaic and the chosen mode in all matrices are seen together.
+            Column((Cell(("modes",)),), 1.3),
+            Column((Cell(("sprint",), 1.3), Cell(("gains", "camera", "devices", "log"), 1.0)), 1.15),
         ),
     ),
     Workspace(

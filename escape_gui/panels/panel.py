@@ -32,6 +32,18 @@ class Context:
     session: Session
 
 
+class _Pages(QStackedLayout):
+    """Content, or the words that stand for it.
+
+    Where a line wraps, a scroll area would give all that it would like and scroll, though it could do
+    with less.
+    """
+
+    def hasHeightForWidth(self) -> bool:
+        """The least height counts."""
+        return False
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Shown:
     """An array that a panel shows, for saving.
@@ -91,7 +103,7 @@ class Panel(QWidget):
         self.body = QVBoxLayout()
         self.body.setContentsMargins(8, 8, 8, 8)
         self.body.setSpacing(8)
-        self._stack = QStackedLayout(self)
+        self._stack = _Pages(self)
         holder = QWidget()
         holder.setLayout(self.body)
         self._nothing = QLabel(self.empty)

@@ -79,7 +79,7 @@ class ProcedurePanel(Panel):
         self.form.edited.connect(self._edit)
         self.plan = _words()
         self.plan.setAccessibleName("Plan")
-        for widget, stretch in ((self.choice, 0), (self._about, 0), (self.form, 2), (self.plan, 0)):
+        for widget, stretch in ((self.choice, 0), (self._about, 0), (self.form, 100), (self.plan, 0)):
             self.body.addWidget(widget, stretch)
 
     def _make_buttons(self) -> None:
@@ -120,7 +120,8 @@ class ProcedurePanel(Panel):
         self._outcome.setWidgetResizable(True)
         self._outcome.setFrameShape(QFrame.Shape.NoFrame)
         self._outcome.setWidget(self._result)
-        self.body.addWidget(self._outcome, 1)
+        self.body.addWidget(self._outcome, 100)
+        self.body.addStretch(1)
         self._outcome.hide()
 
     # ------------------------------------------------------------ data

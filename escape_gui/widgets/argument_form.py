@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from PySide6.QtCore import Qt, Signal
+from PySide6.QtCore import QSize, Qt, Signal
 from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
@@ -14,6 +14,7 @@ from PySide6.QtWidgets import (
     QLabel,
     QLineEdit,
     QScrollArea,
+    QSizePolicy,
     QVBoxLayout,
     QWidget,
 )
@@ -48,6 +49,13 @@ class ArgumentForm(QWidget):
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(self._area)
+        # What follows stands right below the last argument; on a small screen the form scrolls.
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
+
+    def sizeHint(self) -> QSize:
+        """As high as its arguments."""
+        hint, page = super().sizeHint(), self._area.widget()
+        return hint if page is None else QSize(hint.width(), page.sizeHint().height())
 
     def show_parameters(self, parameters: Sequence[Parameter], matrices: tuple[str, ...]) -> None:
         """Make the form; arguments stand at their defaults."""
@@ -77,6 +85,7 @@ class ArgumentForm(QWidget):
             name.setBuddy(field)
             form.addRow(name, row)
         self._area.setWidget(page)
+        self.updateGeometry()
 
     def offer_matrices(self, matrices: tuple[str, ...]) -> None:
         """Other matrices to choose from; a choice that is still there stays."""

@@ -34,7 +34,12 @@ def picture(values: ArrayLike, width: int = 240) -> str:
     colours = _ENDS[low] + (_ENDS[low + 1] - _ENDS[low]) * (share - low)[..., None]
     colours[~known] = 160
     data = base64.b64encode(_png(colours.astype(np.uint8))).decode()
-    return f'<img src="data:image/png;base64,{data}" width="{width}" style="image-rendering:pixelated"/>'
+    # A tall matrix is pressed into a square: it is to be seen at one glance.
+    height = min(round(width * image.shape[0] / image.shape[1]), width)
+    return (
+        f'<img src="data:image/png;base64,{data}" width="{width}" height="{height}" '
+        'style="image-rendering:pixelated"/>'
+    )
 
 
 def curve(values: ArrayLike, width: int = 240, height: int = 48) -> str:

@@ -1,9 +1,9 @@
-"""A server's state for notebooks."""
+"""What a server says, for notebooks."""
 
 from __future__ import annotations
 
 from escape_hw.api.thumbnail import table
-from escape_hw.remote.state import State
+from escape_hw.remote.state import Plan, ProcedureEntry, State
 
 
 def state_html(state: State) -> str:
@@ -27,3 +27,26 @@ def state_html(state: State) -> str:
     rows["devices"] = ", ".join(f"{one.name} {one.health.value}" for one in state.devices)
     rows["server"] = f"process {state.server_pid}, ESCAPE {state.version}"
     return table(rows, "Server")
+
+
+def plan_html(plan: Plan) -> str:
+    """What a procedure would do."""
+    said = {key: value for key, value in plan.arguments.items() if value is not None}
+    rows: dict[str, object] = {
+        "frames": plan.frames,
+        "at the camera's rate": f"{plan.seconds:.1f} s",
+        "largest poke": f"{100 * plan.stroke:.3g} % of the stroke" if plan.stroke else "none",
+        "arguments": ", ".join(f"{key} {value}" for key, value in said.items()),
+    }
+    if plan.warnings:
+        rows["mind"] = "; ".join(plan.warnings)
+    return table(rows, f"Plan of {plan.name}")
+
+
+def procedure_html(entry: ProcedureEntry) -> str:
+    """A procedure with its parameters."""
+    rows = {
+        one.name: f"{one.help} {'' if one.default is None else f'Default: {one.default} {one.unit}'}".strip()
+        for one in entry.parameters
+    }
+    return table(rows, f"{entry.name}: {entry.help}")

@@ -245,6 +245,11 @@ class State(Part):
     #: What the server found when it started: a crash before, a calibration that can be resumed.
     notes: tuple[str, ...] = ()
 
+    def _repr_html_(self) -> str:
+        from escape_hw.remote.html import state_html
+
+        return state_html(self)
+
 
 class LogLine(Part):
     """One line of the log."""
@@ -286,6 +291,11 @@ class Plan(Part):
     stroke: float
     warnings: tuple[str, ...] = ()
 
+    def _repr_html_(self) -> str:
+        from escape_hw.remote.html import plan_html
+
+        return plan_html(self)
+
 
 class Parameter(Part):
     """One argument of a procedure, enough to make a form of it."""
@@ -308,3 +318,8 @@ class ProcedureEntry(Part):
     title: str
     help: str
     parameters: tuple[Parameter, ...] = ()
+
+    def _repr_html_(self) -> str:
+        from escape_hw.remote.html import procedure_html
+
+        return procedure_html(self)

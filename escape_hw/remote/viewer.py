@@ -73,7 +73,7 @@ class Viewer:
         self, endpoint: Endpoint, name: str = "", keys: tuple[bytes, bytes, bytes] | None = None
     ) -> None:
         self.client = str(uuid.uuid4())
-        self._name = name or os.path.basename(sys.argv[0]) or "python"
+        self._name = name or _program()
         self._closed = self._known = False
         self._changed = threading.Condition()
         self._state = State()
@@ -240,3 +240,9 @@ class Viewer:
     def _how_ended(self, run: int) -> Ended | None:
         last = self._state.last
         return last if last is not None and last.id == run else self._ended.get(run)
+
+
+def _program() -> str:
+    """What other clients call this one: its script, or that it is a notebook."""
+    name = os.path.basename(sys.argv[0])
+    return "notebook" if name.startswith("ipykernel") else name or "python"

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TaskID, 
 from rich.progress import Progress as RichProgress
 
 from escape_hw.api.procedure import Progress
+from escape_hw.runtime.notebook_bar import NotebookBar
 
 #: Seconds between two lines where no bar can be drawn.
 _LINE_PERIOD_S = 10.0
@@ -22,13 +23,18 @@ class ProgressView:
     def __init__(self, console: Console, quiet: bool = False) -> None:
         self._console, self._quiet = console, quiet
         self._bars: RichProgress | None = None
+        self._notebook: NotebookBar | None = None
         self._task: TaskID | None = None
         self._stage: str | None = None
         self._last_line = 0.0
 
     def __enter__(self) -> Self:
         """Begin to draw."""
-        if not self._quiet and (self._console.is_terminal or self._console.is_jupyter):
+        if self._quiet:
+            return self
+        if self._console.is_jupyter:
+            self._notebook = NotebookBar()
+        elif self._console.is_terminal:
             self._bars = RichProgress(
                 SpinnerColumn(),
                 TextColumn("{task.description}"),
@@ -46,6 +52,8 @@ class ProgressView:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Stop drawing."""
+        if self._notebook is not None and error is None:
+            self._notebook.finish()
         if self._bars is not None:
             self._bars.stop()
             self._bars = None
@@ -54,7 +62,9 @@ class ProgressView:
         """Observe one progress."""
         if self._quiet:
             return
-        if self._bars is not None:
+        if self._notebook is not None:
+            self._notebook.draw(progress.stage, progress.done, progress.total, _words(progress))
+        elif self._bars is not None:
             self._draw(self._bars, progress)
         else:
             self._write(progress)
@@ -73,7 +83,7 @@ class ProgressView:
             total=progress.total,
             completed=progress.done,
             left=_left(progress),
-            metrics="  ".join(f"{name} {value:.3g}" for name, value in list(progress.metrics.items())[:3]),
+            metrics=_metrics(progress),
         )
 
     def _write(self, progress: Progress) -> None:
@@ -81,12 +91,21 @@ class ProgressView:
         if progress.stage == self._stage and now - self._last_line < _LINE_PERIOD_S:
             return
         self._stage, self._last_line = progress.stage, now
-        left = _left(progress)
-        self._console.print(
-            f"{progress.stage}: {progress.done} of {progress.total} {progress.unit}s"
-            + (f", {left}" if left else ""),
-            highlight=False,
-        )
+        self._console.print(f"{progress.stage}: {_count(progress)}", highlight=False)
+
+
+def _count(progress: Progress) -> str:
+    whole = f" of {progress.total}" if progress.total else ""
+    left = _left(progress)
+    return f"{progress.done}{whole} {progress.unit}s" + (f", {left}" if left else "")
+
+
+def _words(progress: Progress) -> str:
+    return "  ".join(filter(None, (_count(progress), _metrics(progress))))
+
+
+def _metrics(progress: Progress) -> str:
+    return "  ".join(f"{name} {value:.3g}" for name, value in list(progress.metrics.items())[:3])
 
 
 def _left(progress: Progress) -> str:

@@ -83,6 +83,14 @@ class Channel:
                 return
             yield from lines.feed(data)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether something has arrived that nobody took yet; the end of it does not count."""
+        try:
+            return bool(self._connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
+        except OSError:
+            return False
+
     def close(self) -> None:
         """Send what waits, and hang up."""
         with contextlib.suppress(queue.Full):

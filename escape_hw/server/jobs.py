@@ -161,11 +161,11 @@ def _place(engine: Engine, task: Task[Any], run: int) -> Path:
 
 
 def _shelve(engine: Engine, ended: Ended) -> None:
-    # A matrix that was computed goes before the one it was computed from.
-    main = ("escape",) if "escape" in ended.products else ("im", "loop", ended.name)
+    # One product has the run's own name: a matrix that was computed before the one it was computed from.
+    main = next((key for key in ("escape", "im", "loop", ended.name) if key in ended.products), "")
     for key, path in ended.products.items():
         if key in _SHELVED:
-            name = f"{ended.name}-{ended.id}" + ("" if key in main else f"-{key}")
+            name = f"{ended.name}-{ended.id}" + ("" if key == main else f"-{key}")
             engine.shelf.put(Path(path), name)
 
 

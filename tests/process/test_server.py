@@ -180,6 +180,13 @@ def test_sprint_on_a_stored_matrix(bench: Connection, matrix: str) -> None:
     assert made[f"sprint-{run.id}-im"].startswith("docrime")
 
 
+def test_gains_and_the_matrix_that_they_scale_both_stay_on_the_shelf(bench: Connection, matrix: str) -> None:
+    run = bench.start("gains", im=matrix, frames=300, accuracy=0.5, strehl=False)
+    run.wait(120)
+    kinds = {one.name: one.kind for one in bench.state.products}
+    assert (kinds[f"gains-{run.id}"], kinds[f"gains-{run.id}-gains"]) == ("matrix", "gains")
+
+
 def test_every_procedure_of_the_command_line_is_offered(bench: Connection) -> None:
     offered = {one.name for one in bench.procedures()}
     assert {*METHODS, "sprint", "loop", "gains", "track"} <= offered

@@ -159,6 +159,7 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("seed", range(5))
 def test_ten_kills_at_random_moments_of_a_calibration(system, bench, tmp_path, seed) -> None:
     server, spy = bench

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 
 import pytest
 from rich.console import Console
@@ -57,3 +58,37 @@ def test_quiet_shows_nothing():
 )
 def test_time_left_in_words(seconds, words):
     assert time_left(seconds) == words
+
+
+class Output:
+    """An output of a notebook, as IPython shows it."""
+
+    def __init__(self) -> None:
+        self.html: list[str] = []
+
+    def HTML(self, text: str) -> str:
+        return text
+
+    def display(self, html: str, display_id: bool) -> Output:
+        assert display_id
+        self.update(html)
+        return self
+
+    def update(self, html: str) -> None:
+        self.html.append(html)
+
+
+def test_a_notebook_shows_one_output_without_widgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    output = Output()
+    monkeypatch.setitem(sys.modules, "IPython.display", output)
+    with ProgressView(Console(file=io.StringIO(), force_jupyter=True)) as view:
+        view(Progress("starting", 0, 0))
+        for stage in ("DO-CRIME", "<SPRINT>"):
+            for done in range(1, 100):
+                view(Progress(stage, done, 100, elapsed_s=done * 0.9, metrics={"rms": 0.123456}))
+    # In each stage few of the hundred are drawn.
+    assert len(output.html) < 50
+    assert "&lt;SPRINT&gt;: 1 of 100 frames  rms 0.123" in "".join(output.html)
+    # In the end both stages are whole, and what was only waiting is gone.
+    assert output.html[-1].count("value='100' max='100'") == 2
+    assert "starting" not in output.html[-1]
