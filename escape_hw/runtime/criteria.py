@@ -43,9 +43,11 @@ def gains_converged(result: GainsResult) -> dict[str, Any]:
     if not result.rounds:
         return check("optical gains: measured at least once", False)
     last = result.rounds[-1]
+    short = "" if last.reached else ", its frames ended before the accuracy asked for"
     return check(
         f"optical gains: converged in {len(result.rounds)} rounds (last change {100 * last.change:.1f} %, "
-        f"{100 * last.expected_change:.1f} % expected of the errors, poke {100 * last.poke:.2g} % of stroke)",
+        f"{100 * last.expected_change:.1f} % expected of the errors, "
+        f"poke {100 * last.poke:.2g} % of stroke{short})",
         result.converged,
     )
 
