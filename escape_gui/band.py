@@ -131,8 +131,9 @@ class Band(QWidget):
             "lost": f"{state.rates.lost:d}",
             "rms": f"{state.mirror.rms:.3f}",
             "peak": f"{state.mirror.peak:.3f}",
-            "latency": f"{state.latency.p99:.0f}",
-            "jitter": f"{state.latency.jitter_p99:.0f}",
+            # Nothing was late where no frame was answered in the last second.
+            "latency": f"{state.latency.p99:.0f}" if state.latency.p99 else UNKNOWN,
+            "jitter": f"{state.latency.jitter_p99:.0f}" if state.latency.p99 else UNKNOWN,
         }
         for name, text in values.items():
             self.readouts[name].show_value(text if known else UNKNOWN)
