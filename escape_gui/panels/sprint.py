@@ -100,7 +100,8 @@ class SprintPanel(Panel):
         if last is None or last.id == self._told or self._running:
             return
         self._told = last.id
-        if last.document.get("converged") is not None or last.document.get("track"):
+        fitted = last.document.get("registration") is not None and last.document.get("converged") is not None
+        if fitted or last.document.get("track"):
             self._document, self._dirty = last.document, True
 
     def take_sample(self, stream: str, sample: Sample) -> None:

@@ -107,7 +107,7 @@ def _difference(
     rms_a, rms_b = (_rms(one[both]) or 1.0 for one in (a, b))
     difference = np.where(both, a / rms_a - b / rms_b, np.nan)
     correlation = float(np.mean(a[both] * b[both])) / (rms_a * rms_b)
-    note = f"correlation {correlation:.4f}, gain {rms_a / rms_b:.3f}"
+    note = f"correlation {correlation:.3f}, gain {rms_a / rms_b:.2f}"
     limit = _enough(3 * _rms(difference[both]), _LIMITS)
     return [Tile(f"{labels[0]} − {labels[1]}", note, difference, (-limit, limit), True)]
 

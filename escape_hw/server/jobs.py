@@ -72,6 +72,7 @@ def do_task(engine: Engine, task: Task[Any], config: SystemConfig, before: LoopC
     usual, bench.config = bench.config, config
     # A procedure finds the camera as the command line hands it over.
     bench.wfs.stop()
+    engine.publisher.forget_residual()
     board.closed = board.needs_loop
     try:
         ended = _run(engine, task, running)
@@ -112,9 +113,13 @@ def _run(engine: Engine, task: Task[Any], running: Running) -> Ended:
         return Ended(id=running.id, name=running.name, finish=finish, message=str(error), folder=place)
     products = {name: str(path) for name, path in kept.document["products"].items()}
     message = "" if kept.met else "it did not meet its own criteria"
+    if stop is not None:
+        # A watchdog stops a run as the operator does, by the same flag.
+        fault = engine.board.fault
+        message = f"{stop if fault is None else fault.reason}; what was measured is kept"
     return Ended(
         id=running.id, name=running.name, finish=Finish.DONE if stop is None else Finish.ABORTED,
-        message=message if stop is None else f"{stop}; what was measured is kept",
+        message=message,
         folder=str(folder.path), products=products, document=plain(kept.document),
     )  # fmt: skip
 
@@ -258,6 +263,7 @@ def _wanted(engine: Engine, request: CloseLoop | SetLoop | LoopChoice) -> LoopCh
 def _keep_loop_closed(engine: Engine, orders: LoopOrders, closed: Callable[[], object]) -> None:
     board, bench = engine.board, engine.bench
     bench.wfs.stop()
+    engine.publisher.forget_residual()
     board.closed = True
     engine.pulse.beat()
     closed()

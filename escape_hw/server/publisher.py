@@ -146,6 +146,10 @@ class Publisher:
         self.commands += 1
         self._write("commands", command, self.commands)
 
+    def forget_residual(self) -> None:
+        """Another loop is about to be closed: the residual of the one before says nothing of it."""
+        self.residual_nm = 0.0
+
     def _residual(self, index: int, modes: NDArray[np.float32], rms: float) -> None:
         self.residual_nm = rms
         self._write("modes", modes, index)

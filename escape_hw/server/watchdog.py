@@ -82,6 +82,9 @@ class Watchdog:
     def _diverging(self, state: State) -> Verdict | None:
         if not state.loop.closed or state.loop.residual_nm <= 0:
             return None
+        if self._residuals and state.loop.residual_nm == self._residuals[-1]:
+            # No frame since the last state: a procedure that closes a loop of its own has not begun with it.
+            return None
         self._residuals.append(state.loop.residual_nm)
         if len(self._residuals) < 4 * _NOW:
             return None
