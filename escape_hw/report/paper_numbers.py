@@ -173,8 +173,12 @@ def _swept(run: RunContent | None) -> Iterator[PaperNumber]:
         kept, chance = sweep["importance"]["matrix"], sweep["importance"].get("chance", 0.0)
         share = f"{100 * kept:.1f} % of the variance; a parameter that does nothing {100 * chance:.1f} %"
     yield PaperNumber(f"{name}: importance of the choice of matrix", "little or none", share)
-    stated = [row["text"] for row in document.get("comparisons", ()) if row["first"].startswith("ESCAPE")]
-    yield PaperNumber(f"{name}: at their own best parameters", "equivalent", stated[0] if stated else None)
+    stated = [
+        row["text"]
+        for row in document.get("comparisons", ())
+        if row["first"].startswith("ESCAPE") and row["second"] == "push-pull"
+    ]
+    yield PaperNumber(f"{name}: at their own best parameters", "equivalent", "; ".join(stated) or None)
 
 
 PARTS = (
