@@ -45,6 +45,10 @@ class Anamorphosis:
     unit: str = "% of the diameter"
     scatter: float = _SHEAR
 
+    def doubt(self, registration_doubt: NDArray[np.float64]) -> float:
+        """What the model's own error adds: as much as to the scalings, of which a shear is one."""
+        return float(registration_doubt[3:].max())
+
     def per_share(self, registration: Registration, width: float, share: float) -> NDArray[np.float64]:
         """Change of the zonal matrix ``(n_slopes, n_act)`` per prior scatter.
 
@@ -82,6 +86,10 @@ class PupilShift:
     unit: str = "% of a sub-aperture"
     scatter: float = _PUPIL_SHIFT
 
+    def doubt(self, registration_doubt: NDArray[np.float64]) -> float:
+        """Nothing: a registration is in doubt because the images are, whose shift is told here."""
+        return 0.0
+
     def per_share(self, registration: Registration, width: float, share: float) -> NDArray[np.float64]:
         """As for :class:`Anamorphosis`, to first order: images are not made anew for every share."""
         here = self.model.zonal_matrix(registration, width)
@@ -110,10 +118,15 @@ class FoundExtra:
     place: int
     share: float
 
-    def measured(self, sigma: NDArray[np.float64]) -> Measured:
-        """With its standard error, from those of all unknowns of the fit."""
-        scatter = self.unknown.scatter
-        return Measured(self.share * scatter, float(sigma[self.place]) * scatter, self.unknown.unit)
+    def measured(self, sigma: NDArray[np.float64], registration_doubt: NDArray[np.float64]) -> Measured:
+        """With its standard error, from those of all unknowns and the model's own of the registration."""
+        unknown = self.unknown
+        told = float(sigma[self.place]) * unknown.scatter
+        return Measured(
+            self.share * unknown.scatter,
+            float(np.hypot(told, unknown.doubt(registration_doubt))),
+            unknown.unit,
+        )
 
 
 def family_of(name: str) -> Extra:

@@ -23,7 +23,7 @@ from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Measured, RegistrationEstimate
 from escape_hw.api.threads import hold_to_one_thread
 from escape_hw.calibration.capture import EXPLAINED
-from escape_hw.calibration.covariance import sandwich
+from escape_hw.calibration.covariance import FLOOR, sandwich
 from escape_hw.calibration.degeneracy import degeneracies
 from escape_hw.calibration.derivatives import modal_matrix
 from escape_hw.calibration.extra_unknowns import extra_unknowns
@@ -285,8 +285,8 @@ def _estimate(
     notes = degeneracies(covariance[np.ix_([*named.values()], [*named.values()])], [*named])
     if found.scatter is not None:
         covariance[1:6, 1:6] += found.scatter
-    if isinstance(model, DoubtfulModel):
-        covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(model.registration_doubt)
+    doubt = model.registration_doubt if isinstance(model, DoubtfulModel) else np.zeros(5)
+    covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(doubt)
     warnings = []
     if not found.settled:
         warnings.append(f"the steps did not shrink within {len(history)} iterations")
@@ -318,5 +318,5 @@ def _estimate(
         tuple(warnings),
         notes,
         found.departures,
-        {one.unknown.name: one.measured(sigma) for one in found.extras},
+        {one.unknown.name: one.measured(sigma, np.hypot(FLOOR, doubt)) for one in found.extras},
     )

@@ -209,17 +209,18 @@ def test_a_real_loop_asks_for_priority_and_says_what_was_refused(bench, good, mo
     asked = []
 
     @contextmanager
-    def refusing():
-        asked.append("in")
-        yield ("no real-time priority: Operation not permitted",)
+    def refusing(cpus=None, priority=1):
+        asked.append(priority)
+        yield ("no real-time priority: Operation not permitted",) if priority else ()
         asked.append("out")
 
     monkeypatch.setattr(endless_loop, "prompt", refusing)
     kept(bench, good, end=30)
-    assert asked == []
+    assert asked == [0, "out"]
+    asked.clear()
     monkeypatch.setattr(type(bench), "simulated", False)
     found = bench.run(keep_closed(bench, orders := LoopOrders(bench, good.run.result)),
                       observers=(Operator(bench, orders, end=30),))  # fmt: skip
     assert found.fault == ""
-    assert asked == ["in", "out"]
+    assert asked == [1, "out"]
     assert "frames may be answered late: no real-time priority" in caplog.text

@@ -51,7 +51,11 @@ def test_right_within_its_errors_whatever_the_loop_does(closing, name):
         assert found.registration.converged, found.registration.warnings
         assert found.measured is None
         assert found.matrix.metrics["frames"] == FRAMES
-        assert (found.matrix.metrics["shortened"] > 0) == (name == "commands cut by the limits")
+        if name == "commands cut by the limits":
+            assert found.matrix.metrics["shortened"] > 0
+        elif name != "a matrix half as large":
+            # That one doubles the loop's gain, whose commands may reach the limits, too.
+            assert found.matrix.metrics["shortened"] == 0
         pulls.append(pull(found))
     assert np.abs(pulls).max() < 5
     assert np.mean(np.square(pulls)) < 3

@@ -129,6 +129,7 @@ def test_on_the_twin_a_planted_shear_is_found_and_told():
         pulls.append((shear.value - SHEAR) / shear.sigma)
         assert shear.sigma < 0.5
     assert np.abs(pulls).max() < 4
+    assert np.mean(np.square(pulls)) < 2.5
 
 
 def test_what_a_model_or_solver_does_not_know_is_refused():

@@ -111,6 +111,7 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
         "choice": "snr",
         "loss": "squares",
         "actuators": "found",
+        "also": (),
     }
     assert bench.calls == [("sprint", asked)]
     assert (
