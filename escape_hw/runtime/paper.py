@@ -128,5 +128,10 @@ def sweep_runs(folders: Sequence[Path]) -> dict[str, Path]:
         system = str(document.get("system"))
         if "sweep" not in document or system not in ("razor-shwfs", "razor-pywfs"):
             raise ConfigError(f"--sweep {folder}: not a sweep of razor-shwfs or razor-pywfs")
+        if document.get("partial"):
+            raise ConfigError(
+                f"--sweep {folder}: it was broken off; finish it (escape sweep --resume {folder} --out NEW) "
+                "and give the new folder"
+            )
         found[f"sweep-{system.removeprefix('razor-')}"] = folder
     return found

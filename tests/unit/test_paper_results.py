@@ -56,3 +56,10 @@ def test_what_is_no_sweep_of_the_papers_is_refused(tmp_path):
     (tmp_path / "result.json").write_text('{"system": "maps-nir", "sweep": {}, "products": {}}')
     with pytest.raises(ConfigError, match="--sweep"):
         sweep_runs([tmp_path])
+
+
+def test_a_sweep_that_was_broken_off_is_not_taken_for_a_finished_one(sweep_run, tmp_path):
+    document = json.loads((sweep_run / "result.json").read_text())
+    (tmp_path / "result.json").write_text(json.dumps({**document, "partial": True}))
+    with pytest.raises(ConfigError, match="broken off; finish it"):
+        sweep_runs([tmp_path])

@@ -143,9 +143,10 @@ def _candidates(sweep: Sweep, records: Sequence[Record]) -> dict[tuple[str, int]
     for arm in sweep.arms:
         chosen = shortlist(records, sweep.space, arm.label, sweep.design.candidates)
         if not chosen:
+            said = {note for one in records if one.slot.arm == arm.label for note in one.outcome["notes"]}
             raise CalibrationError(
-                f"no loop with the matrix {arm.label} stayed closed; widen the range of the gain or leave "
-                "the matrix out"
+                f"no loop with the matrix {arm.label} gave a Strehl ratio; widen the range of the gain, make "
+                f"the loops longer, or leave the matrix out ({'; '.join(sorted(said)) or 'all diverged'})"
             )
         found.update({(arm.label, number): values for number, values in enumerate(chosen)})
     return found
