@@ -117,11 +117,20 @@ def test_saturated_actuators(closed, mirror) -> None:
 
 
 def test_a_diverging_residual(closed, mirror) -> None:
-    # The residual's usual size has to be known first, by its state five times a second.
-    seen = {closed.state.serial}
-    wait_for(lambda: len(seen) > 40 or seen.add(closed.state.serial), "states")
-    # Nothing of the shape remains from one frame to the next, and the residual becomes that of an open loop.
-    closed.set_loop(gain=0.01, leak=0.99)
+    loop = closed.state.loop
+    for _ in range(4):
+        # The residual's usual size has to be known first, by its state five times a second.
+        seen = {closed.state.serial}
+        wait_for(lambda seen=seen: len(seen) > 40 or seen.add(closed.state.serial), "states")
+        # Nothing of the shape remains from frame to frame, and the residual becomes that of an open loop.
+        closed.set_loop(gain=0.01, leak=0.99)
+        deadline = time.monotonic() + 8
+        while closed.state.fault is None and time.monotonic() < deadline:
+            time.sleep(0.1)
+        if closed.state.fault is not None:
+            break
+        # The air was calm, and without the loop hardly worse than with it: once more, in other air.
+        closed.set_loop(gain=loop.gain, leak=loop.leak)
     made_safe(closed, mirror[1], "the residual grew")
 
 

@@ -104,7 +104,7 @@ def test_one_mode_in_every_matrix():
         assert np.isnan(tile.maps[:, :12][outside]).all()
     a, b = (matrices[name].data[:, 10] for name in ("ESCAPE", "push-pull"))
     correlation = float(a @ b / np.sqrt((a @ a) * (b @ b)))
-    assert f"correlation {correlation:.4f}" in shown["ESCAPE − push-pull"].note
+    assert f"correlation {correlation:.3f}" in shown["ESCAPE − push-pull"].note
     same = tiles({"one": matrices["ESCAPE"], "other": matrices["ESCAPE"]}, 0)
     assert not np.nan_to_num(same[2].maps).any()
 
