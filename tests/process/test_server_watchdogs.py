@@ -145,5 +145,4 @@ def test_a_poke_run_that_lost_its_lease(held, mirror) -> None:
     watcher.acquire()
     made_safe(watcher, mirror[1], "was left alone for")
     assert watcher.state.last.finish is Finish.ABORTED
-    assert "was left alone for" in watcher.state.last.message
     watcher.release()
