@@ -182,7 +182,7 @@ class _Tracker:
         """
         bench, matrix, start = self.bench, self.used.matrix, self.used.registration
         c = bench.config.calibration
-        self.grid = motion.of(self.grid)
+        self.grid = motion.of(self.grid, closed=True)
         self.model = bench.model(self.grid)
         self.live = LiveRegistration(
             matrix, self.model, start, order=c.whiten_order, lags=c.lags,
