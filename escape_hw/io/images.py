@@ -11,6 +11,7 @@ import numpy as np
 from astropy.io import fits as astropy_fits
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, Region
 from escape_hw.io import fits_file
 from escape_hw.io.product import Product
@@ -95,6 +96,7 @@ class RecordedFrames:
     camera: str
     serial: str
     settings: CameraSettings
+    __repr__ = brief
 
     @property
     def lost_frames(self) -> int:
@@ -108,7 +110,7 @@ class RecordedFrames:
         return float(np.ptp(self.index)) / seconds if seconds > 0 else 0.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FramesProduct(Product[RecordedFrames]):
     """Camera frames read from disk."""
 

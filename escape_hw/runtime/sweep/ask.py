@@ -11,8 +11,8 @@ from escape_hw.errors import ConfigError
 from escape_hw.runtime.sweep.space import DELAY, LOOP_KEYS, Parameter, default_space, parse_parameter
 
 if TYPE_CHECKING:
-    from escape_hw.api.results import CalibrationResult
     from escape_hw.config.models import SystemConfig
+    from escape_hw.runtime.calibrated import Calibrated
     from escape_hw.runtime.loop_bench import LoopBench
     from escape_hw.runtime.sweep.kept import KeptSweep
     from escape_hw.runtime.sweep.result import SweepResult
@@ -76,7 +76,7 @@ def swept_space(config: SystemConfig, texts: Sequence[str]) -> tuple[Parameter, 
 
 def sweep_of(
     bench: LoopBench,
-    matrices: Mapping[str, CalibrationResult],
+    matrices: Mapping[str, Calibrated],
     folder: Path,
     vary: Sequence[str],
     asked: Mapping[str, Any],
@@ -109,7 +109,7 @@ def sweep_of(
 
 def _begin(
     bench: LoopBench,
-    matrices: Mapping[str, CalibrationResult],
+    matrices: Mapping[str, Calibrated],
     folder: Path,
     space: tuple[Parameter, ...],
     asked: Mapping[str, Any],
@@ -119,6 +119,7 @@ def _begin(
 
     from escape_hw.io.fits import load_matrix, save_matrix
     from escape_hw.io.storage import make_folder
+    from escape_hw.runtime.calibrated import calibration_of
     from escape_hw.runtime.keep import key_of
     from escape_hw.runtime.sweep.kept import KeptSweep
     from escape_hw.runtime.sweep.plan import Arm, Design
@@ -127,7 +128,8 @@ def _begin(
     folder = folder.absolute()
     make_folder(folder)
     arms = []
-    for label, calibration in matrices.items():
+    for label, given in matrices.items():
+        calibration = calibration_of(given)
         path = folder / f"{key_of(label)}.fits"
         # A file that holds this very matrix stays: its checksum says whether a study goes on.
         kept = load_matrix(path) if path.is_file() else None
