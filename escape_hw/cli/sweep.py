@@ -56,7 +56,7 @@ def sweep(
         typer.Option("--gains", metavar="FILE", help="Optical gains: compare with and without them."),
     ] = None,
     trials: Annotated[int, typer.Option("--trials", min=2, help="Loops with drawn parameters.")] = 200,
-    frames: Annotated[int, typer.Option("--frames", min=50, help="Frames of each loop.")] = 400,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of each loop.")] = 400,
     sampler: Annotated[
         str, typer.Option("--sampler", help="random (the same for every matrix), or tpe.")
     ] = "random",
@@ -114,7 +114,7 @@ def sweep(
 ) -> None:
     """Compare matrices, each at its own best gain, leak and number of modes, on the same air."""
     with session("sweep", json=json, quiet=quiet) as one:
-        from escape_hw.runtime.sweep.ask import need_optuna, swept_space
+        from escape_hw.runtime.sweep.ask import need_optuna, require_loop_frames, swept_space
 
         need_optuna()
         loop_ranges = {"gain": gain, "leak": leak, "dropped_modes": drop, "delay": delay}
@@ -128,6 +128,7 @@ def sweep(
         config = one.configured(choice)
         if resume is None:
             swept_space(config, request.vary)
+            require_loop_frames(config, frames)
         with one.run_folder(config, "sweep", out) as folder:
             with one.bench(choice) as bench:
                 from escape_hw.runtime.records import BenchRecord

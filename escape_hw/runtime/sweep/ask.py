@@ -74,6 +74,28 @@ def swept_space(config: SystemConfig, texts: Sequence[str]) -> tuple[Parameter, 
     return default_space(config.basis.n_modes, given)
 
 
+def require_loop_frames(config: SystemConfig, frames: int) -> None:
+    """Refuse loops too short for the Strehl ratios that a sweep judges them by.
+
+    Raises
+    ------
+    ConfigError
+        Says how many frames are needed; or there is no science camera.
+    """
+    from escape_hw.calibration.loop_run import CLOSING_S, frames_for_strehl
+
+    science = config.devices.science
+    if science is None:
+        raise ConfigError(f"'{config.system.name}' has no science camera to judge the loops of a sweep by")
+    least = frames_for_strehl(config.devices.wfs.frame_rate_hz, science.frame_rate_hz)
+    if frames < least:
+        raise ConfigError(
+            f"--frames {frames}: too short for Strehl ratios with an error; a loop closes in {CLOSING_S:g} s, "
+            f"then the science camera has to take some frames at {science.frame_rate_hz:g} Hz; "
+            f"the least is --frames {least}"
+        )
+
+
 def sweep_of(
     bench: LoopBench,
     matrices: Mapping[str, Calibrated],
@@ -88,6 +110,7 @@ def sweep_of(
     """A sweep with matrices in memory; see :meth:`~escape_hw.runtime.system.System.sweep`."""
     need_optuna()
     space = swept_space(bench.config, vary)
+    require_loop_frames(bench.config, asked["frames"])
     from escape_hw.runtime.sweep.kept import KEPT, read_kept
     from escape_hw.runtime.sweep.result import conclude
     from escape_hw.runtime.sweep.run import run_sweep
