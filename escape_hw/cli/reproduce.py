@@ -126,6 +126,7 @@ def everything(
     """Every table and figure one after the other, and a page that leads to their reports."""
     with session("reproduce all", json=json, quiet=quiet) as one:
         from escape_hw.cli.views import checks_view
+        from escape_hw.config.load import load_system
         from escape_hw.io import documents
         from escape_hw.report.index import write_index
         from escape_hw.report.paper_results import write_results
@@ -136,7 +137,7 @@ def everything(
         done = {case.kind: finished(out / case.kind, case.kind) if resume else None for case in chosen(only)}
         left = [case for case in chosen(only) if done[case.kind] is None]
         choices = {case.kind: options.Choice.of(case.system, set, seed, None) for case in left}
-        require_share([(case, one.configured(choices[case.kind])) for case in left], share)
+        require_share([(case, load_system(case.system, overrides=set or [], seed=seed)) for case in left], share)
         try:
             for case in chosen(only):
                 one.tell(f"{case.kind}: {case.title}")
