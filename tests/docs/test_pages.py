@@ -12,7 +12,12 @@ from pages import EVERY, ROOT, Block, blocks_of, call, escape, spelled_right
 
 DOCS = ROOT / "docs"
 #: Pages whose blocks belong together and are run whole; of the others, commands are parsed.
-RUN = sorted([*DOCS.glob("tutorial/*.md"), *DOCS.glob("how-to/*.md"), DOCS / "reference" / "products.md"])
+RUN = sorted(
+    [
+        *DOCS.glob("tutorial/*.md"), *DOCS.glob("how-to/*.md"), DOCS / "devices" / "add-a-driver.md",
+        DOCS / "reference" / "products.md",
+    ]
+)  # fmt: skip
 
 
 def name_of(page: Path) -> str:
