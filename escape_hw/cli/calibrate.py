@@ -105,7 +105,7 @@ def calibrate(
 
 
 def _tell_way_on(one: Session, error: BaseException, resumed: Path | None, force: bool) -> None:
-    """Add the command that goes on with what was measured, when its state was kept here or in the run before."""
+    """Add the command that goes on, when a state was kept, here or in the run before."""
     from escape_hw.io.state_file import STATE
 
     folders = [] if one.folder is None else [one.folder.path]

@@ -137,7 +137,9 @@ def everything(
         done = {case.kind: finished(out / case.kind, case.kind) if resume else None for case in chosen(only)}
         left = [case for case in chosen(only) if done[case.kind] is None]
         choices = {case.kind: options.Choice.of(case.system, set, seed, None) for case in left}
-        require_share([(case, load_system(case.system, overrides=set or [], seed=seed)) for case in left], share)
+        require_share(
+            [(case, load_system(case.system, overrides=set or [], seed=seed)) for case in left], share
+        )
         try:
             for case in chosen(only):
                 one.tell(f"{case.kind}: {case.title}")

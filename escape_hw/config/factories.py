@@ -74,7 +74,8 @@ def made(what: str, kind: type[T], factory: Callable[..., object], *arguments: A
         raise
     except Exception as error:
         raise ConfigError(
-            f"{what} cannot be made: {_name(factory)} failed with {type(error).__name__}: {error}{_place(error)}"
+            f"{what} cannot be made: {_name(factory)} failed with {type(error).__name__}: {error}"
+            f"{_place(error)}"
         ) from error
     if not isinstance(one, kind):
         raise ConfigError(

@@ -108,9 +108,7 @@ def model_factory(name: str) -> ModelFactory:
     ConfigError
         Unknown name (with the nearest one), its package is not completely installed, or is broken.
     """
-    return cast(
-        ModelFactory, partial(made, f"synthetic model '{name}'", SyntheticModel, _load(MODELS, name))
-    )
+    return cast(ModelFactory, partial(made, f"synthetic model '{name}'", SyntheticModel, _load(MODELS, name)))
 
 
 def emulator_factory(name: str) -> EmulatorFactory:

@@ -129,11 +129,12 @@ def load_frames(path: Path | str) -> FramesProduct:
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> RecordedFrames:
     data = fits_file.array(path, hdus, "FRAMES", np.uint16)
     times = fits_file.need(path, hdus, "TIMES").data
-    columns = [np.asarray(times[name]).astype(np.int64) for name in _COLUMNS]
-    if any(len(column) != len(data) for column in columns):
-        raise ValueError(f"{len(data)} frames, {len(times)} times")
+    index, exposed, arrived, saturated = (np.asarray(times[name]).astype(np.int64) for name in _COLUMNS)
+    if len(index) != len(data):
+        raise ValueError(f"{len(data)} frames, {len(index)} times")
     region = Region(int(header["REGX"]), int(header["REGY"]), data.shape[2], data.shape[1])
     settings = CameraSettings(
         region, float(header["EXPTIME"]), float(header["RATE"]), float(header["GAINDB"])
     )
-    return RecordedFrames(data, *columns, str(header["CAMERA"]), str(header["SERIAL"]), settings)
+    camera, serial = str(header["CAMERA"]), str(header["SERIAL"])
+    return RecordedFrames(data, index, exposed, arrived, saturated, camera, serial, settings)

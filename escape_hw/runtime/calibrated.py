@@ -1,4 +1,4 @@
-"""Matrices as scripts hand them over: as they were measured, as read from disk, or with their geometry apart."""
+"""Matrices as scripts hand them over: measured, read from disk, or with their geometry apart."""
 
 from __future__ import annotations
 

@@ -18,7 +18,6 @@ from escape_hw.runtime.reproduce_keep import keep_maps, keep_pywfs, keep_shwfs, 
 from escape_hw.runtime.reproduce_maps import reproduce_maps
 from escape_hw.runtime.reproduce_pywfs import reproduce_pywfs
 
-
 #: Keyword of the frames that a loop is closed for.
 _LOOP_FRAMES = "loop_frames"
 

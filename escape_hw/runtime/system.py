@@ -95,7 +95,8 @@ class System(LoopBench):
             What ``"escape"`` fits: ``"matrix"``, ``"telemetry"`` (fewer frames than modes are enough)
             or ``"auto"``; as configured by default.
         closing
-            An earlier calibration, or a loaded one: its matrix closes the loop, and the pokes stand beside the integrator.
+            An earlier calibration, or a loaded one: its matrix closes the loop, and the pokes stand beside
+            the integrator.
         until
             Stop when this signal-to-noise ratio or accuracy is reached.
         keep

@@ -32,9 +32,7 @@ def track() -> TrackResult:
 
 
 def telemetry() -> LoopTelemetry:
-    return LoopTelemetry(
-        np.arange(500), np.zeros(500), np.zeros((500, 912), np.float32), np.zeros((500, 97))
-    )
+    return LoopTelemetry(np.arange(500), np.zeros(500), np.zeros((500, 912), np.float32), np.zeros((500, 97)))
 
 
 def frames() -> RecordedFrames:

@@ -1,4 +1,4 @@
-"""What ``load_matrix`` returns goes wherever a calibration goes; anything else is refused with the way out."""
+"""What ``load_matrix`` returns goes wherever a calibration goes; anything else is told the way out."""
 
 from __future__ import annotations
 

@@ -98,8 +98,8 @@ def test_too_small_a_share_is_refused_before_anything_runs(document, bench, tmp_
     code, found, _ = document(*words, 0.005)
     assert code == 2
     said = re.fullmatch(
-        r"--share 0\.005: too small; (\w+) needs at least (\d+) frames \((\w+)\) and would get (\d+) of (\d+); "
-        r"the least is --share (\S+)",
+        r"--share 0\.005: too small; (\w+) needs at least (\d+) frames \((\w+)\) and would get (\d+) of (\d+)"
+        r"; the least is --share (\S+)",
         found["error"]["message"],
     )
     kind, least, name, got, full = said[1], int(said[2]), said[3], int(said[4]), int(said[5])

@@ -13,7 +13,13 @@ from escape_hw.api.tracking import TrackResult
 from escape_hw.cli.track import _show
 from escape_hw.io.track_document import track_document
 
-PLANTED = {"shift_x": -16.0, "shift_y": -71.0, "rotation": -0.77, "radial_scaling": 2.9, "tangential_scaling": 0.0}
+PLANTED = {
+    "shift_x": -16.0,
+    "shift_y": -71.0,
+    "rotation": -0.77,
+    "radial_scaling": 2.9,
+    "tangential_scaling": 0.0,
+}
 
 
 def shown(result: TrackResult, planted: dict[str, float] | None) -> str:
