@@ -149,13 +149,16 @@ class CalibrationResult:
 
     def __repr__(self) -> str:
         state = ", PARTIAL" if self.partial else ""
-        parts = [f"{type(self).__name__} of {self._taken()}{state}", f"matrix: {self.matrix!r}"]
+        parts = [
+            f"{type(self).__name__} of {self.frames} frames, {self._taken()}{state}",
+            f"matrix: {self.matrix!r}",
+        ]
         if self.registration is not None:
             parts.append(f"registration: {self.registration!r}")
         return f"<{chr(10).join(parts)}>".replace("\n", "\n  ")
 
     def _taken(self) -> str:
-        return f"{self.frames} frames, {self.lost_frames} lost, {self.sky_seconds:.1f} s"
+        return f"{self.lost_frames} lost, {self.sky_seconds:.1f} s"
 
     def _repr_html_(self) -> str:
         """For notebooks: the matrix, and the registration behind it."""
@@ -163,7 +166,7 @@ class CalibrationResult:
         if self.registration is not None:
             parts.append(self.registration._repr_html_())
         rows = {
-            "frames": self._taken(),
+            "frames": f"{self.frames}, {self._taken()}",
             **({"PARTIAL": "stopped by the operator"} if self.partial else {}),
             **{f"note {number}": text for number, text in enumerate(self.notes, 1)},
         }

@@ -45,11 +45,11 @@ def frames() -> RecordedFrames:
 RESULTS = {
     "InteractionMatrix": (fake.matrix, 1, ("push-pull of razor-shwfs (SIMULATED)", "94 modes", "at worst")),
     "CalibrationResult": (
-        fake.calibration, 3, ("10000 frames, 7 lost, 20.0 s", "escape of razor", "shift_x -16."),
+        fake.calibration, 3, ("10000 frames, 7 lost, 20.0 s", "escape of razor", "shift_x -15."),
     ),
     "partial": (lambda: fake.calibration("docrime", partial=True), 2, ("PARTIAL",)),
     "RegistrationEstimate": (fake.registration, 1, ("deg", "gain 0.98", "converged in 18 iterations")),
-    "LoopResult": (fake.loop, 1, ("escape at gain 0.4", "stable", "72 nm rms", "0.620 ± 0.012")),
+    "LoopResult": (fake.loop, 1, ("escape at gain 0.4", "stable", "71.5 nm rms", "0.620 ± 0.012")),
     "TrackResult": (track, 1, ("60 s, 30000 frames", "0 alarms")),
     "nothing tracked": (TrackResult, 1, ("0 s, 0 frames",)),
     "GainsResult": (fake.gains_result, 1, ("of escape: 2 rounds", "converged")),

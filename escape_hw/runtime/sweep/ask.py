@@ -90,8 +90,8 @@ def require_loop_frames(config: SystemConfig, frames: int) -> None:
     least = frames_for_strehl(config.devices.wfs.frame_rate_hz, science.frame_rate_hz)
     if frames < least:
         raise ConfigError(
-            f"--frames {frames}: too short for Strehl ratios with an error; a loop closes in {CLOSING_S:g} s, then "
-            f"the science camera has to take some frames at {science.frame_rate_hz:g} Hz; "
+            f"--frames {frames}: too short for Strehl ratios with errors; a loop closes in {CLOSING_S:g} s, "
+            f"and then the science camera has to take some frames at {science.frame_rate_hz:g} Hz; "
             f"the least is --frames {least}"
         )
 
