@@ -89,8 +89,8 @@ def _frames(file: Path) -> View:
         f"{result.settings.frame_rate_hz:.6g} Hz{measured}",
         f"frame {result.index[0]} to {result.index[-1]} in {seconds:.6g} s, {result.lost_frames} lost; the "
         f"first exposure ended at {1e-9 * float(result.exposed_ns[0]):.6f} s of the camera's clock",
-        f"counts {counts['min']} to {counts['max']}, mean {counts['mean']:.1f}, at most {saturated} pixels of "
-        "a frame saturated; as the camera delivered them: no dark subtracted, no flat divided",
+        f"counts {counts['min']} to {counts['max']}, mean {counts['mean']:.1f}, at most {saturated} pixels "
+        "of a frame saturated; as the camera delivered them: no dark subtracted, no flat divided",
     ]
 
 
