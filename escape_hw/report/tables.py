@@ -108,7 +108,7 @@ def parameters_table(
             if planted is not None:
                 row.append("–" if value is None or name not in truth else _pull(value, truth[name]))
         if planted is not None:
-            row.append(f"{truth[name]:g}".replace("-", "−") if name in truth else "–")
+            row.append(f"{truth[name]:.4g}".replace("-", "−") if name in truth else "–")
         rows.append(tuple(row))
     return Table(tuple(headings), tuple(rows))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 _NUMBER = re.compile(r"[+−-]?\d+(?:\.\d+)?")
+_MEASURED = re.compile(rf"({_NUMBER.pattern})\s*±\s*({_NUMBER.pattern})")
 
 
 def _words(line: str) -> str:
@@ -12,8 +13,8 @@ def _words(line: str) -> str:
     return " ".join(_NUMBER.sub("#", line).split())
 
 
-def _numbers(line: str) -> list[float]:
-    return [float(text.replace("−", "-")) for text in _NUMBER.findall(line)]
+def _value(text: str) -> float:
+    return float(text.replace("−", "-"))
 
 
 def differences(quoted: str, printed: str) -> list[str]:
@@ -34,14 +35,17 @@ def differences(quoted: str, printed: str) -> list[str]:
 
 
 def _agree(quoted: str, printed: str) -> bool:
-    error = re.search(r"±\s*([\d.]+)", printed)
-    pairs = list(zip(_numbers(quoted), _numbers(printed), strict=True))
-    if error is not None:
-        (a, b), (sigma, other), *rest = pairs
-        size = float(error[1])
-        return abs(a - b) <= 0.5 * size and abs(sigma - other) <= 0.2 * size and _near(rest)
-    return _near(pairs)
+    measured = zip(_MEASURED.findall(quoted), _MEASURED.findall(printed), strict=True)
+    rest = zip(*(_NUMBER.findall(_MEASURED.sub("", line)) for line in (quoted, printed)), strict=True)
+    return all(_same_measured(a, b) for a, b in measured) and all(_near(a, b) for a, b in rest)
 
 
-def _near(pairs: list[tuple[float, float]]) -> bool:
-    return all(abs(a - b) <= max(0.5 if abs(b) < 10 else 0.0, 0.02 * abs(b)) for a, b in pairs)
+def _same_measured(quoted: tuple[str, str], printed: tuple[str, str]) -> bool:
+    (a, sigma), (b, other) = ((_value(value), _value(error)) for value, error in (quoted, printed))
+    return abs(a - b) <= 0.5 * other and abs(sigma - other) <= 0.2 * other
+
+
+def _near(quoted: str, printed: str) -> bool:
+    a, b = _value(quoted), _value(printed)
+    # What carries a sign is a difference in units of its error.
+    return abs(a - b) <= (0.5 if printed[0] in "+−" else 0.02 * abs(b))
