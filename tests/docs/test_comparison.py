@@ -1,4 +1,4 @@
-"""The comparison's short table says what the performance page says, and its packages have versions and dates."""
+"""The comparison's short table says what the performance page says; its packages have versions and dates."""
 
 from __future__ import annotations
 
