@@ -6,7 +6,7 @@ The names below are the public namespace for scripts::
 
     with escape_hw.open_system("razor-shwfs") as bench:
         found = bench.calibrate("escape", progress=True)
-        run = bench.close_loop(found.matrix, found.grid)
+        run = bench.close_loop(found)
 
 They are loaded when first used, so that importing the package stays cheap.
 """

@@ -20,6 +20,7 @@ from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.taps import Taps, harmless
 from escape_hw.api.threads import hold_to_one_thread
 from escape_hw.config.device_models import DeviceConfig
+from escape_hw.config.factories import made
 from escape_hw.config.models import SystemConfig
 from escape_hw.config.registry import device_factory, model_factory
 from escape_hw.errors import ConfigError
@@ -278,9 +279,4 @@ def _build(
         factory = device_factory(driver, hardware=not twin)
     except ConfigError as error:
         raise ConfigError(f"devices.{name}: {error}") from error
-    device = factory(name, config, shared)
-    if not isinstance(device, kind):
-        raise ConfigError(
-            f"devices.{name}: driver '{driver}' makes a {type(device).__name__}, not a {kind.__name__}"
-        )
-    return device
+    return made(f"devices.{name}: driver '{driver}'", kind, factory, name, config, shared)

@@ -20,7 +20,7 @@ with escape_hw.open_system("razor-shwfs", seed=4) as bench:
     print(f"{path.name}: {product.matrix.method}, {product.matrix.n_modes} modes")
 
     model = bench.take_model_psf()  # flat mirror, no turbulence: Strehl 1 by definition
-    run = bench.close_loop(product.matrix, product.grid, frames=1500, model_psf=model, progress=True)
+    run = bench.close_loop(product, frames=1500, model_psf=model, progress=True)
 
 print(f"gain {run.gain}, leak {run.leak}: {'stable' if run.stable else 'DIVERGED'}")
 print(f"residual seen by the sensor: {run.residual_rms_nm:.0f} nm rms")

@@ -66,7 +66,8 @@ if __name__ == "__main__":
     for result in results:
         print(f"{result.outcome:>8}  {result.check}  {result.message}".rstrip())
 
-    # In a script one line registers it; then a configuration, or --set, may name it.
+    # In a script one line registers it; then a configuration, or --set, may name it. No light falls on this
+    # one: how a mirror joins the simulated beam stands in docs/devices/add-a-driver.md.
     escape_hw.register_device("acme", make_mirror)
     with escape_hw.open_system("razor-shwfs", set=["devices.dm.sim_driver=acme"]) as bench:
         report = bench.dm.send(np.full(bench.dm.info.n_act, 0.9))

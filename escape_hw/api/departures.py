@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
+
 #: Width of the broad pedestal that influence functions may stand on, relative to their own.
 PEDESTAL = 1.7
 
@@ -32,3 +34,4 @@ class MirrorDepartures:
     gain_sigma: NDArray[np.float64]
     width: NDArray[np.float64]
     pedestal: float
+    __repr__ = brief

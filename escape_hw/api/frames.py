@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
@@ -29,6 +31,7 @@ class Frame:
     exposed_ns: int
     arrived_ns: int
     n_saturated: int = 0
+    __repr__ = brief
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.results import StrehlEstimate
 from escape_hw.api.thumbnail import curve, table
 
@@ -35,6 +36,7 @@ class OpticalGains:
     best: NDArray[np.float64]
     best_sigma: NDArray[np.float64]
     common_sigma: float = 0.0
+    __repr__ = brief
 
     @property
     def n_modes(self) -> int:
@@ -77,6 +79,7 @@ class GainRound:
     strehl_loss: float
     reached: bool
     strehl: StrehlEstimate | None = None
+    __repr__ = brief
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,13 +146,26 @@ class GainsResult:
         """Of the last round, if there was one."""
         return self.rounds[-1].gains if self.rounds else None
 
+    def __repr__(self) -> str:
+        mean = "" if self.gains is None else f" {_mean_of(self.gains)}"
+        state = ("converged" if self.converged else "NOT CONVERGED") + (", PARTIAL" if self.partial else "")
+        return (
+            f"<{type(self).__name__} mean{mean} of {self.method}: {len(self.rounds)} rounds, "
+            f"{self.frames} frames, {self.lost_frames} lost, {state}>"
+        )
+
     def _repr_html_(self) -> str:
         """For notebooks: gain by mode, and how the bootstrap went."""
         gains = self.gains
         rows: dict[str, object] = {"relative to": self.method, "rounds": len(self.rounds)}
         if gains is not None:
-            rows["mean"] = f"{np.mean(gains.best):.3f} ± {np.mean(gains.best_sigma):.3f}"
+            rows["mean"] = _mean_of(gains)
             rows["weakest, strongest"] = f"{gains.best.min():.3f}, {gains.best.max():.3f}"
         rows["converged"] = "yes" if self.converged else "no"
         rows["frames"] = f"{self.frames}, {self.lost_frames} lost"
         return table(rows, "Optical gain by mode", "" if gains is None else curve(gains.best))
+
+
+def _mean_of(gains: OpticalGains) -> str:
+    """Mean over the modes, and the mean error of one."""
+    return f"{np.mean(gains.best):.3f} ± {np.mean(gains.best_sigma):.3f}"

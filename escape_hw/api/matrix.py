@@ -86,17 +86,28 @@ class InteractionMatrix:
             both.append(image)
         return both[0], both[1]
 
+    def __repr__(self) -> str:
+        system, size, quality = self._words()
+        return f"<{type(self).__name__} {self.method} of {system}: {size}; signal to noise {quality}>"
+
+    def _words(self) -> tuple[str, str, str]:
+        """Where it is from, how large it is, and how good."""
+        snr = self.snr()
+        known = np.isfinite(snr).all()
+        return (
+            f"{self.system}{' (SIMULATED)' if self.simulated else ''}",
+            f"{self.n_slopes} slopes × {self.n_modes} modes, in {self.slope_unit} per unit mode",
+            f"{snr.min():.3g} at worst, median {np.median(snr):.3g}" if known else "computed",
+        )
+
     def _repr_html_(self) -> str:
         """For notebooks: the matrix in small, what it is of, and how good it is."""
-        snr = self.snr()
-        known = (
-            f"{snr.min():.3g} at worst, median {np.median(snr):.3g}" if np.isfinite(snr).all() else "computed"
-        )
+        system, size, quality = self._words()
         rows: dict[str, object] = {
             "method": self.method,
-            "system": f"{self.system}{' (SIMULATED)' if self.simulated else ''}",
-            "size": f"{self.n_slopes} slopes × {self.n_modes} modes, in {self.slope_unit} per unit mode",
-            "signal to noise": known,
+            "system": system,
+            "size": size,
+            "signal to noise": quality,
             **{
                 name: self.metrics[name]
                 for name in ("frames", "poke", "delay_frames")

@@ -11,6 +11,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.device import Device
 from escape_hw.errors import CommandRejected, DeviceError, SettingRejected
 from escape_hw.safety.guard import CommandGuard, GuardReport
@@ -40,6 +41,7 @@ class DMInfo:
     positions_m: NDArray[np.float64]
     stroke_m: float
     simulated: bool
+    __repr__ = brief
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +64,7 @@ class SendReport:
     sent_ns: int
     guard: GuardReport
     skipped: bool = False
+    __repr__ = brief
 
 
 class DeformableMirror(Device):

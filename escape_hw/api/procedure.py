@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.flag import Flag
 from escape_hw.errors import Aborted
 
@@ -54,6 +55,7 @@ class Progress:
     elapsed_s: float = 0.0
     metrics: Mapping[str, float] = field(default_factory=dict)
     arrays: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    __repr__ = brief
 
     @property
     def fraction(self) -> float:

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.sensor import SensorGeometry
 
 #: Names of the four pupil images in the order used everywhere: ``2 * lower + right``.
@@ -90,6 +91,7 @@ class PyramidPupils(SensorGeometry):
     pokes: float = 0.0
     looks: float = 0.0
     steady: float = 0.0
+    __repr__ = brief
 
     def with_background(self, counts: float) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_background`."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.departures import MirrorDepartures
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
@@ -39,6 +40,7 @@ class TemporalResponse:
 
     weights: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    __repr__ = brief
 
     @property
     def delay(self) -> float:
@@ -99,15 +101,23 @@ class RegistrationEstimate:
             for name, v, s in zip(PARAMETERS, values, self.sigma, strict=True)
         }
 
-    def _repr_html_(self) -> str:
-        """For notebooks: the parameters with their errors and units, and how SPRINT came there."""
+    def __repr__(self) -> str:
+        found = ", ".join(f"{name} {text}" for name, text in self._found().items())
+        state = "converged" if self.converged else "NOT CONVERGED"
+        return f"<{type(self).__name__} {found}; {state} in {len(self.iterations)} iterations>"
+
+    def _found(self) -> dict[str, str]:
+        """Parameters and gain with errors and units."""
         found = {
             name: f"{one.value:.3f} ± {one.sigma:.3f} {one.unit}"
             for name, one in {**self.measured(), **self.extras}.items()
         }
+        return {**found, "gain": f"{self.gain.value:.4f} ± {self.gain.sigma:.4f}"}
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the parameters with their errors and units, and how SPRINT came there."""
         rows = {
-            **found,
-            "gain": f"{self.gain.value:.4f} ± {self.gain.sigma:.4f}",
+            **self._found(),
             "converged": f"{'yes' if self.converged else 'NO'}, {len(self.iterations)} iterations",
             **{f"warning {number}": text for number, text in enumerate(self.warnings, 1)},
         }
@@ -137,13 +147,26 @@ class CalibrationResult:
     mean_frame: NDArray[np.float32] | None = None
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        state = ", PARTIAL" if self.partial else ""
+        parts = [
+            f"{type(self).__name__} of {self.frames} frames, {self._taken()}{state}",
+            f"matrix: {self.matrix!r}",
+        ]
+        if self.registration is not None:
+            parts.append(f"registration: {self.registration!r}")
+        return f"<{chr(10).join(parts)}>".replace("\n", "\n  ")
+
+    def _taken(self) -> str:
+        return f"{self.lost_frames} lost, {self.sky_seconds:.1f} s"
+
     def _repr_html_(self) -> str:
         """For notebooks: the matrix, and the registration behind it."""
         parts = [self.matrix._repr_html_()]
         if self.registration is not None:
             parts.append(self.registration._repr_html_())
         rows = {
-            "frames": f"{self.frames}, {self.lost_frames} lost, {self.sky_seconds:.1f} s",
+            "frames": f"{self.frames}, {self._taken()}",
             **({"PARTIAL": "stopped by the operator"} if self.partial else {}),
             **{f"note {number}": text for number, text in enumerate(self.notes, 1)},
         }
@@ -186,3 +209,14 @@ class LoopResult:
     last_frame: NDArray[np.uint16] | None = None
     partial: bool = False
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        words = [
+            f"{self.method} at gain {self.gain:.3g}",
+            f"{self.frames} frames at {self.rate_hz:.4g} Hz, {self.lost_frames} lost",
+            "stable" if self.stable else "UNSTABLE",
+            f"residual {self.residual_rms_nm:.3g} nm rms",
+        ]
+        if self.strehl is not None:
+            words.append(f"Strehl ratio {self.strehl.peak.value:.3f} ± {self.strehl.peak.sigma:.3f}")
+        return f"<{type(self).__name__} {', '.join(words)}{', PARTIAL' if self.partial else ''}>"

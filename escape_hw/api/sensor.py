@@ -9,6 +9,7 @@ from typing import ClassVar, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.errors import IncompatibleProduct
 
 #: Spots move and blur by more than their centres of gravity show: what the window and the threshold
@@ -176,6 +177,7 @@ class SubApertureGrid(SensorGeometry):
     motion_px: float = 0.0
     background: float = 0.0
     air_px: float = 0.0
+    __repr__ = brief
 
     def centres_px(self) -> NDArray[np.float64]:
         """Centres ``(n_valid, 2)`` of the valid lenslets as (x, y) in pixels."""

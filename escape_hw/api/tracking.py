@@ -102,6 +102,17 @@ class TrackResult:
     partial: bool = False
     began_ns: int = 0
 
+    def __repr__(self) -> str:
+        seconds = self.rows["seconds"][-1] if self.rows["seconds"] else 0.0
+        accepted = sum(one.accepted for one in self.exchanges)
+        words = [
+            f"{seconds:.4g} s, {self.frames} frames, {self.lost_frames} lost",
+            "stable" if self.stable else "UNSTABLE",
+            f"{len(self.exchanges)} matrices proposed, {accepted} exchanged",
+            f"{len(self.alarms)} alarms",
+        ]
+        return f"<{type(self).__name__} {', '.join(words)}{', PARTIAL' if self.partial else ''}>"
+
     def column(self, name: str) -> NDArray[np.float64]:
         """A column of the table."""
         return np.array(self.rows[name])

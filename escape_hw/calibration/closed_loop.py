@@ -15,7 +15,7 @@ from escape_hw.api.results import LoopResult, StrehlEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import next_frame, some_frames
-from escape_hw.calibration.loop_run import CLOSING_S, LoopRecord, RunningLoop
+from escape_hw.calibration.loop_run import CLOSING_S, LoopRecord, RunningLoop, frames_for_strehl
 from escape_hw.calibration.sensor_setup import extractor, prepare_sensor
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, IncompatibleProduct
 from escape_hw.pipeline.integrator import LeakyIntegrator
@@ -182,7 +182,7 @@ def _science_notes(bench: Bench, science: Camera, record: LoopRecord, seconds: f
     if count < expected / 2:
         notes.append(f"only {count} of about {expected} frames came from {science.name}")
     if count < LEAST and not record.diverged:
-        needed = math.ceil((CLOSING_S + (LEAST + 2) / rate) * bench.wfs.settings.frame_rate_hz)
+        needed = frames_for_strehl(bench.wfs.settings.frame_rate_hz, rate)
         missing = "an error of the Strehl ratios" if count else "Strehl ratios"
         notes.append(
             f"too short for {missing}: {count} frames of {science.name} after the {CLOSING_S:g} s in which "

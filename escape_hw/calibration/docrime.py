@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult
@@ -47,6 +48,7 @@ class DocrimeRun:
     result: CalibrationResult
     solution: DocrimeSolution
     record: Record | None = None
+    __repr__ = brief
 
 
 def docrime_run(

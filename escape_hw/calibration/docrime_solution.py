@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.results import TemporalResponse
 
 
@@ -45,3 +46,4 @@ class DocrimeSolution:
     frames: int
     lost_frames: int
     gain_sigma: float
+    __repr__ = brief

@@ -52,6 +52,9 @@ class GainsRun:
     result: GainsResult
     rescaled: CalibrationResult
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.result!r}\n  rescaled: {self.rescaled.matrix!r}>"
+
 
 @dataclass(slots=True, eq=False)
 class _State:

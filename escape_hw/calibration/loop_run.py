@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from array import array
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.command_shape import shaper
 from escape_hw.pipeline.controller import Controller
 from escape_hw.pipeline.frame_stack import FrameStack
+from escape_hw.pipeline.standard_error import LEAST
 from escape_hw.pipeline.strehl import peak_is_clipped
 from escape_hw.streams.loop_timing import LoopTiming
 
@@ -41,6 +43,17 @@ LoopObserver = Callable[[int, NDArray[np.float32], NDArray[np.float64], NDArray[
 
 #: Residuals that a progress report shows.
 _SHOWN = 500
+
+
+def frames_for_strehl(loop_hz: float, science_hz: float) -> int:
+    """Least frames of a loop whose Strehl ratios have an error: while it closes, no science frame counts.
+
+    Parameters
+    ----------
+    loop_hz, science_hz
+        Frames per second of the sensor's and of the science camera.
+    """
+    return math.ceil((CLOSING_S + (LEAST + 2) / science_hz) * loop_hz)
 
 
 def _newest(residual: array[float]) -> NDArray[np.float32]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.camera import Camera
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.registration import Registration
@@ -30,6 +31,7 @@ class SensorSetup:
 
     grid: SensorGeometry
     mean_frame: NDArray[np.float32]
+    __repr__ = brief
 
 
 def prepare_sensor(bench: Bench) -> None:

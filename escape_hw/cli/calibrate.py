@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +11,7 @@ import typer
 
 from escape_hw.cli import options
 from escape_hw.cli.session import Session, session
+from escape_hw.errors import EscapeError
 
 if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult
@@ -63,7 +65,11 @@ def calibrate(
     also: options.Also = None,
     resume: Annotated[
         Path | None,
-        typer.Option("--resume", metavar="RUN", help="Go on with a run that was broken off (its folder)."),
+        typer.Option(
+            "--resume",
+            metavar="RUN",
+            help="Go on with a run that was broken off (its folder); products go to a new one (--out).",
+        ),
     ] = None,
     force: options.Force = False,
     out: options.Out = None,
@@ -91,7 +97,23 @@ def calibrate(
         choice = options.Choice.of(_system(system, resume), set, seed, mode)
         if modes is not None:
             choice = _with_modes(one, choice, modes)
-        one.perform(task, choice, out, partial(_show, one))
+        try:
+            one.perform(task, choice, out, partial(_show, one), resume)
+        except (EscapeError, KeyboardInterrupt) as error:
+            _tell_way_on(one, error, resume, force)
+            raise
+
+
+def _tell_way_on(one: Session, error: BaseException, resumed: Path | None, force: bool) -> None:
+    """Add the command that goes on, when a state was kept, here or in the run before."""
+    from escape_hw.io.state_file import STATE
+
+    folders = [] if one.folder is None else [one.folder.path]
+    folders += [] if resumed is None or one.folder is None else [resumed]
+    kept = next((folder for folder in folders if (folder / STATE).is_file()), None)
+    if kept is not None:
+        words = ["escape", "calibrate", "--resume", str(kept), *(["--force"] if force else [])]
+        error.add_note(f"go on with: {shlex.join(words)}")
 
 
 def _system(system: str | None, resume: Path | None) -> str:

@@ -27,46 +27,20 @@ def show(
 
 
 def _show_product(one: Session, file: Path) -> None:
-    from escape_hw.cli.views import bands, calibration_lines, rich_table
+    from escape_hw.cli.product_views import product_view
+    from escape_hw.cli.views import bands, rich_table
     from escape_hw.io import documents, fits_file
-    from escape_hw.io.fits import KIND_MATRIX, load_matrix
-    from escape_hw.io.gains import KIND_GAINS, load_gains
-    from escape_hw.io.psf import load_loop
-    from escape_hw.io.telemetry import KIND_TELEMETRY, load_telemetry
-    from escape_hw.report.tables import Table, registration_table, rounds_table, strehl_table
+    from escape_hw.report.tables import Table
 
-    hdus, _ = fits_file.read(file)
+    hdus, sha256 = fits_file.read(file)
     header = fits_file.header_dict(hdus)
-    document = documents.head("show", header["SYSTEM"], bool(header["SIMULATE"]), header.get("SEED"))
-    partial = header["FINISH"] == "aborted"
-    one.show(f"{file}: kind {header['KIND']}", bands(bool(header["SIMULATE"]), partial))
-    if header["KIND"] == KIND_MATRIX:
-        matrix = load_matrix(file)
-        document |= documents.calibration_document(matrix.result)
-        document["metrics"] = matrix.matrix.metrics
-        sha256 = matrix.sha256
-        one.show(*calibration_lines(matrix.result))
-        if matrix.registration is not None:
-            one.show(rich_table(registration_table({"": matrix.registration})))
-    elif header["KIND"] == KIND_GAINS:
-        gains = load_gains(file)
-        document |= documents.gains_document(gains.result)
-        sha256 = gains.sha256
-        one.show(rich_table(rounds_table(gains.result)))
-    elif header["KIND"] == KIND_TELEMETRY:
-        telemetry = load_telemetry(file)
-        frames, n_slopes = telemetry.result.slopes.shape
-        document |= {"frames": frames, "n_slopes": n_slopes, "rate_hz": telemetry.result.rate_hz}
-        sha256 = telemetry.sha256
-        one.show(f"{frames} frames of {n_slopes} slopes at {telemetry.result.rate_hz:.6g} Hz")
-    else:
-        loop = load_loop(file)
-        document |= documents.loop_document(loop.result)
-        sha256 = loop.sha256
-        one.show(rich_table(strehl_table({loop.result.method: loop.result})))
+    document, lines = product_view(header["KIND"], file)
+    simulated, partial = bool(header["SIMULATE"]), header["FINISH"] == "aborted"
     cards = tuple((key, str(value)) for key, value in header.items())
+    one.show(f"{file}: kind {header['KIND']}", bands(simulated, partial), *lines)
     one.show(rich_table(Table(("Card", "value"), cards, numeric=False)), f"SHA-256: {sha256}")
-    one.result({**document, "file": file.absolute(), "header": header, "sha256": sha256})
+    head = documents.head("show", header["SYSTEM"], simulated, header.get("SEED"))
+    one.result({**head, **document, "file": file.absolute(), "header": header, "sha256": sha256})
 
 
 def _show_run(one: Session, folder: Path) -> None:

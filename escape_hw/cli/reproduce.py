@@ -126,20 +126,27 @@ def everything(
     """Every table and figure one after the other, and a page that leads to their reports."""
     with session("reproduce all", json=json, quiet=quiet) as one:
         from escape_hw.cli.views import checks_view
+        from escape_hw.config.load import load_system
         from escape_hw.io import documents
         from escape_hw.report.index import write_index
         from escape_hw.report.paper_results import write_results
-        from escape_hw.runtime.paper import chosen, finished, sweep_runs
+        from escape_hw.runtime.paper import chosen, finished, require_share, sweep_runs
 
         parts: dict[str, Any] = {}
         swept = sweep_runs(sweeps or [])
+        done = {case.kind: finished(out / case.kind, case.kind) if resume else None for case in chosen(only)}
+        left = [case for case in chosen(only) if done[case.kind] is None]
+        choices = {case.kind: options.Choice.of(case.system, set, seed, None) for case in left}
+        require_share(
+            [(case, load_system(case.system, overrides=set or [], seed=seed)) for case in left], share
+        )
         try:
             for case in chosen(only):
                 one.tell(f"{case.kind}: {case.title}")
-                kept = finished(out / case.kind, case.kind) if resume else None
+                kept = done[case.kind]
                 if kept is None:
-                    choice = options.Choice.of(case.system, set, seed, None)
-                    _, kept = _case(one, case.kind, case.shortened(share), choice, out / case.kind)
+                    counts = case.shortened(share)
+                    _, kept = _case(one, case.kind, counts, choices[case.kind], out / case.kind)
                 else:
                     one.tell(f"{case.kind}: finished {kept['finished_utc']}, not run again")
                 parts[case.kind] = kept

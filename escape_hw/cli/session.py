@@ -149,8 +149,11 @@ class Session:
         choice: Choice,
         out: Path | None,
         show: Callable[[T, BenchRecord, dict[str, Any]], object],
+        going_on: Path | None = None,
     ) -> None:
         """Do a task on the chosen system, keep its result, and show it.
+
+        Who goes on with a run is told where the products of this one lie.
 
         Raises
         ------
@@ -161,6 +164,8 @@ class Session:
         config = self.configured(choice)
         task.load(config)
         with self.run_folder(config, task.kind, out) as folder:
+            if going_on is not None:
+                self.tell(f"going on with {going_on}, which stays as it is; products go to {folder.path}")
             with self.bench(choice) as bench:
                 from escape_hw.runtime.records import BenchRecord
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -56,7 +58,7 @@ def sweep(
         typer.Option("--gains", metavar="FILE", help="Optical gains: compare with and without them."),
     ] = None,
     trials: Annotated[int, typer.Option("--trials", min=2, help="Loops with drawn parameters.")] = 200,
-    frames: Annotated[int, typer.Option("--frames", min=50, help="Frames of each loop.")] = 400,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of each loop.")] = 400,
     sampler: Annotated[
         str, typer.Option("--sampler", help="random (the same for every matrix), or tpe.")
     ] = "random",
@@ -114,7 +116,7 @@ def sweep(
 ) -> None:
     """Compare matrices, each at its own best gain, leak and number of modes, on the same air."""
     with session("sweep", json=json, quiet=quiet) as one:
-        from escape_hw.runtime.sweep.ask import need_optuna, swept_space
+        from escape_hw.runtime.sweep.ask import need_optuna, require_loop_frames, swept_space
 
         need_optuna()
         loop_ranges = {"gain": gain, "leak": leak, "dropped_modes": drop, "delay": delay}
@@ -126,18 +128,20 @@ def sweep(
         )  # fmt: skip
         choice = options.Choice.of(_system(system, resume), set, seed, mode)
         config = one.configured(choice)
+        going_on = None
         if resume is None:
             swept_space(config, request.vary)
+            require_loop_frames(config, frames)
+        else:
+            going_on = _resumed(resume, storage)
+            if _is_finished(one, resume, going_on):
+                return
         with one.run_folder(config, "sweep", out) as folder:
             with one.bench(choice) as bench:
                 from escape_hw.runtime.records import BenchRecord
 
                 record = BenchRecord.of(bench)
-                kept = (
-                    _resumed(resume, storage)
-                    if resume
-                    else _prepared(one, request, config, bench, folder, record)
-                )
+                kept = going_on or _prepared(one, request, config, bench, folder, record)
                 if not bench.simulated:
                     result, stop = _run(one, kept, bench)
             if kept.sweep.simulated:
@@ -160,6 +164,21 @@ def _resumed(run: Path, storage: str | None) -> KeptSweep:
     from escape_hw.runtime.sweep.kept import read_kept
 
     return read_kept(run, storage)
+
+
+def _is_finished(one: Session, run: Path, kept: KeptSweep) -> bool:
+    """Whether the sweep has nothing left to run; then its result is shown where it lies."""
+    from escape_hw.runtime.sweep.finished import finished_document
+
+    document = finished_document(run, kept)
+    if document is None:
+        return False
+    one.tell(
+        f"{run} is finished since {document['finished_utc']}, nothing is left to run; its result is in "
+        f"{document['folder']}"
+    )
+    _show(one, document)
+    return True
 
 
 def _prepared(
@@ -244,18 +263,24 @@ def _run(one: Session, kept: KeptSweep, runner: Any) -> tuple[SweepResult, Abort
 def _finish(
     one: Session, folder: RunFolder, record: BenchRecord, kept: KeptSweep, result: SweepResult
 ) -> None:
-    from escape_hw.cli.views import bands, checks_view, products_view, rich_table
-    from escape_hw.report.sweep_section import best_table, importance_table
     from escape_hw.runtime.sweep.keep import keep_sweep
 
-    document = keep_sweep(folder, record, kept, result, one.wall_seconds)
+    _show(one, keep_sweep(folder, record, kept, result, one.wall_seconds))
+    if result.partial:
+        one.tell(f"go on with: {shlex.join(['escape', 'sweep', '--resume', str(folder.path)])}")
+    else:
+        kept.store().mark_finished(str(folder.path))
+
+
+def _show(one: Session, document: Mapping[str, Any]) -> None:
+    from escape_hw.cli.views import bands, checks_view, products_view, rich_table
+    from escape_hw.report.sweep_section import best_table, importance_table
+
     one.result(document, met=all(entry["met"] for entry in document["criteria"]))
-    one.show(bands(record.simulated, result.partial))
+    one.show(bands(document["simulated"], document["partial"]))
     if document["best"]:
         one.show(rich_table(best_table(document)))
     if document["sweep"]["importance"]:
         one.show(rich_table(importance_table(document)))
     one.show(*(row["text"] for row in document["comparisons"]))
     one.show(*checks_view(document["criteria"]), *products_view(document["products"]))
-    if result.partial:
-        one.tell(f"go on with: escape sweep --resume {folder.path}")

@@ -56,11 +56,16 @@ def track(
 
 
 def _show(one: Session, result: TrackResult, record: BenchRecord, document: dict[str, Any]) -> None:
-    from escape_hw.cli.views import bands, products_view
+    from escape_hw.api.registration import Registration
+    from escape_hw.api.results import Measured
+    from escape_hw.cli.views import bands, products_view, rich_table
+    from escape_hw.report.tables import parameters_table
 
     one.show(bands(record.simulated, result.partial))
-    for name, found in document["registration"].items():
-        one.show(f"{name}: {found['value']:.3f} ± {found['sigma']:.3f} {found['unit']}")
+    found = {name: Measured(**value) for name, value in document["registration"].items()}
+    if found:
+        planted = Registration(**document["planted_end"]) if document["planted_end"] else None
+        one.show(rich_table(parameters_table({"": found}, planted)))
     if result.optical_gain.size:
         value, sigma = result.optical_gain.mean(), result.optical_gain_sigma.mean()
         one.show(f"optical gain beside the first matrix: {value:.3f} ± {sigma:.3f}")

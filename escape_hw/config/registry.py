@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,6 +13,7 @@ from escape_hw.api.emulator import EmulatorFactory
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.rehearsal import RehearsalFactory
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.config.factories import made, require_factory
 from escape_hw.config.models import SystemConfig
 from escape_hw.config.outline import nearest
 from escape_hw.errors import ConfigError
@@ -27,6 +29,14 @@ _KINDS = {
     EMULATORS: "emulator",
     REHEARSALS: "rehearsal",
     WINDOWS: "window",
+}
+#: What the factories of each group are called with.
+_PARAMETERS = {
+    DEVICES: ("name", "config", "shared"),
+    MODELS: ("config", "grid"),
+    EMULATORS: ("request",),
+    REHEARSALS: ("config",),
+    WINDOWS: ("system", "address", "screenshot", "reset_settings"),
 }
 #: What the name of every twin begins with; other drivers drive real hardware.
 TWIN = "sim-"
@@ -58,8 +68,9 @@ def register_device(name: str, factory: DeviceFactory) -> None:
     Raises
     ------
     ConfigError
-        An installed package offers that name already.
+        An installed package offers that name already, or it is no such factory.
     """
+    require_factory(f"device driver '{name}'", repr(factory), factory, _PARAMETERS[DEVICES])
     if any(entry.name == name for entry in importlib.metadata.entry_points(group=DEVICES)):
         raise ConfigError(f"device driver '{name}' is offered by an installed package; choose another name")
     _OWN[name] = factory
@@ -90,14 +101,14 @@ def device_factory(name: str, *, hardware: bool = False) -> DeviceFactory:
 
 
 def model_factory(name: str) -> ModelFactory:
-    """The factory of a synthetic model.
+    """The factory of a synthetic model; calling it raises ConfigError when it fails or makes none.
 
     Raises
     ------
     ConfigError
-        Unknown name (with the nearest one), or its package is not completely installed.
+        Unknown name (with the nearest one), its package is not completely installed, or is broken.
     """
-    return cast(ModelFactory, _load(MODELS, name))
+    return cast(ModelFactory, partial(made, f"synthetic model '{name}'", SyntheticModel, _load(MODELS, name)))
 
 
 def emulator_factory(name: str) -> EmulatorFactory:
@@ -152,8 +163,7 @@ def _load(group: str, name: str, hardware: bool = False) -> Any:
         raise ConfigError(
             f"{kind} '{name}' of {_package(entry)} is broken: {entry.value} does not exist ({error})"
         ) from error
-    if not callable(factory):
-        raise ConfigError(f"{kind} '{name}' of {_package(entry)} is broken: {entry.value} is not callable")
+    require_factory(f"{kind} '{name}' of {_package(entry)}", entry.value, factory, _PARAMETERS[group])
     return factory
 
 

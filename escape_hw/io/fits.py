@@ -21,7 +21,7 @@ from escape_hw.io.provenance import Provenance
 KIND_MATRIX = "IM"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MatrixProduct(Product[CalibrationResult]):
     """An interaction matrix read from disk."""
 

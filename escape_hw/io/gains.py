@@ -24,7 +24,7 @@ _SCALARS = tuple(one.name for one in fields(GainRound) if one.name not in ("gain
 _WAYS = tuple(one.name for one in fields(StrehlEstimate))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class GainsProduct(Product[GainsResult]):
     """Optical gains read from disk."""
 

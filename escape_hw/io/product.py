@@ -30,6 +30,9 @@ class Product(Generic[R]):
     header: dict[str, Any]
     sha256: str
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.path}: {self.result!r}>"
+
     @classmethod
     def read(
         cls,

@@ -26,7 +26,7 @@ _IMAGES = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LoopProduct(Product[LoopResult]):
     """A closed-loop run read from disk."""
 

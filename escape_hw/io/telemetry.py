@@ -10,6 +10,7 @@ import numpy as np
 from astropy.io import fits as astropy_fits
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.io import fits_file
 from escape_hw.io.product import Product
 from escape_hw.io.provenance import Provenance
@@ -42,6 +43,7 @@ class LoopTelemetry:
     exposed_s: NDArray[np.float64]
     slopes: NDArray[np.float32]
     commands: NDArray[np.float64]
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         lengths = {len(part) for part in (self.index, self.exposed_s, self.slopes, self.commands)}
@@ -55,7 +57,7 @@ class LoopTelemetry:
         return float(np.ptp(self.index)) / seconds if seconds > 0 else 0.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class TelemetryProduct(Product[LoopTelemetry]):
     """Telemetry read from disk."""
 

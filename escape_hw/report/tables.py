@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from escape_hw.api.gains import GainsResult
-from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.registration import Registration
 from escape_hw.api.results import LoopResult, Measured, RegistrationEstimate
 
 #: How methods are called in figures and tables.
@@ -80,6 +80,13 @@ def registration_table(
         The truth hidden in a twin, shown in a last column; beside each estimate then stands its
         difference from the truth over its standard error.
     """
+    return parameters_table({k: {**one.measured(), **one.extras} for k, one in estimates.items()}, planted)
+
+
+def parameters_table(
+    estimates: Mapping[str, Mapping[str, Measured]], planted: Registration | None = None
+) -> Table:
+    """As :func:`registration_table`, of parameters by name with their errors."""
     headings = ["Component"]
     for label in estimates:
         headings.append(f"α {label}".strip())
@@ -91,18 +98,17 @@ def registration_table(
     if planted is not None:
         straight, shear = planted.along_axes
         truth = {**straight.to_dict(), "anamorphosis": shear}
-    extras = [name for name in TITLES if any(name in estimate.extras for estimate in estimates.values())]
     rows = []
-    for name in (*PARAMETERS, *extras):
+    for name in (name for name in TITLES if any(name in estimate for estimate in estimates.values())):
         title, unit = TITLES[name]
         row = [f"{title} [{unit}]"]
         for estimate in estimates.values():
-            value = {**estimate.measured(), **estimate.extras}.get(name)
+            value = estimate.get(name)
             row.append("–" if value is None else with_error(value))
             if planted is not None:
                 row.append("–" if value is None or name not in truth else _pull(value, truth[name]))
         if planted is not None:
-            row.append(f"{truth[name]:g}".replace("-", "−") if name in truth else "–")
+            row.append(f"{truth[name]:.4g}".replace("-", "−") if name in truth else "–")
         rows.append(tuple(row))
     return Table(tuple(headings), tuple(rows))
 

@@ -81,6 +81,11 @@ class CalibrationRequest:
         from escape_hw.io.state_file import STATE, load_state
 
         path = resume / STATE
+        if not path.is_file() and (resume / "report.html").is_file():
+            raise ProductError(
+                f"{resume} came to its end, there is nothing to go on with; its report is "
+                f"{resume / 'report.html'}, and 'escape show {resume}' tells what it found"
+            )
         if not path.is_file():
             raise ProductError(
                 f"{path}: not there; {resume} is no run, it was broken off in its first seconds, or it came "

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.results import CalibrationResult, LoopResult
+from escape_hw.api.results import LoopResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.tracking import TrackResult
+from escape_hw.runtime.calibrated import Calibrated, calibration_of, matrix_and_grid
 from escape_hw.runtime.running_bench import RunningBench
 
 if TYPE_CHECKING:
@@ -50,8 +51,8 @@ class LoopBench(RunningBench):
 
     def close_loop(
         self,
-        matrix: InteractionMatrix,
-        grid: SensorGeometry,
+        matrix: InteractionMatrix | Calibrated,
+        grid: SensorGeometry | None = None,
         *,
         gain: float | None = None,
         leak: float | None = None,
@@ -65,7 +66,8 @@ class LoopBench(RunningBench):
         Parameters
         ----------
         matrix, grid
-            From a calibration.
+            A calibration, as :meth:`calibrate` or ``escape_hw.load_matrix`` returns it; or its matrix and its
+            grid.
         gain, leak, dropped_modes
             Loop parameters; as configured by default.
         frames
@@ -89,6 +91,7 @@ class LoopBench(RunningBench):
         """
         from escape_hw.calibration.closed_loop import closed_loop
 
+        matrix, grid = matrix_and_grid(matrix, grid)
         procedure = closed_loop(
             self, matrix, grid,
             gain=gain, leak=leak, dropped_modes=dropped_modes, frames=frames, model_psf=model_psf,
@@ -97,8 +100,8 @@ class LoopBench(RunningBench):
 
     def find_best_gain(
         self,
-        matrix: InteractionMatrix,
-        grid: SensorGeometry,
+        matrix: InteractionMatrix | Calibrated,
+        grid: SensorGeometry | None = None,
         *,
         gains: tuple[float, ...] | None = None,
         frames: int = 1500,
@@ -110,7 +113,8 @@ class LoopBench(RunningBench):
         Parameters
         ----------
         matrix, grid
-            From a calibration.
+            A calibration, as :meth:`calibrate` or ``escape_hw.load_matrix`` returns it; or its matrix and its
+            grid.
         gains
             Gains to try; by default shares of the largest stable one.
         frames
@@ -135,12 +139,13 @@ class LoopBench(RunningBench):
         """
         from escape_hw.calibration.gain_search import best_gain
 
+        matrix, grid = matrix_and_grid(matrix, grid)
         procedure = best_gain(self, matrix, grid, gains=gains, frames=frames, model_psf=model_psf)
         return self.run(procedure, progress=progress)
 
     def find_optical_gains(
         self,
-        calibration: CalibrationResult,
+        calibration: Calibrated,
         *,
         poke: float = 0.002,
         accuracy: float = 0.01,
@@ -153,7 +158,7 @@ class LoopBench(RunningBench):
         Parameters
         ----------
         calibration
-            From :meth:`calibrate`, best with ``"escape"``.
+            From :meth:`calibrate`, best with ``"escape"``, or ``escape_hw.load_matrix``.
         poke
             Last poke of each mode, rms surface as fraction of full stroke; lowered to a cost of 1 % of the
             Strehl ratio.
@@ -181,6 +186,7 @@ class LoopBench(RunningBench):
         from escape_hw.calibration.gain_bootstrap import bootstrap_gains
         from escape_hw.calibration.pseudo_synthetic import at_rest
 
+        calibration = calibration_of(calibration)
         procedure = bootstrap_gains(
             self, calibration, poke=poke, accuracy=accuracy, frames=frames,
             shape=at_rest(self, calibration), model_psf=model_psf,
@@ -189,7 +195,7 @@ class LoopBench(RunningBench):
 
     def sweep(
         self,
-        matrices: Mapping[str, CalibrationResult],
+        matrices: Mapping[str, Calibrated],
         folder: str | os.PathLike[str],
         *,
         vary: Sequence[str] = (),
@@ -210,7 +216,7 @@ class LoopBench(RunningBench):
         Parameters
         ----------
         matrices
-            Calibrations by name; the first is the one that the others are compared with.
+            Calibrations or loaded matrices by name; the first is the one that the others are compared with.
         folder
             Where the matrices and, by default, the trials are kept.
         vary
@@ -247,7 +253,7 @@ class LoopBench(RunningBench):
 
     def track(
         self,
-        calibration: CalibrationResult,
+        calibration: Calibrated,
         *,
         seconds: float = 60.0,
         poke: float | None = None,
@@ -262,8 +268,8 @@ class LoopBench(RunningBench):
         Parameters
         ----------
         calibration
-            From :meth:`calibrate` or :meth:`find_optical_gains`; a registration that is not in it is
-            found from its matrix.
+            From :meth:`calibrate` or ``escape_hw.load_matrix``, or the ``rescaled`` one of
+            :meth:`find_optical_gains`; a registration that is not in it is found from its matrix.
         seconds
             How long, at least one.
         poke
@@ -296,6 +302,7 @@ class LoopBench(RunningBench):
         """
         from escape_hw.calibration.track import track
 
+        calibration = calibration_of(calibration)
         procedure = track(
             self, calibration.matrix, calibration.grid, seconds=seconds,
             registration=calibration.registration, response=calibration.response, poke=poke,

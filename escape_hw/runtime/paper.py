@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,16 @@ from typing import Any
 
 from escape_hw.api.procedure import Procedure
 from escape_hw.bench import Bench
+from escape_hw.config.models import SystemConfig
 from escape_hw.errors import ConfigError
 from escape_hw.io.run_folder import read_result
 from escape_hw.runtime.reproduce import PAPER_CASE, reproduce_shwfs, reproduce_table1
 from escape_hw.runtime.reproduce_keep import keep_maps, keep_pywfs, keep_shwfs, keep_table1
 from escape_hw.runtime.reproduce_maps import reproduce_maps
 from escape_hw.runtime.reproduce_pywfs import reproduce_pywfs
+
+#: Keyword of the frames that a loop is closed for.
+_LOOP_FRAMES = "loop_frames"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +55,17 @@ class PaperCase:
     def shortened(self, share: float) -> dict[str, int]:
         """A share of the frames, by the procedure's keyword."""
         return {name: max(1, round(share * count)) for name, count in self.frames.items()}
+
+    def least(self, config: SystemConfig) -> dict[str, int]:
+        """Fewest frames that give its result, by the procedure's keyword: a matrix, a Strehl ratio."""
+        from escape_hw.calibration.docrime import least_frames
+        from escape_hw.calibration.loop_run import frames_for_strehl
+
+        devices = config.devices
+        matrix = least_frames(config.calibration, config.basis.n_modes)
+        science_hz = devices.wfs.frame_rate_hz if devices.science is None else devices.science.frame_rate_hz
+        loop = frames_for_strehl(devices.wfs.frame_rate_hz, science_hz)
+        return {name: loop if name == _LOOP_FRAMES else matrix for name in self.frames}
 
 
 def _table1(bench: Bench, *, short: int, long: int) -> Procedure[Any]:
@@ -92,6 +108,36 @@ def chosen(kinds: Sequence[str] | None) -> list[PaperCase]:
         if kind not in CASES:
             raise ConfigError(f"the paper's result '{kind}' is unknown; it is one of {', '.join(CASES)}")
     return [case for kind, case in CASES.items() if not kinds or kind in kinds]
+
+
+def require_share(cases: Sequence[tuple[PaperCase, SystemConfig]], share: float) -> None:
+    """Refuse a share of the frames that would end in errors after minutes, or with nothing to compare.
+
+    Parameters
+    ----------
+    cases
+        What is to run, and how it is configured.
+    share
+        Share of the frames of each.
+
+    Raises
+    ------
+    ConfigError
+        Too small; names the least share.
+    """
+    short = [
+        (least / case.frames[name], case, name, least)
+        for case, config in cases
+        for name, least in case.least(config).items()
+        if case.shortened(share)[name] < least
+    ]
+    if short:
+        wanted, case, name, least = max(short, key=lambda one: one[0])
+        enough = math.ceil(1000 * wanted) / 1000
+        raise ConfigError(
+            f"--share {share:g}: too small; {case.kind} needs at least {least} frames ({name}) and would get "
+            f"{case.shortened(share)[name]} of {case.frames[name]}; the least is --share {enough:g}"
+        )
 
 
 def finished(folder: Path, kind: str) -> dict[str, Any] | None:

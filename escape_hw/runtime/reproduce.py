@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.api.gains import GainsResult
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult, LoopResult
@@ -46,6 +47,7 @@ class Comparison:
     rescaled: CalibrationResult | None = None
     notes: list[str] = field(default_factory=list)
     partial: bool = False
+    __repr__ = brief
 
 
 @dataclass(slots=True)
@@ -54,6 +56,7 @@ class Table1Result:
 
     calibrations: dict[str, CalibrationResult] = field(default_factory=dict)
     partial: bool = False
+    __repr__ = brief
 
 
 def reproduce_shwfs(

@@ -10,6 +10,7 @@ from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.config.load import load_system
+from escape_hw.runtime.calibrated import Calibrated, calibration_of, matrix_and_grid
 from escape_hw.runtime.loop_bench import LoopBench
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ class System(LoopBench):
         grid: SensorGeometry | None = None,
         whiten: bool = True,
         estimator: str | None = None,
-        closing: CalibrationResult | None = None,
+        closing: Calibrated | None = None,
         until: Target | None = None,
         keep: Checkpoint | None = None,
         progress: bool = False,
@@ -94,7 +95,8 @@ class System(LoopBench):
             What ``"escape"`` fits: ``"matrix"``, ``"telemetry"`` (fewer frames than modes are enough)
             or ``"auto"``; as configured by default.
         closing
-            An earlier calibration: its matrix closes the loop, and the pokes stand beside the integrator.
+            An earlier calibration, or a loaded one: its matrix closes the loop, and the pokes stand beside
+            the integrator.
         until
             Stop when this signal-to-noise ratio or accuracy is reached.
         keep
@@ -120,11 +122,13 @@ class System(LoopBench):
 
         procedure = calibrate_by(
             self, method, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator,
-            closing=closing, until=until, keep=keep,
+            closing=None if closing is None else calibration_of(closing), until=until, keep=keep,
         )  # fmt: skip
         return self.run(procedure, progress=progress)
 
-    def find_registration(self, matrix: InteractionMatrix, grid: SensorGeometry) -> RegistrationEstimate:
+    def find_registration(
+        self, matrix: InteractionMatrix | Calibrated, grid: SensorGeometry | None = None
+    ) -> RegistrationEstimate:
         """Where the mirror sits on the sensor, from a measured matrix (SPRINT); nothing moves.
 
         ``calibrate("escape")`` does this as well, and its error bars are the better ones: it still
@@ -133,9 +137,10 @@ class System(LoopBench):
         Parameters
         ----------
         matrix
-            A measured matrix, by push-pull or DO-CRIME.
+            A measured matrix, by push-pull or DO-CRIME, or a calibration, as :meth:`calibrate` or
+            ``escape_hw.load_matrix`` returns it; of a pseudo-synthetic one, the measured matrix behind it.
         grid
-            The grid it was measured on.
+            The grid it was measured on; a calibration tells its own.
 
         Raises
         ------
@@ -147,6 +152,10 @@ class System(LoopBench):
         from escape_hw.calibration.sprint import sprint
         from escape_hw.calibration.sprint_settings import as_configured
 
+        if not isinstance(matrix, InteractionMatrix):
+            found = calibration_of(matrix)
+            matrix, grid = found.measured or found.matrix, found.grid if grid is None else grid
+        matrix, grid = matrix_and_grid(matrix, grid)
         settings = self.config.calibration
         modes = min(settings.sprint_modes, matrix.n_modes)
         return sprint(

@@ -79,6 +79,7 @@ class TrackTask(MatrixTask):
         if result.latest is not None:
             keep_calibration(folder, record, "im", result.latest, {"im": self.product.path})
         track = track_document(result)
+        ended = self._planted(result, result.rows["seconds"][-1:]) if record.simulated else None
         document = finish(
             folder,
             {
@@ -88,6 +89,8 @@ class TrackTask(MatrixTask):
                 "planted_course": self._planted(result, track["track"]["seconds"])
                 if record.simulated
                 else None,
+                # The truth where the track ends, beside its registration there.
+                "planted_end": None if ended is None else {k: at[0] for k, at in ended.items() if at},
                 "im": self.product.path.absolute(),
                 "criteria": [
                     {"text": "loop stable", "met": result.stable},

@@ -16,6 +16,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
 from escape_hw.errors import ProductError
 
 #: What stands before the data of a block, one for each entry.
@@ -64,6 +65,7 @@ class Recording:
     arrived_ns: NDArray[np.int64]
     data: NDArray[Any]
     whole: bool
+    __repr__ = brief
 
 
 def read_recording(path: Path) -> list[Recording]:

@@ -8,6 +8,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from escape_hw.api.brief import brief
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
@@ -30,3 +32,4 @@ class Sample:
     arrived_ns: int
     data: NDArray[Any]
     meta: Mapping[str, float | str]
+    __repr__ = brief

@@ -9,33 +9,55 @@ from pathlib import Path
 
 import pytest
 from pages import EVERY, ROOT, Block, blocks_of, call, escape, spelled_right
+from quoted import differences
 
 DOCS = ROOT / "docs"
 #: Pages whose blocks belong together and are run whole; of the others, commands are parsed.
-RUN = sorted([*DOCS.glob("tutorial/*.md"), *DOCS.glob("how-to/*.md"), DOCS / "reference" / "products.md"])
+RUN = sorted(
+    [
+        *DOCS.glob("tutorial/*.md"), *DOCS.glob("how-to/*.md"), DOCS / "devices" / "add-a-driver.md",
+        DOCS / "reference" / "products.md",
+    ]
+)  # fmt: skip
 
 
 def name_of(page: Path) -> str:
     return str(page.relative_to(DOCS))
 
 
-def run_block(block: Block, folder: Path) -> None:
+def run_block(block: Block, folder: Path) -> str:
+    """Run a block; what it printed."""
+    printed = ""
     if block.language == "python":
         done = call([sys.executable, "-c", block.text], folder)
         assert done.returncode == 0, done.stderr
+        printed = done.stdout
     elif block.language == "sh":
         for line in block.commands():
             done = escape(line, folder)
             # Whether this computer can drive real devices is not for a test to say.
             allowed = (0, 1) if line.startswith("escape doctor") else (0,)
             assert done.returncode in allowed, f"{line}: {done.stderr}"
+            printed += done.stdout
+    return printed
 
 
 @pytest.mark.parametrize("page", RUN, ids=name_of)
 def test_a_page_can_be_followed(page: Path, tmp_path: Path) -> None:
+    printed = ""
     for block in blocks_of(page):
-        if "slow" not in block.marks:
-            run_block(block, tmp_path)
+        if "printed" in block.marks:
+            assert differences(block.text, printed) == []
+        elif "slow" not in block.marks:
+            printed = run_block(block, tmp_path)
+
+
+def test_a_quotation_is_held_against_the_output() -> None:
+    printed = "delay: 2.16 frames\n Shift X [%]  −16.036 ± 0.050   −0.7   −16\n"
+    assert differences("delay: 2.17 frames\n Shift X [%] −16.05 ± 0.051  −0.9  −16", printed) == []
+    assert len(differences("delay: 3.16 frames\nlag: 2.16 frames", printed)) == 2
+    assert len(differences("Shift X [%] −16.1 ± 0.050  −0.7  −16", printed)) == 1
+    assert len(differences("Shift X [%] −16.036 ± 0.090  −0.7  −16", printed)) == 1
 
 
 @pytest.mark.slow

@@ -269,6 +269,7 @@ def test_the_command_leaves_table_matrix_and_report(start, tmp_path, capsys):
     # The drift began when the bench was switched on, so the twin's clock counts.
     np.testing.assert_allclose(np.diff(planted), np.diff(seconds), rtol=1e-6)
     assert abs(planted[-1] - document["track"]["shift_x"][-1]) < 3.0
+    assert document["planted_end"]["shift_x"] == planted[-1]
     assert len(document["optical_gain"]) == start.matrix.n_modes
     lines = (tmp_path / "run" / "track.csv").read_text().splitlines()
     assert lines[0].split(",")[:2] == ["seconds", "shift_x"]

@@ -21,7 +21,7 @@ from escape_hw.runtime.system import System
 ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
 #: Short loops: a few tens of them run in some seconds.
 SHORT = (
-    "--trials", "12", "--candidates", "1", "--heats", "1", "--finals", "6", "--frames", "200", "--quiet",
+    "--trials", "12", "--candidates", "1", "--heats", "1", "--finals", "6", "--frames", "270", "--quiet",
     "--json",
 )  # fmt: skip
 #: 12 drawn, one heat and six finals of two matrices.

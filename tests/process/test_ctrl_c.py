@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 import sys
 from pathlib import Path
@@ -96,6 +97,25 @@ def test_ctrl_c_while_sprint_computes(start, tmp_path):
     assert ended.cpu_s < 2.0
     check_products(out, [], ["im"])
     assert load_matrix(out / "im.partial.fits").matrix.method == "docrime-whitened"
+
+
+def test_ctrl_c_tells_the_command_that_goes_on(start, system, tmp_path):
+    first, second = tmp_path / "a run", tmp_path / "again"
+    running = start("calibrate", system, "--method", "docrime", "--frames", ENDLESS, "--out", first)
+    running.wait_for("DO-CRIME")
+    running.let_work(0.5)
+    ended = running.stop(signal.SIGINT)
+    (way,) = [line.strip() for line in ended.lines if "go on with: " in line]
+    words = shlex.split(way.removeprefix("go on with: "))
+    assert words == ["escape", "calibrate", "--resume", str(first)]
+    taken = ended.document["frames"]
+    ended = start(*words[1:], "--frames", taken + 1000, "--out", second).stop()
+    assert ended.code == 0, ended.lines
+    assert ended.document["frames"] == taken + 1000
+    (told,) = [line for line in ended.lines if line.startswith("going on with ")]
+    assert str(first) in told
+    assert told.endswith(f"products go to {second}")
+    assert not any("go on with: " in line for line in ended.lines)
 
 
 def test_sigterm(start, system, tmp_path):

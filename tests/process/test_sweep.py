@@ -45,6 +45,11 @@ def test_killed_workers_and_a_killed_sweep_lose_nothing(arguments, tmp_path):
     assert len(loops(again)) == LOOPS
     assert set(document["best"]) == {"push-pull", "DO-CRIME"}
     assert (again / "report.html").stat().st_size > 10_000
+    # Resumed once more, it has nothing left to run, and shows what there is.
+    folders = sorted(path.name for path in tmp_path.iterdir())
+    shown = ended(start("--resume", str(run), "--json", "--quiet"))
+    assert (shown["folder"], shown["best"]) == (str(again), document["best"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == folders
     # Whatever ran when and where, the loops are those of a sweep that nobody disturbed.
     drawn = {(row["matrix"], row["air"]): row["gain"] for row in loops(again) if row["stage"] == "explore"}
     assert all(drawn["push-pull", air] == gain for (_, air), gain in drawn.items())

@@ -137,6 +137,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
             setattr(stand_in, name, getattr(made, name))
         if module == "docrime":
             stand_in.require_frames = lambda *_: None
+            stand_in.least_frames = lambda settings, n_modes: 2 * n_modes
         monkeypatch.setitem(sys.modules, stand_in.__name__, stand_in)
 
     def open_system(system: str, *, set: Any = (), seed: Any = None, mode: Any = None) -> FakeBench:

@@ -160,6 +160,25 @@ def test_snap_writes_frames_with_their_times(document, tmp_path: Path):
     assert code == 2  # never overwritten
 
 
+def test_show_tells_what_frames_a_file_holds(document, escape, tmp_path: Path):
+    file = tmp_path / "frames.fits"
+    taken = document("camera", "snap", "razor-shwfs", "--frames", 3, "--out", file)[1]
+    code, shown, _ = document("show", file)
+    assert (code, shown["system"], shown["simulated"]) == (0, "razor-shwfs", True)
+    assert (shown["frames"], shown["shape"], shown["lost_frames"]) == (3, [400, 400], 0)
+    assert (shown["counts"], shown["settings"]) == (taken["counts"], taken["settings"])
+    assert shown["rate_hz"] == pytest.approx(500)
+    assert shown["first_index"] == taken["first_index"]
+    assert (shown["dark_subtracted"], shown["flat_divided"]) == (False, False)
+    code, out, _ = escape("show", file)
+    assert code == 0
+    assert "3 frames of 400 x 400 pixels" in out
+    assert "500 Hz by their times" in out
+    assert "no dark subtracted" in out
+    assert escape("camera", "snap", "razor-shwfs", "--out", tmp_path / "one.fits")[0] == 0
+    assert document("show", tmp_path / "one.fits")[1]["rate_hz"] == 0
+
+
 def test_stream_counts_what_is_lost(document):
     code, found, _ = document("camera", "stream", "razor-shwfs", "--seconds", 0.04)
     assert code == 0

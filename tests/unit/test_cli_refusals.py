@@ -79,3 +79,13 @@ def test_unwritable_folder_exits_2_before_anything_opens(document, bench, tmp_pa
     code, found, _ = document("calibrate", "razor-shwfs", "--out", tmp_path / "file" / "run")
     assert (code, found["error"]["type"]) == (2, "StorageError")
     assert not bench.benches
+
+
+def test_a_calibration_that_came_to_its_end_is_not_resumed_but_shown(document, bench, tmp_path):
+    run = tmp_path / "run"
+    assert document("calibrate", "razor-shwfs", "--out", run)[0] == 0
+    (run / "report.html").touch()
+    code, found, _ = document("calibrate", "--resume", run)
+    assert code == 2
+    assert str(run / "report.html") in found["error"]["message"]
+    assert f"escape show {run}" in found["error"]["message"]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from escape_hw.io.psf import load_loop
+from escape_hw.runtime.paper import CASES
 
 
 @pytest.mark.usefixtures("reports")
@@ -88,6 +91,28 @@ def test_reproduce_all_leads_to_every_report(escape, document, bench, tmp_path):
     assert list(found["parts"]) == ["table1", "maps"]
     assert document("reproduce", "all", "--out", tmp_path / "x", "--only", "mops")[0] == 2
     assert not (tmp_path / "x").exists()
+
+
+def test_too_small_a_share_is_refused_before_anything_runs(document, bench, tmp_path):
+    words = ("reproduce", "all", "--out", tmp_path / "all", "--share")
+    code, found, _ = document(*words, 0.005)
+    assert code == 2
+    said = re.fullmatch(
+        r"--share 0\.005: too small; (\w+) needs at least (\d+) frames \((\w+)\) and would get (\d+) of (\d+)"
+        r"; the least is --share (\S+)",
+        found["error"]["message"],
+    )
+    kind, least, name, got, full = said[1], int(said[2]), said[3], int(said[4]), int(said[5])
+    assert CASES[kind].frames[name] == full
+    assert got == CASES[kind].shortened(0.005)[name] < least
+    assert bench.benches == []
+    assert not (tmp_path / "all").exists()
+    # What it says is enough is enough, and no more than that.
+    code, found, _ = document(*words, float(said[6]) - 0.001)
+    assert code == 2
+    code, found, err = document(*words, said[6], "--only", kind)
+    assert "too small" not in err
+    assert found["parts"][kind]
 
 
 @pytest.mark.usefixtures("reports")

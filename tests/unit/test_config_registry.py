@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from escape_hw.bench import build_bench
 from escape_hw.config import registry
 from escape_hw.config.load import load_system
 from escape_hw.errors import ConfigError
@@ -16,6 +17,22 @@ def make(name, config, shared):
     return name
 
 LIMIT = 3
+
+
+def too_few(name, config):
+    return name
+
+
+def fails(name, config, shared):
+    return config.no_such_key
+
+
+def forgets(name, config, shared):
+    pass
+
+
+def model(config):
+    return config
 """
 
 
@@ -34,8 +51,14 @@ def plug(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "plug-number = plug_mirror:LIMIT\n"
         "plug-typo = plug_mirror:mkae\n"
         "plug-gone = plug_gone.devices:make\n"
+        "plug-few = plug_mirror:too_few\n"
+        "plug-fails = plug_mirror:fails\n"
+        "plug-forgets = plug_mirror:forgets\n"
         "plug-needy = plug_needy:make\n"
         "plug-extra = plug_needy:make [vendor]\n"
+        "[escape.models]\n"
+        "plug-model = plug_mirror:model\n"
+        "plug-none = plug_mirror:too_few\n"
     )
     for module in ("plug_mirror", "plug_needy"):
         monkeypatch.delitem(sys.modules, module, raising=False)
@@ -55,6 +78,11 @@ def test_a_third_party_driver_is_found_by_its_entry_point() -> None:
     [
         ("plug-miror", r"no device driver 'plug-miror' is installed \(did you mean 'plug-mirror'\?"),
         ("plug-number", r"device driver 'plug-number' of plug is broken: plug_mirror:LIMIT is not callable"),
+        (
+            "plug-few",
+            r"'plug-few' of plug is broken: plug_mirror:too_few takes \(name, config\) \(too many positional "
+            r"arguments\); it is called as factory\(name, config, shared\)",
+        ),
         ("plug-typo", r"device driver 'plug-typo' of plug is broken: plug_mirror:mkae does not exist"),
         ("plug-gone", r"module plug_gone\.devices is not installed .* pip install --force-reinstall plug$"),
         ("plug-needy", r"needs the Python module 'a_vendor_library_nobody_has'.* pip install 'a_vendor_"),
@@ -67,6 +95,42 @@ def test_a_third_party_driver_is_found_by_its_entry_point() -> None:
 def test_what_cannot_be_loaded_says_what_to_do(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         registry.device_factory(name)
+
+
+@pytest.mark.usefixtures("plug")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "plug-mirror",
+            "makes a str, not a DeformableMirror; plug_mirror:make must return one",
+        ),
+        ("plug-forgets", "makes a NoneType, not a DeformableMirror; plug_mirror:forgets must return one"),
+        (
+            "plug-fails",
+            r"cannot be made: plug_mirror:fails failed with AttributeError: .*no_such_key.* line",
+        ),
+    ],
+)
+def test_what_makes_no_mirror_is_named_with_what_is_expected(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        build_bench(load_system("razor-shwfs", overrides=[f"devices.dm.sim_driver={name}"]))
+    assert str(caught.value).startswith("devices.dm: driver")
+
+
+@pytest.mark.usefixtures("plug")
+def test_a_broken_model_is_named_with_what_is_expected() -> None:
+    with pytest.raises(ConfigError, match=r"takes \(config\).*called as factory\(config, grid\)"):
+        registry.model_factory("plug-model")
+    with pytest.raises(ConfigError, match="'plug-none' makes a SystemConfig, not a SyntheticModel; plug_mi"):
+        registry.model_factory("plug-none")(load_system("razor-shwfs"), None)
+
+
+@pytest.mark.parametrize("factory", [3, lambda name: name])
+def test_what_is_no_factory_is_not_registered(monkeypatch: pytest.MonkeyPatch, factory: object) -> None:
+    monkeypatch.setattr(registry, "_OWN", {})
+    with pytest.raises(ConfigError, match=r"'bench-mirror' is broken: .* factory\(name, config, shared"):
+        registry.register_device("bench-mirror", factory)  # type: ignore[arg-type]
 
 
 def test_unknown_model() -> None:

@@ -69,7 +69,9 @@ def test_methods_and_procedures_have_the_same_defaults(method: str, procedure: s
     ours = inspect.signature(getattr(escape_hw.System, method)).parameters
     theirs = inspect.signature(getattr(escape_hw, procedure)).parameters
     for name, parameter in ours.items():
-        if name not in ("self", "progress"):
+        # A calibration tells its own grid; a procedure is handed matrix and grid.
+        own_grid = name == "grid" and theirs[name].default is inspect.Parameter.empty
+        if name not in ("self", "progress") and not own_grid:
             assert parameter.default == theirs[name].default, name
 
 

@@ -14,7 +14,7 @@ from escape_hw.api.procedure import run
 from escape_hw.config.load import load_system
 from escape_hw.errors import ConfigError
 from escape_hw.io.provenance import sha256_of
-from escape_hw.runtime.sweep.ask import need_optuna, swept_space
+from escape_hw.runtime.sweep.ask import need_optuna, require_loop_frames, swept_space
 from escape_hw.runtime.sweep.document import criteria, sweep_document, trials_csv
 from escape_hw.runtime.sweep.kept import KeptSweep, read_kept
 from escape_hw.runtime.sweep.plan import Arm, Design
@@ -38,6 +38,30 @@ def test_hardware_wants_a_persons_limits_on_everything():
 def test_what_cannot_be_varied_is_said(text):
     with pytest.raises(ConfigError, match="--vary"):
         swept_space(configuration(), [text])
+
+
+@pytest.mark.parametrize(("system", "least"), [("razor-shwfs", 270), ("razor-pywfs", 162)])
+def test_loops_too_short_for_a_strehl_ratio_are_refused_before_anything_opens(escape, system, least):
+    require_loop_frames(load_system(system), least)
+    with pytest.raises(ConfigError, match=f"--frames {least - 1}: .* the least is --frames {least}"):
+        require_loop_frames(load_system(system), least - 1)
+    code, _, err = escape("sweep", system, "--frames", least - 1, "--trials", 4)
+    assert code == 2
+    assert f"the least is --frames {least}" in err
+
+
+def test_the_least_loop_has_a_strehl_ratio_with_an_error():
+    with escape_hw.open_system("razor-shwfs", set=SMALL) as bench:
+        found, psf = bench.calibrate("push-pull"), bench.take_model_psf()
+        run = bench.close_loop(found, frames=270, model_psf=psf)
+    assert np.isfinite(run.strehl.peak.sigma)
+
+
+def test_without_a_science_camera_there_is_nothing_to_judge_by():
+    config = configuration()
+    bare = config.model_copy(update={"devices": config.devices.model_copy(update={"science": None})})
+    with pytest.raises(ConfigError, match="no science camera"):
+        require_loop_frames(bare, 400)
 
 
 def test_ranges_beyond_the_configurations_are_refused():

@@ -11,8 +11,8 @@ from escape_hw.errors import ConfigError
 from escape_hw.runtime.sweep.space import DELAY, LOOP_KEYS, Parameter, default_space, parse_parameter
 
 if TYPE_CHECKING:
-    from escape_hw.api.results import CalibrationResult
     from escape_hw.config.models import SystemConfig
+    from escape_hw.runtime.calibrated import Calibrated
     from escape_hw.runtime.loop_bench import LoopBench
     from escape_hw.runtime.sweep.kept import KeptSweep
     from escape_hw.runtime.sweep.result import SweepResult
@@ -74,9 +74,31 @@ def swept_space(config: SystemConfig, texts: Sequence[str]) -> tuple[Parameter, 
     return default_space(config.basis.n_modes, given)
 
 
+def require_loop_frames(config: SystemConfig, frames: int) -> None:
+    """Refuse loops too short for the Strehl ratios that a sweep judges them by.
+
+    Raises
+    ------
+    ConfigError
+        Says how many frames are needed; or there is no science camera.
+    """
+    from escape_hw.calibration.loop_run import CLOSING_S, frames_for_strehl
+
+    science = config.devices.science
+    if science is None:
+        raise ConfigError(f"'{config.system.name}' has no science camera to judge the loops of a sweep by")
+    least = frames_for_strehl(config.devices.wfs.frame_rate_hz, science.frame_rate_hz)
+    if frames < least:
+        raise ConfigError(
+            f"--frames {frames}: too short for Strehl ratios with errors; a loop closes in {CLOSING_S:g} s, "
+            f"and then the science camera has to take some frames at {science.frame_rate_hz:g} Hz; "
+            f"the least is --frames {least}"
+        )
+
+
 def sweep_of(
     bench: LoopBench,
-    matrices: Mapping[str, CalibrationResult],
+    matrices: Mapping[str, Calibrated],
     folder: Path,
     vary: Sequence[str],
     asked: Mapping[str, Any],
@@ -88,6 +110,7 @@ def sweep_of(
     """A sweep with matrices in memory; see :meth:`~escape_hw.runtime.system.System.sweep`."""
     need_optuna()
     space = swept_space(bench.config, vary)
+    require_loop_frames(bench.config, asked["frames"])
     from escape_hw.runtime.sweep.kept import KEPT, read_kept
     from escape_hw.runtime.sweep.result import conclude
     from escape_hw.runtime.sweep.run import run_sweep
@@ -109,7 +132,7 @@ def sweep_of(
 
 def _begin(
     bench: LoopBench,
-    matrices: Mapping[str, CalibrationResult],
+    matrices: Mapping[str, Calibrated],
     folder: Path,
     space: tuple[Parameter, ...],
     asked: Mapping[str, Any],
@@ -119,6 +142,7 @@ def _begin(
 
     from escape_hw.io.fits import load_matrix, save_matrix
     from escape_hw.io.storage import make_folder
+    from escape_hw.runtime.calibrated import calibration_of
     from escape_hw.runtime.keep import key_of
     from escape_hw.runtime.sweep.kept import KeptSweep
     from escape_hw.runtime.sweep.plan import Arm, Design
@@ -127,7 +151,8 @@ def _begin(
     folder = folder.absolute()
     make_folder(folder)
     arms = []
-    for label, calibration in matrices.items():
+    for label, given in matrices.items():
+        calibration = calibration_of(given)
         path = folder / f"{key_of(label)}.fits"
         # A file that holds this very matrix stays: its checksum says whether a study goes on.
         kept = load_matrix(path) if path.is_file() else None

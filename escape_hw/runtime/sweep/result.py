@@ -69,6 +69,16 @@ class SweepResult:
     importance: dict[str, float] = field(default_factory=dict)
     importance_closed: dict[str, float] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        arms = ", ".join(arm.label for arm in self.sweep.arms)
+        state = ", PARTIAL" if self.partial else ""
+        lines = [f"{type(self).__name__} of {len(self.run.records)} loops: {arms}{state}"]
+        lines += [
+            f"{label}: Strehl ratio {best.strehl.peak.value:.3f} ± {best.strehl.peak.sigma:.3f} at its best"
+            for label, best in self.best.items()
+        ]
+        return f"<{chr(10).join([*lines, *(one.text for one in self.comparisons)])}>".replace("\n", "\n  ")
+
     @property
     def partial(self) -> bool:
         """Whether the operator stopped it."""

@@ -9,6 +9,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from typing import Any
 
+from escape_hw.api.brief import brief
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.bench import Bench
 from escape_hw.errors import Aborted, CalibrationError
@@ -82,6 +83,7 @@ class SweepRun:
     records: list[Record] = field(default_factory=list)
     best: dict[str, dict[str, Any]] = field(default_factory=dict)
     partial: bool = False
+    __repr__ = brief
 
 
 def run_sweep(sweep: Sweep, store: SweepStore, runner: Workers | Bench) -> Procedure[SweepRun]:

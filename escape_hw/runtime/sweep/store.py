@@ -222,6 +222,14 @@ class SweepStore:
                 found.setdefault(slot, self._record(trial, slot))
         return sorted(found.values(), key=lambda r: (r.slot.stage, r.slot.index, r.slot.candidate))
 
+    def finished_in(self) -> str | None:
+        """Folder with the result of all its loops, once there is one."""
+        return self._patiently(lambda: self._study.user_attrs.get("finished_in"))
+
+    def mark_finished(self, folder: str) -> None:
+        """Keep where the result of all its loops lies."""
+        self._patiently(lambda: self._study.set_user_attr("finished_in", folder))
+
     def _record(self, trial: FrozenTrial, slot: Slot) -> Record:
         values = {one.key: trial.params[one.key] for one in self._space}
         complete = trial.state == TrialState.COMPLETE and trial.value is not None
