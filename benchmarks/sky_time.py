@@ -67,7 +67,7 @@ def main() -> None:
     plants = [PlantErrors(*(array(line[kept]) for kept in _KEPT)) for line in lines]
     curves = summary(plants, options.frames, goal_of(options.system))
     (options.out / f"{name}.json").write_text(json.dumps(curves, indent=1) + "\n")
-    error_curves(curves).savefig(options.out / f"{name}.png", dpi=110)
+    error_curves(curves).savefig(options.out / f"{name}.png", dpi=110, facecolor="white")
     tell(plants, options.frames)
     print(f"{len(plants)} plants; fewest frames that meet the goal: {curves['fewest_frames']}")
 
