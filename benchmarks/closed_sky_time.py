@@ -2,11 +2,11 @@
 
     python benchmarks/closed_sky_time.py --plants 10 --frames 1000 --poke 0.002 --out closed
 
-Each plant is calibrated in open loop first (1,200 frames at the usual poke); its pseudo-synthetic matrix closes
-the loop, and pokes of the given size beside the integrator find the registration again, from nothing of the
-calibration before but its matrix. Writes ``closed-sky-time.jsonl``, a line per plant as soon as it is done;
-plants that the file has already are not run again. Prints rms errors with, in brackets, normalised chi-squared
-and mean error. A plant takes half a minute on one core.
+Each plant is calibrated in open loop first (1,200 frames at the usual poke); its pseudo-synthetic matrix
+closes the loop, and pokes of the given size beside the integrator find the registration again, from nothing
+of the calibration before but its matrix. Writes ``closed-sky-time.jsonl``, a line per plant as soon as it is
+done; plants that the file has already are not run again. Prints rms errors with, in brackets, normalised
+chi-squared and mean error. A plant takes half a minute on one core.
 """
 
 from __future__ import annotations

@@ -3,10 +3,10 @@
     python benchmarks/sky_time.py --plants 20 --frames 20 50 220 1000 --out docs/figures
     python benchmarks/sky_time.py --plants 5 --frames 1000 2000 4000 8000 --estimators plain --out long
 
-Writes ``sky-time.jsonl``, a line per plant as soon as it is done, ``sky-time.json`` and ``sky-time.png``, with
-the system's name behind for any but ``razor-shwfs``; plants that the file has already are not run again. Prints
-rms errors with, in brackets, their ratio to the bound, normalised chi-squared and mean. Twenty plants take
-about twenty minutes on one core (``escape reproduce sky-time`` uses two); on a pyramid (``--system
+Writes ``sky-time.jsonl``, a line per plant as soon as it is done, ``sky-time.json`` and ``sky-time.png``,
+with the system's name behind for any but ``razor-shwfs``; plants that the file has already are not run again.
+Prints rms errors with, in brackets, their ratio to the bound, normalised chi-squared and mean. Twenty plants
+take about twenty minutes on one core (``escape reproduce sky-time`` uses two); on a pyramid (``--system
 razor-pywfs``) the goal is that of its own sub-apertures, pixels of the pupil image.
 """
 
