@@ -1,11 +1,13 @@
 """Error of the registration against the frames spent: runs the campaign and draws its curves.
 
-    python benchmarks/sky_time.py --plants 20 --frames 220 300 500 1000 10000 --out docs/figures
+    python benchmarks/sky_time.py --plants 20 --frames 20 50 220 1000 --out docs/figures
+    python benchmarks/sky_time.py --plants 5 --frames 1000 2000 4000 8000 --estimators plain --out long
 
-Writes ``sky-time.json`` and ``sky-time.png``, with the system's name behind for any but ``razor-shwfs``.
-Twenty plants take about ten minutes on two cores; on a pyramid (``--system razor-pywfs``) the goal is that of
-its own sub-apertures, pixels of the pupil image.
-``--curves FILE`` draws curves that were measured before, from ``escape reproduce sky-time --json``.
+Writes ``sky-time.jsonl``, a line per plant as soon as it is done, ``sky-time.json`` and ``sky-time.png``,
+with the system's name behind for any but ``razor-shwfs``; plants that the file has already are not run again.
+Prints rms errors with, in brackets, their ratio to the bound, normalised chi-squared and mean. Twenty plants
+take about twenty minutes on one core (``escape reproduce sky-time`` uses two); on a pyramid (``--system
+razor-pywfs``) the goal is that of its own sub-apertures, pixels of the pupil image.
 """
 
 from __future__ import annotations
@@ -13,44 +15,61 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any
 
-from escape_hw.api.procedure import Progress, run
+import numpy as np
+from plant_tables import Line, array, each_plant, plain, row
+
 from escape_hw.report.figures_registration import error_curves
-from escape_hw.runtime.sky_time import FRAMES, sky_time
+from escape_hw.runtime.sky_time import ESTIMATORS, FRAMES, PlantErrors, goal_of, run_plant, summary
+
+#: What a line keeps of a plant.
+_KEPT = ("errors", "sigmas", "exact", "hybrid")
 
 
-def measure(system: str, plants: int, frames: list[int], workers: int) -> dict[str, Any]:
-    """Run the campaign with a line per plant."""
+def measured(options: argparse.Namespace, number: int) -> Line:
+    """The line of a plant."""
+    found = run_plant(options.system, number, options.frames, estimators=options.estimators)
+    return {"frames": options.frames, **{name: plain(getattr(found, name)) for name in _KEPT}}
 
-    def tell(progress: Progress) -> None:
-        print(f"\r{progress.done} of {progress.total} plants", end="", flush=True)
 
-    procedure = sky_time(system, plants=plants, frames=sorted(frames), workers=workers)
-    return run(procedure, observers=(tell,))
+def tell(plants: list[PlantErrors], frames: list[int]) -> None:
+    """Print a table."""
+    for f, count in enumerate(frames):
+        bound = np.sqrt(np.mean([p.hybrid[f] ** 2 for p in plants], axis=0))
+        for e, name in enumerate(ESTIMATORS):
+            errors, sigmas = (np.stack([getattr(p, k)[e, f] for p in plants]) for k in _KEPT[:2])
+            if np.isfinite(errors).all():
+                print(f"| {count:,} | {name} | {row(errors, sigmas, bound)} |")
+        if np.isfinite(bound).all():
+            print(f"| | bound | {' | '.join(f'{value:.2g}' for value in bound)} |")
 
 
 def main() -> None:
-    """Parse, measure or read, write."""
+    """Parse, measure what is missing, write."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--system", default="razor-shwfs")
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--plants", type=int, default=20)
     parser.add_argument("--frames", type=int, nargs="+", default=list(FRAMES))
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--curves", type=Path)
+    parser.add_argument("--estimators", nargs="+", choices=ESTIMATORS, default=list(ESTIMATORS))
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
-    if options.curves is not None:
-        curves = json.loads(options.curves.read_text())
-    else:
-        curves = measure(options.system, options.plants, options.frames, options.workers)
+    options.frames.sort()
     options.out.mkdir(parents=True, exist_ok=True)
     name = "sky-time" if options.system == "razor-shwfs" else f"sky-time-{options.system}"
+    target = options.out / f"{name}.jsonl"
+    numbers = range(options.first, options.first + options.plants)
+    lines = each_plant(target, numbers, lambda number: measured(options, number))
+    if any(line["frames"] != options.frames for line in lines):
+        parser.error(f"{target} has plants of other numbers of frames; choose another folder")
+    plants = [PlantErrors(*(array(line[kept]) for kept in _KEPT)) for line in lines]
+    curves = summary(plants, options.frames, goal_of(options.system))
     (options.out / f"{name}.json").write_text(json.dumps(curves, indent=1) + "\n")
-    error_curves(curves).savefig(options.out / f"{name}.png", dpi=110)
-    print(f"\nfewest frames that meet the goal: {curves['fewest_frames']}; curves in {options.out}")
+    error_curves(curves).savefig(options.out / f"{name}.png", dpi=110, facecolor="white")
+    tell(plants, options.frames)
+    print(f"{len(plants)} plants; fewest frames that meet the goal: {curves['fewest_frames']}")
 
 
 if __name__ == "__main__":

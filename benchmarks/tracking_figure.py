@@ -17,6 +17,8 @@ from escape_hw.report import style
 SETTLED_S = 10.0
 #: Seconds before and after an exchange that are held against each other.
 BUMP_S = 0.1
+#: How far off the shift may be [% of a sub-aperture], and the Strehl ratio beside the loop that knows [%].
+SHIFT_BAR, STREHL_BAR = 2.0, 1.0
 LABELS = {"knows": "knows the truth, no pokes", "never": "never looks, no pokes"}
 
 
@@ -53,7 +55,7 @@ def draw(out: Path, figure: Path) -> None:
         if len(looks):
             others[loop] = looks
             print(difference(loop, others[loop], t, rows["strehl"]))
-    picture(rows, truth, gains, others).savefig(figure, dpi=110)
+    picture(rows, truth, gains, others).savefig(figure, dpi=110, facecolor="white")
 
 
 def bumps(out: Path, t: Any, exchanged: Any) -> str:
@@ -78,48 +80,74 @@ def bumps(out: Path, t: Any, exchanged: Any) -> str:
     )
 
 
+def beside(looks: NDArray[np.float64], t: Any, ratios: Any) -> NDArray[np.float64]:
+    """The tracked loop's Strehl ratios at the moments of looks at another one ``(n,)``."""
+    return np.array([ratios[np.argmin(np.abs(t - end))] for end in looks[:, 0]])
+
+
 def difference(loop: str, looks: NDArray[np.float64], t: Any, ratios: Any) -> str:
     """Mean Strehl ratios of the tracked loop and another one at the same moments, and of their difference."""
-    here = np.array([ratios[np.argmin(np.abs(t - end))] for end in looks[:, 0]])
+    here = beside(looks, t, ratios)
     apart = here - looks[:, 1]
     error = apart.std(ddof=1) / np.sqrt(len(apart))
     return (
         f"Strehl ratio: tracked {100 * here.mean():.2f} %, {loop} {100 * looks[:, 1].mean():.2f} %, tracked "
-        f"minus {loop} {100 * apart.mean():+.2f} +- {100 * error:.2f} % ({len(apart)} looks), "
+        f"minus {loop} {100 * apart.mean():+.2f} +- {100 * error:.2f} % ({len(apart)} looks), relative "
+        f"{100 * apart.mean() / looks[:, 1].mean():+.2f} +- {100 * error / looks[:, 1].mean():.2f} %; "
         f"last quarter {100 * apart[-len(apart) // 4 :].mean():+.2f} %"
     )
 
 
+def band(panel: Any, t: Any, value: Any, sigma: Any) -> None:
+    """A course with the band of its standard errors."""
+    panel.fill_between(t, value - sigma, value + sigma, color=style.SERIES[0], alpha=0.3, lw=0)
+    panel.plot(t, value, color=style.SERIES[0], lw=1.2, label="tracked")
+
+
 def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]) -> Figure:
-    """Shift, rotation, gain and Strehl ratio against time."""
-    figure = style.new_figure(9.2, 6.4)
-    panels = figure.subplots(2, 2).ravel()
+    """Shift and its error, rotation, gain, Strehl ratio and what it lacks, against time."""
+    figure = style.new_figure(9.2, 9.0)
+    panels = figure.subplots(3, 2, sharex=True).ravel()
     t = rows["seconds"]
     for panel, name, k, title in (
         (panels[0], "shift_x", 0, "shift x [% of a sub-aperture]"),
-        (panels[1], "rotation", 2, "rotation [deg]"),
+        (panels[2], "rotation", 2, "rotation [deg]"),
     ):
-        value, sigma = rows[name] - truth[0, k], rows[f"{name}_sigma"]
-        panel.fill_between(t, value - sigma, value + sigma, color=style.SERIES[0], alpha=0.3, lw=0)
-        panel.plot(t, value, color=style.SERIES[0], lw=1.2, label="tracked")
-        panel.plot(t, truth[:, k] - truth[0, k], ":", color=style.INK, lw=1.2, label="truth")
+        band(panel, t, rows[name] - truth[0, k], rows[f"{name}_sigma"])
+        panel.plot(t, truth[:, k] - truth[0, k], ":", color=style.INK, lw=1.4, label="truth")
         style.tidy(panel).set_title(f"{title}, since the start", fontsize=9.5)
-    sigma = rows["optical_gain_sigma"]
-    panels[2].fill_between(
-        t, rows["optical_gain"] - sigma, rows["optical_gain"] + sigma, color=style.SERIES[0], alpha=0.3, lw=0
-    )
-    panels[2].plot(t, rows["optical_gain"], color=style.SERIES[0], lw=1.2, label="tracked")
-    panels[2].plot(gains[:, 0], gains[:, 1], "o", ms=3, color=style.INK, label="truth")
-    style.tidy(panels[2]).set_title("optical gain, beside the start's matrix", fontsize=9.5)
-    ratio = np.isfinite(rows["strehl"])
-    panels[3].errorbar(
-        t[ratio], rows["strehl"][ratio], rows["strehl_sigma"][ratio],
+    band(panels[1], t, rows["shift_x"] - truth[:, 0], rows["shift_x_sigma"])
+    panels[1].axhline(0, color=style.INK, lw=0.8)
+    for bar in (-SHIFT_BAR, SHIFT_BAR):
+        panels[1].axhline(bar, color=style.MUTED, lw=1.0, ls=":", label="asked for" if bar > 0 else None)
+    style.tidy(panels[1]).set_title("shift x, tracked less truth [% of a sub-aperture]", fontsize=9.5)
+    band(panels[3], t, rows["optical_gain"], rows["optical_gain_sigma"])
+    panels[3].plot(gains[:, 0], gains[:, 1], "o", ms=3, color=style.INK, label="truth")
+    style.tidy(panels[3]).set_title("optical gain, beside the start's matrix", fontsize=9.5)
+    strehl_panels(panels[4], panels[5], rows, others)
+    for panel in panels:
+        panel.legend(frameon=False, fontsize=8)
+    for panel in panels[4:]:
+        panel.set_xlabel("seconds")
+    return figure
+
+
+def strehl_panels(panel: Any, lacking: Any, rows: dict[str, Any], others: dict[str, Any]) -> None:
+    """Strehl ratios, and what each loop lacks of the one that knows on the same air."""
+    t, ratio = rows["seconds"], np.isfinite(rows["strehl"])
+    panel.errorbar(
+        t[ratio], 100 * rows["strehl"][ratio], 100 * rows["strehl_sigma"][ratio],
         color=style.SERIES[0], lw=1.0, elinewidth=0.5, label="tracked, with pokes",
     )  # fmt: skip
+    known = others.get("knows")
     for (loop, looks), mark, colour in zip(others.items(), "os", (style.INK, style.SERIES[1]), strict=False):
-        panels[3].plot(looks[:, 0], looks[:, 1], mark, ms=3.5, color=colour, label=LABELS[loop])
-    style.tidy(panels[3]).set_title("Strehl ratio, peak", fontsize=9.5)
-    for panel in panels:
-        panel.set_xlabel("seconds")
-        panel.legend(frameon=False, fontsize=8)
-    return figure
+        panel.plot(looks[:, 0], 100 * looks[:, 1], mark, ms=3.5, color=colour, label=LABELS[loop])
+        if known is not None and len(known) == len(looks) and loop != "knows":
+            lack = 100 * (looks[:, 1] / known[:, 1] - 1)
+            lacking.plot(looks[:, 0], lack, mark, ms=3.5, color=colour, label=LABELS[loop])
+    if known is not None:
+        lack = 100 * (beside(known, t, rows["strehl"]) / known[:, 1] - 1)
+        lacking.plot(known[:, 0], lack, "-", color=style.SERIES[0], lw=1.2, label="tracked, with pokes")
+    lacking.axhline(-STREHL_BAR, color=style.MUTED, lw=1.0, ls=":", label="asked for")
+    style.tidy(panel).set_title("Strehl ratio, peak [%]", fontsize=9.5)
+    style.tidy(lacking).set_title("Strehl ratio beside the loop that knows [%]", fontsize=9.5)

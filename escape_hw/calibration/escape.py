@@ -15,7 +15,7 @@ from escape_hw.calibration.checkpoint import Checkpoint
 from escape_hw.calibration.docrime import docrime_run, least_frames, matrix_of
 from escape_hw.calibration.docrime_closed import docrime_closed_run
 from escape_hw.calibration.docrime_solution import DocrimeSolution
-from escape_hw.calibration.escape_few import escape_from_few
+from escape_hw.calibration.escape_few import escape_from_few, fit_record
 from escape_hw.calibration.escape_few_closed import escape_closed_from_few
 from escape_hw.calibration.pseudo_synthetic import synthesise
 from escape_hw.calibration.sensor_setup import modal_basis
@@ -26,6 +26,10 @@ from escape_hw.calibration.stopping import Target
 from escape_hw.calibration.telemetry_sprint import independent_columns
 from escape_hw.config.models import ESTIMATORS
 from escape_hw.errors import Aborted, ConfigError
+
+#: Frames per mode below which the frames themselves are fitted even where there is a matrix: the errors of
+#: one from so few frames look like white noise in what it leaves, and the filter found on that is too weak.
+_FRAMES_PER_MODE = 10
 
 
 def escape(
@@ -108,14 +112,20 @@ def escape(
             raise ConfigError("the plain estimator is for open loop; in closed loop turbulence is whitened")
         run = yield from docrime_closed_run(bench, closing, frames=frames, poke=poke, keep=keep, judge=asked)
     else:
+        few = not from_matrix and n_frames < _FRAMES_PER_MODE * n_modes
         run = yield from docrime_run(
-            bench, frames=frames, poke=poke, grid=grid, whiten=whiten, keep=keep, judge=asked
+            bench, frames=frames, poke=poke, grid=grid, whiten=whiten, keep=keep, judge=asked, record=few
         )
     measured, solution = run.result, run.solution
     if measured.partial:
         return measured
     try:
-        estimate = yield from _fit(bench, measured.matrix, measured.grid, solution, from_matrix)
+        if run.record is not None and run.record[0].size == measured.frames:
+            order = bench.config.calibration.whiten_order
+            fit = yield from fit_record(bench, run.record, measured.matrix, measured.grid, order)
+            estimate = fit.estimate
+        else:
+            estimate = yield from _fit(bench, measured.matrix, measured.grid, solution, from_matrix)
     except Aborted:
         return replace(measured, partial=True)
     made = synthesise(bench, measured.grid, estimate, measured.matrix.m2c)

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix, some_frames
 from escape_hw.calibration.poke_patterns import random_pattern
-from escape_hw.calibration.poke_session import PokeSession
+from escape_hw.calibration.poke_session import PokeSession, Record
 from escape_hw.calibration.pseudo_synthetic import synthesise
 from escape_hw.calibration.sensor_setup import SETUP_FRAMES, modal_basis, random_amplitudes
 from escape_hw.calibration.telemetry_sprint import MIN_ROWS, TelemetryFit, telemetry_sprint, time_line
@@ -70,11 +71,7 @@ def escape_from_few(
     found = session.finished_grid() if session.long_look else session.motion.of(session.grid)
     shape = (found.n_slopes, m2c.shape[1])
     frame = measured_matrix(bench, found, m2c, np.zeros(shape), np.zeros(shape), "telemetry")
-    fit = yield from telemetry_sprint(
-        time_line(*record, before=2 * c.whiten_order + c.lags), frame, bench.model(found),
-        order=order, lags=c.lags, learning_rate=c.learning_rate, solver=c.solver, loss=c.loss, also=c.also,
-        actuators=c.actuators,
-    )  # fmt: skip
+    fit = yield from fit_record(bench, record, frame, found, order)
     lost = int(record[0][-1] - record[0][0]) + 1 - record[0].size
     result = few_frames_result(
         bench, fit, found, m2c, frames=int(record[0].size), lost=lost, poke=float(poke), order=order,
@@ -86,6 +83,33 @@ def escape_from_few(
         mean_frame=session.mean_frame,
         notes=(*result.notes, *session.notes()),
     )
+
+
+def fit_record(
+    bench: Bench, record: Record, frame: InteractionMatrix, grid: SensorGeometry, order: int
+) -> Procedure[TelemetryFit]:
+    """SPRINT on the frames of an open-loop run.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    record
+        Frame indices, slopes and pokes.
+    frame
+        A matrix of this sensor and basis; its data are not used.
+    grid
+        The geometry that the model is built on.
+    order
+        Of the whitening filter.
+    """
+    c = bench.config.calibration
+    data = time_line(*record, before=2 * c.whiten_order + c.lags)
+    fit = yield from telemetry_sprint(
+        data, frame, bench.model(grid), order=order, lags=c.lags, learning_rate=c.learning_rate,
+        solver=c.solver, loss=c.loss, also=c.also, actuators=c.actuators,
+    )  # fmt: skip
+    return fit
 
 
 def order_for(c: CalibrationSection, frames: int) -> int:

@@ -96,11 +96,16 @@ def twins_of(
 
 
 def run_plant(
-    system: str | SystemConfig, number: int, frames: Sequence[int] = FRAMES, overrides: Sequence[str] = ()
+    system: str | SystemConfig,
+    number: int,
+    frames: Sequence[int] = FRAMES,
+    overrides: Sequence[str] = (),
+    estimators: Sequence[str] = ESTIMATORS,
 ) -> PlantErrors:
     """Record one run on one plant and estimate its registration from its first frames.
 
     The estimators get frames, indices and the commands sent; the plant is only compared at the end.
+    Without ``"whitened"`` among ``estimators`` there is no bound, for the noise is not known.
     """
     plant = random_plant(number)
     config = twins_of(system, [*overrides, *plant_overrides(plant)], seed=number + 1)
@@ -115,7 +120,7 @@ def run_plant(
         grid, m2c = measured.result.grid, measured.result.matrix.m2c
         model = bench.model(grid)
         for e, order in enumerate((0, c.whiten_order)):
-            for f, count in enumerate(frames):
+            for f, count in enumerate(frames if ESTIMATORS[e] in estimators else ()):
                 estimator = DocrimeEstimator(
                     slopes.shape[1], pokes.shape[1], order=order, lags=c.lags,
                     correlations=slopes.shape[1] <= MOST_CORRELATED,
@@ -130,7 +135,7 @@ def run_plant(
                 sigmas[e, f] = found.sigma
                 if order and count == max(frames):
                     bounds = _bounds(measured.record, c.lags, solution, matrix, model, frames)
-        for f, count in enumerate(frames):
+        for f, count in enumerate(frames if ESTIMATORS[2] in estimators else ()):
             # Frames of its own: a run this short must find the sensor's geometry on them as well.
             try:
                 short = bench.run(escape(bench, frames=count, estimator="telemetry")).registration

@@ -27,6 +27,10 @@ _MOTION = 0.17
 _OUTER_SCALE = 4.0
 #: Nodes of the average over spot motion, and the step of their lattice: neighbouring Fibonacci numbers.
 _NODES, _STEP = 34, 21
+#: Share of a full turn from one window's lattice to the next one's: the golden one, no multiple repeats.
+_TURN = (np.sqrt(5) - 1) / 2
+#: Ways to see a wavefront: quarter turns, mirrored or not.
+_SIGHTS = 8
 
 
 def slope_weights(
@@ -64,8 +68,8 @@ def slope_weights(
     if grid.motion_px and grid.air_px:
         blur = np.sqrt(_strength(config, grid)) * lenslet_turbulence(pupil.n_pix)
     out = {step: np.zeros((2, grid.n_valid, pupil.n_pix, pupil.n_pix)) for step in STEPS}
-    for (dx, dy), phase in zip(moves.tolist(), blur, strict=True):
-        views.accumulate(out, dx, dy, phase, 1 / len(moves))
+    for move, phase in zip(moves, blur, strict=True):
+        views.accumulate(out, move, phase, 1 / len(moves))
     wave = 2 * np.pi / config.system.wavelength_m
     return {step: block * wave for step, block in out.items()}
 
@@ -115,6 +119,11 @@ def lenslet_turbulence(samples: int) -> NDArray[np.float64]:
     return np.concatenate([first, first[::-1, ::-1, ::-1]])
 
 
+def _sights(phase: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A wavefront ``(p, p)`` in all orientations that a square has ``(8, p, p)``; each is as likely."""
+    return np.stack([np.rot90(seen, turns) for seen in (phase, phase.T) for turns in range(_SIGHTS // 2)])
+
+
 def _strength(config: SystemConfig, grid: SubApertureGrid) -> float:
     """``(d / r0)^(5/3)`` of the turbulence on a lenslet, from how far the air moves its spot."""
     sensor = config.sensor_as(ShackHartmannSection)
@@ -146,6 +155,10 @@ class _Views:
         self._cut = counts / grid.counts * float(np.percentile(light[light > 0], 95)) if grid.counts else 0.0
         self._samples = (np.arange(p) - (p - 1) / 2) / p
         self._spot = spot
+        angle = 2 * np.pi * _TURN * np.arange(len(rows))
+        #: Directions of the lattice's axes in each window ``(2, n_valid)``, and how it sees the wavefronts.
+        self._axes = np.stack([np.cos(angle), np.sin(angle)])
+        self._sight = np.arange(len(rows)) % _SIGHTS
         # An average over motion is not worth double precision; a small-signal limit is.
         self._real = np.dtype(np.float32 if grid.motion_px else np.float64)
         self._complex = np.dtype(np.complex64 if grid.motion_px else np.complex128)
@@ -180,19 +193,26 @@ class _Views:
     def accumulate(
         self,
         out: dict[tuple[int, int], NDArray[np.float64]],
-        dx: float,
-        dy: float,
+        move: NDArray[np.float64],
         phase: NDArray[np.float64],
         share: float,
     ) -> None:
-        """Add ``share`` times the derivatives, spots moved by ``(dx, dy)`` pixels and blurred by a phase."""
-        blur = np.exp(1j * phase).astype(self._complex)
-        tilt = [np.exp(2j * np.pi * d * self._samples / self._spot).astype(self._complex) for d in (dy, dx)]
+        """Add ``share`` times the derivatives, spots moved by some pixels ``(2,)`` and blurred by a phase.
+
+        Every window turns the move and mirrors the phase in its own way.
+        """
+        (cosine, sine), (along, across) = self._axes, move
+        blur = np.exp(1j * _sights(phase)).astype(self._complex)[self._sight]
+        tilt = [
+            np.exp(2j * np.pi * d[:, None] * self._samples / self._spot).astype(self._complex).conj()
+            for d in (sine * along + cosine * across, cosine * along - sine * across)
+        ]
+        swing = tilt[0][:, :, None] * tilt[1][:, None, :] * blur
         fields = {}
         image = np.zeros(self._inside.shape, self._real)
         for step in STEPS:
             fy, fx = self._along[step]
-            amplitude = self._blocks[step] * (tilt[0].conj()[:, None] * tilt[1].conj()[None, :] * blur)
+            amplitude = self._blocks[step] * swing
             e = np.matmul(np.matmul(fy.transpose(0, 2, 1), amplitude), fx)
             image += e.real**2 + e.imag**2
             fields[step] = (amplitude, e)
