@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.runtime.matrix_task import MatrixTask
 from escape_hw.runtime.task import Kept, given
 
 if TYPE_CHECKING:
+    from escape_hw.api.model import SyntheticModel
     from escape_hw.api.results import CalibrationResult
     from escape_hw.bench import Bench
     from escape_hw.config.models import SystemConfig
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from escape_hw.runtime.records import BenchRecord
 
 
-class SprintTask:
+class SprintTask(MatrixTask):
     """The registration behind a measured matrix; see :class:`~escape_hw.runtime.task.Task`.
 
     Parameters
@@ -32,31 +34,15 @@ class SprintTask:
     kind = "sprint"
 
     def __init__(self, im: Path, settings: dict[str, object] | None = None) -> None:
-        self._im = im
+        super().__init__(im)
+        self._model: SyntheticModel | None = None
         self.overrides = given({f"calibration.{key}": value for key, value in (settings or {}).items()})
-        self._config: SystemConfig | None = None
-        self._product: MatrixProduct | None = None
 
-    @property
-    def config(self) -> SystemConfig:
-        """The configuration, once loaded."""
-        if self._config is None:
-            raise RuntimeError("load() comes first")
-        return self._config
-
-    @property
-    def product(self) -> MatrixProduct:
-        """The matrix, once loaded."""
-        if self._product is None:
-            raise RuntimeError("load() comes first")
-        return self._product
-
-    def load(self, config: SystemConfig) -> None:
-        """See :meth:`~escape_hw.runtime.task.Task.load`."""
+    def _read(self, config: SystemConfig, simulated: bool) -> MatrixProduct:
+        # Nothing moves: a matrix of other modes than the configured ones is as good.
         from escape_hw.io.fits import load_matrix
 
-        self._config = config
-        self._product = load_matrix(
+        return load_matrix(
             self._im,
             expect_system=config.system.name,
             expect_sensor=config.sensor.kind,
@@ -70,23 +56,26 @@ class SprintTask:
     def fit(self) -> Procedure[CalibrationResult]:
         """Find the registration; the result's matrix is the measured one."""
         from escape_hw.calibration.sprint import sprint_steps
-        from escape_hw.config.registry import model_factory
+        from escape_hw.calibration.sprint_settings import as_configured
 
         settings, product = self.config.calibration, self.product
         measured = product.result.measured or product.matrix
         yield Reporter("synthetic model", 1, "model")(0)
         estimate = yield from sprint_steps(
             measured,
-            model_factory(settings.model)(self.config, product.grid),
+            self._synthetic(),
             modes=min(settings.sprint_modes, measured.n_modes),
-            choice=settings.modes_choice,
-            solver=settings.solver,
-            loss=settings.loss,
-            actuators=settings.actuators,
-            learning_rate=settings.learning_rate,
-            also=settings.also,
+            **as_configured(settings),
         )
         return replace(product.result, matrix=measured, measured=None, registration=estimate)
+
+    def _synthetic(self) -> SyntheticModel:
+        """The model that is inverted; a pyramid's takes seconds to make."""
+        from escape_hw.config.registry import model_factory
+
+        if self._model is None:
+            self._model = model_factory(self.config.calibration.model)(self.config, self.product.grid)
+        return self._model
 
     def keep(
         self, folder: RunFolder, record: BenchRecord, result: CalibrationResult, wall_seconds: float
@@ -103,7 +92,6 @@ class SprintTask:
             They cannot be written.
         """
         from escape_hw.calibration.pseudo_synthetic import synthetic_of
-        from escape_hw.config.registry import model_factory
         from escape_hw.io import documents
         from escape_hw.io.fits import save_matrix
         from escape_hw.io.provenance import utc_text
@@ -116,8 +104,7 @@ class SprintTask:
             raise RuntimeError("a fit without a registration")
         origin = replace(config_record(self.config), parents={name: self.product.sha256})
         folder.add("im", save_matrix(folder.file("im.fits"), result, origin))
-        model = model_factory(self.config.calibration.model)(self.config, self.product.grid)
-        synthetic = synthetic_of(result, model, estimate)
+        synthetic = synthetic_of(result, self._synthetic(), estimate)
         folder.add("escape", save_matrix(folder.file("escape.fits"), synthetic, origin))
         document = finish(
             folder,
@@ -132,6 +119,3 @@ class SprintTask:
             },
         )
         return Kept(document, estimate.converged)
-
-    def done(self) -> None:
-        """Nothing was kept to go on with."""

@@ -178,7 +178,7 @@ class Desk:
                 engine.board.require_idle()
             task = engine.offers.task(request.procedure, request.arguments, engine.shelf)
             config = jobs.configured(engine, task)
-            task.load(config)
+            task.load(config, self._engine.bench.simulated)
             run = engine.next_run
             engine.next_run += 1
             jobs.announce(engine, run, request.procedure, arguments, loop)
@@ -206,7 +206,7 @@ class Desk:
         engine = self._engine
         with engine.board.lock:
             engine.board.require_idle()
-            jobs.close_loop(engine, request, lambda: self._reply(number))
+            jobs.close_loop(engine, request, lambda error: self._reply(number, error=error))
         return LATER
 
     def _set_loop(self, request: ask.SetLoop, number: int) -> object:
