@@ -160,7 +160,8 @@ class _Pyramid:
         self, bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]
     ) -> PyramidPupils:
         """Rims and shadow on the mean of the whole run: turbulence averages out."""
-        return refine_pupils(means, of_kind(grid, PyramidPupils), shadow_of(bench.config.telescope))
+        shadow = shadow_of(bench.config.telescope, bench.config.system.pupil_m)
+        return refine_pupils(means, of_kind(grid, PyramidPupils), shadow)
 
     def extractor(
         self, bench: Bench, grid: SensorGeometry, shape: tuple[int, int], dark: NDArray[np.float32]

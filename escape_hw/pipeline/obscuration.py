@@ -17,16 +17,13 @@ if TYPE_CHECKING:
 #: Points along each side of a sample at which it is asked whether light passes.
 _POINTS = 8
 #: Share of the radius in which the shadow is looked for: farther out the rim's own troubles begin.
-_INSIDE = 0.5
-#: Highest power of the smooth light that the shadow falls on.
-_SMOOTH = 2
-_ITERATIONS, _LARGEST, _DIFFERENCE = 4, 0.7, 0.25
-#: What light that is uneven on the scale of the shadow moves it by in all four images alike, in pixels: their
-#: scatter does not know (docs/decisions/0018-pyramids-in-truth.md).
-_COMMON_PX = 0.05
-#: Finer than that by so much where the shadow is moved by fractions of a pixel.
-_FINER = 3
-
+_INSIDE = 0.8
+#: Highest power of the smooth light that the shadow falls on: less takes uneven light for a moved shadow.
+_SMOOTH = 6
+#: Steps to where the shadow is, and the largest of them in pixels.
+_ITERATIONS, _LARGEST = 4, 0.7
+#: Samples across a pixel of the shadow's map, an odd number, and points along each side of such a sample.
+_FINE, _FEW = 21, 2
 #: Share of the light that passes at coordinates ``(n,)`` along x and ``(m,)`` along y, in pupil diameters.
 Shadow = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
@@ -36,6 +33,7 @@ def passed_share(
     diameter_m: float,
     x_m: NDArray[np.float64],
     y_m: NDArray[np.float64] | None = None,
+    points: int = _POINTS,
 ) -> NDArray[np.float64]:
     """Share of each sample that neither the central obscuration nor a vane covers ``(n_y, n_x)``.
 
@@ -48,32 +46,39 @@ def passed_share(
     x_m, y_m
         Coordinates of the samples along either axis in metres, evenly spaced; ``y_m`` as ``x_m`` by
         default.
+    points
+        Points along each side of a sample at which it is asked whether light passes.
     """
-    x, y = _finely(x_m, diameter_m)[None, :], _finely(x_m if y_m is None else y_m, diameter_m)[:, None]
+    x, y = (_finely(at, diameter_m, points) for at in (x_m, x_m if y_m is None else y_m))
+    x, y = x[None, :], y[:, None]
     passed = np.hypot(x, y) >= telescope.obscuration * diameter_m / 2
     for angle in np.deg2rad(telescope.spiders_deg):
         along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
         passed &= (along < 0) | (np.abs(across) > telescope.spider_m / 2)
-    return np.asarray(passed.reshape(y.size // _POINTS, _POINTS, -1, _POINTS).mean(axis=(1, 3)))
+    return np.asarray(passed.reshape(y.size // points, points, -1, points).mean(axis=(1, 3)))
 
 
-def _finely(at: NDArray[np.float64], alone: float) -> NDArray[np.float64]:
+def _finely(at: NDArray[np.float64], alone: float, points: int) -> NDArray[np.float64]:
     step = at[1] - at[0] if at.size > 1 else alone
-    inside = ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5) * step
+    inside = ((np.arange(points) + 0.5) / points - 0.5) * step
     return np.asarray((at[:, None] + inside).ravel())
 
 
-def shadow_of(telescope: TelescopeSection) -> Shadow | None:
-    """The shadow of a telescope's obscuration and vanes; ``None`` if it has neither."""
+def shadow_of(telescope: TelescopeSection, diameter_m: float) -> Shadow | None:
+    """The shadow of a telescope's obscuration and vanes; ``None`` if it has no obscuration.
+
+    Parameters
+    ----------
+    telescope
+        Obscuration and vanes.
+    diameter_m
+        Diameter of the pupil in metres, which the vanes' width is told in.
+    """
     if not telescope.obscuration:
         return None
 
     def shadow(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        # With points further apart the edge is a staircase to those who move it by fractions of a pixel.
-        step = x[1] - x[0]
-        fine = ((np.arange(_FINER) + 0.5) / _FINER - 0.5) * step
-        share = passed_share(telescope, 1.0, *((at[:, None] + fine).ravel() for at in (x, y)))
-        return np.asarray(share.reshape(y.size, _FINER, x.size, _FINER).mean(axis=(1, 3)))
+        return passed_share(telescope, diameter_m, x * diameter_m, y * diameter_m, points=_FEW)
 
     return shadow
 
@@ -83,8 +88,9 @@ def shadow_offset(
 ) -> tuple[NDArray[np.float64], float]:
     """How far the shadow lies beside the centres of the images, in common, and with what error.
 
-    Within each image the light is taken for a polynomial of second degree, from which the shadow
-    takes a share; all of it is linear but for the shadow's place, which the four images share.
+    Within each image the light is taken for a polynomial of sixth degree, from which the shadow
+    takes a share; all of it is linear but for the shadow's place, which the four images share. The light
+    as it is counts: pressed down, what is uneven from image to image would no longer be smooth.
 
     Parameters
     ----------
@@ -102,37 +108,55 @@ def shadow_offset(
     offset : ndarray, ``(2,)``
         As (x, y) in pixels.
     sigma : float
-        Standard error along an axis, by the scatter of the four and what they have in common.
+        Standard error along an axis by the scatter of the four. It does not know what they err by in
+        common; and what takes light from one image and gives it to another counts twice in it.
     """
     offset = np.zeros(2)
     moves = np.zeros((4, 2))
+    shade = _shade(shadow, diameter)
     for _ in range(_ITERATIONS):
-        moves = np.array([_step(image, at, diameter, shadow) for at in centres + offset])
+        moves = np.array([_step(image, at, diameter, shade) for at in centres + offset])
         offset += np.clip(moves.mean(axis=0), -_LARGEST, _LARGEST)
     scatter = float(np.mean(np.var(moves, axis=0, ddof=1))) / len(moves)
-    return offset, float(np.hypot(np.sqrt(scatter), _COMMON_PX))
+    return offset, float(np.sqrt(scatter))
+
+
+def _reach(diameter: float) -> int:
+    """Pixels from the centre to beyond where the shadow is looked for."""
+    return int(np.ceil(_INSIDE * diameter / 2)) + 1
+
+
+def _shade(shadow: Shadow, diameter: float) -> NDArray[np.float64]:
+    """Map ``(3, n, n)`` of what a pixel lacks for the shadow, and its derivatives by the shadow's place.
+
+    By where the pixel's middle lies from the shadow's centre, :data:`_FINE` samples to a pixel.
+    """
+    half = (_reach(diameter) + 1) * _FINE
+    at = np.arange(-half, half + 1) / (_FINE * diameter)
+    covered = ndimage.gaussian_filter(1 - shadow(at, at), SOFT * _FINE, mode="nearest")
+    seen = ndimage.uniform_filter(covered, _FINE, mode="nearest")
+    by_y, by_x = np.gradient(seen, 1 / _FINE)
+    return np.stack([seen, -by_x, -by_y])
 
 
 def _step(
-    image: NDArray[np.float64], centre: NDArray[np.float64], diameter: float, shadow: Shadow
+    image: NDArray[np.float64], centre: NDArray[np.float64], diameter: float, shade: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Gauss-Newton step ``(2,)`` of the shadow in one image."""
-    reach = int(np.ceil(_INSIDE * diameter / 2)) + 1
+    reach = _reach(diameter)
     columns, rows = (round(at) + np.arange(-reach, reach + 1) for at in centre)
-    x, y = (columns - centre[0]) / diameter, (rows - centre[1]) / diameter
-
-    def shade(dx: float, dy: float) -> NDArray[np.float64]:
-        covered = 1 - shadow(x - dx / diameter, y - dy / diameter)
-        return np.asarray(ndimage.gaussian_filter(covered, SOFT, mode="nearest"))
-
-    e = _DIFFERENCE
-    moving = [(shade(e, 0) - shade(-e, 0)) / (2 * e), (shade(0, e) - shade(0, -e)) / (2 * e)]
-    u, v = np.meshgrid(2 * x, 2 * y)
+    x, y = np.meshgrid(columns - centre[0], rows - centre[1])
+    u, v = 2 * x / diameter, 2 * y / diameter
     inside = np.hypot(u, v) < _INSIDE
     powers = [(i, j) for i in range(_SMOOTH + 1) for j in range(_SMOOTH + 1 - i)]
-    smooth = [u**i * v**j for i, j in powers]
+    smooth = np.stack([u[inside] ** i * v[inside] ** j for i, j in powers], axis=1)
+    places = np.stack([y[inside], x[inside]]) * _FINE + shade.shape[1] // 2
+    dark, *moving = (ndimage.map_coordinates(part, places, order=1) for part in shade)
     light = image[np.ix_(rows, columns)][inside]
-    known = np.stack([term[inside] for term in (*smooth, shade(0, 0))], axis=1)
-    depth = np.linalg.lstsq(known, light, rcond=None)[0][-1]
-    by_place = np.stack([depth * term[inside] for term in moving], axis=1)
-    return np.asarray(np.linalg.lstsq(np.concatenate([known, by_place], axis=1), light, rcond=None)[0][-2:])
+    lit, depth = np.ones_like(light), 0.0
+    for _ in range(2):
+        # The shadow takes its share of whatever light there is.
+        *shares, depth = np.linalg.lstsq(np.column_stack([smooth, lit * dark]), light, rcond=None)[0]
+        before, lit = lit, smooth @ shares
+    terms = np.column_stack([smooth, before * dark, *(depth * before * part for part in moving)])
+    return np.asarray(np.linalg.lstsq(terms, light, rcond=None)[0][-2:])

@@ -27,9 +27,12 @@ _FAINT = 0.1
 #: little enough that a rim in the shade of a soiled edge is as steep as any other. A bench's stop is whole,
 #: and what diffraction puts between the images would count for more the harder light is pressed.
 _PRESSED, _PRESSED_SOILED = 1.0, 0.25
-#: What the mean place of a telescope's images errs by beyond scatter and roundness, in pixels: from fourteen
-#: clean pupils and twenty soiled ones (docs/decisions/0018-pyramids-in-truth.md).
-_COMMON_PX = 0.018
+#: How much more of a soiled rim is in the first harmonic, where it passes for a shift, than in the second to
+#: fourth.
+_FIRST_HARMONIC = 1.4
+#: What the shadow errs by beyond its scatter over time, for light is uneven on its scale too, and what rim
+#: and shadow together do, in pixels (docs/decisions/0018-pyramids-in-truth.md).
+_SHADOW_PX, _COMMON_PX = 0.02, 0.018
 
 
 def find_pupils(
@@ -140,6 +143,8 @@ def _refined(
     centres, diameter = _places(image, pupils.centres_px, n_sub, pressed, order)
     even = _evened(image, pressed)
     variance = out_of_round(even, centres, diameter / 2, n_sub / 2) ** 2
+    if shadow is not None:
+        variance *= _FIRST_HARMONIC**2
     if len(means) > 1:
         parts = [
             _places(np.asarray(part, np.float64), centres, n_sub, pressed, order)[0].mean(axis=0)
@@ -147,14 +152,30 @@ def _refined(
         ]
         variance += float(np.mean(np.var(parts, axis=0, ddof=1))) / len(parts)
     if shadow is not None:
-        offset, sigma = shadow_offset(even, centres, diameter, shadow)
-        share = variance / (variance + sigma**2)
+        offset, shadow_variance = _by_shadow(means, image, centres, diameter, shadow)
+        share = variance / (variance + shadow_variance)
         centres, variance = centres + share * offset, variance * (1 - share) + _COMMON_PX**2
     light = _light(image, pupils.corners_px, n_sub)
     flux = np.maximum(light / np.percentile(light[pupils.valid], 95), 0.0).astype(np.float32)
     return replace(
         pupils, centres_px=centres, diameter_px=diameter, centre_sigma_px=float(np.sqrt(variance)), flux=flux
     )
+
+
+def _by_shadow(
+    means: Sequence[NDArray[np.float32]],
+    image: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    diameter: float,
+    shadow: Shadow,
+) -> tuple[NDArray[np.float64], float]:
+    """How far the shadow lies beside the centres ``(2,)``, and the variance of that along an axis."""
+    offset, sigma = shadow_offset(image, centres, diameter, shadow)
+    variance = sigma**2
+    if len(means) > 1:
+        parts = [shadow_offset(np.asarray(part, np.float64), centres, diameter, shadow)[0] for part in means]
+        variance = float(np.mean(np.var(parts, axis=0, ddof=1))) / len(parts)
+    return offset, variance + _SHADOW_PX**2
 
 
 def _light(image: NDArray[np.float64], corners: NDArray[np.intp], n_sub: int) -> NDArray[np.float64]:

@@ -14,7 +14,8 @@ from escape_hw.pipeline.rims import out_of_round
 
 N, SHAPE = 30, (80, 80)
 NOMINAL = np.array([[19.5, 19.5], [59.5, 19.5], [19.5, 59.5], [59.5, 59.5]])
-TELESCOPE = TelescopeSection(obscuration=0.11, spider_m=0.0077, spiders_deg=(45.0, 135.0, 225.0, 315.0))
+DIAMETER_M = 6.5
+TELESCOPE = TelescopeSection(obscuration=0.11, spider_m=0.05, spiders_deg=(45.0, 135.0, 225.0, 315.0))
 FINE = 8
 
 
@@ -37,7 +38,7 @@ def frame(
         degree = (np.rad2deg(np.arctan2(fy[:, None], fx)) % 360).astype(int)
         inside = (np.hypot(fx, fy[:, None]) <= rim[degree]).reshape(80, FINE, 80, FINE).mean(axis=(1, 3))
         slope = 1 + rng.uniform(-0.2, 0.2) * x[None, :] + rng.uniform(-0.2, 0.2) * y[:, None]
-        image += 400 * inside * slope * passed_share(TELESCOPE, 1.0, x, y)
+        image += 400 * inside * slope * passed_share(TELESCOPE, DIAMETER_M, x * DIAMETER_M, y * DIAMETER_M)
     # What diffraction adds to the pixels' own width.
     image = ndimage.gaussian_filter(image, 0.4)
     return (image + 400 * noise * rng.standard_normal(SHAPE)).astype(np.float32)
@@ -49,16 +50,16 @@ def test_the_shadow_is_found_where_it_is() -> None:
         rng = np.random.default_rng(seed)
         place = rng.uniform(-0.3, 0.3, 2)
         image = frame(NOMINAL + place, rng, 0.0).astype(float)
-        shadow = shadow_of(TELESCOPE)
+        shadow = shadow_of(TELESCOPE, DIAMETER_M)
         assert shadow is not None
         offset, sigma = shadow_offset(image, NOMINAL, N, shadow)
         errors.append(offset - place)
-        assert 0.05 <= sigma < 0.07
+        assert 0 < sigma < 0.04
     assert np.sqrt(np.mean(np.square(errors))) < 0.03
 
 
 def test_without_an_obscuration_there_is_no_shadow() -> None:
-    assert shadow_of(TelescopeSection()) is None
+    assert shadow_of(TelescopeSection(), DIAMETER_M) is None
 
 
 def test_an_eaten_rim_shifts_its_circle_and_the_error_knows() -> None:
@@ -68,7 +69,7 @@ def test_an_eaten_rim_shifts_its_circle_and_the_error_knows() -> None:
         centres = NOMINAL + rng.uniform(-0.4, 0.4, (4, 2))
         image = frame(centres, rng, 0.02)
         first = find_pupils(image, n_sub=N, nominal_px=NOMINAL, min_flux=0.4)
-        found = refine_pupils([image], first, shadow_of(TELESCOPE))
+        found = refine_pupils([image], first, shadow_of(TELESCOPE, DIAMETER_M))
         plain = refine_pupils([image], first)
         rim.append((plain.centres_px - centres).mean(axis=0))
         both.append((found.centres_px - centres).mean(axis=0))
