@@ -33,6 +33,8 @@ class DocrimeSolution:
     gain_sigma
         Relative standard error of the gain that all elements share: an error of the temporal response,
         which is scaled to sum 1, scales the whole matrix.
+    response_covariance
+        Of the response's weights ``(lags, lags)``.
     """
 
     matrix: NDArray[np.float64]
@@ -45,3 +47,4 @@ class DocrimeSolution:
     frames: int
     lost_frames: int
     gain_sigma: float
+    response_covariance: NDArray[np.float64]
