@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 _HERE_S, _AFAR_S, _RETRY_S, _FORGET_S = 0.2, 0.02, 1.0, 1.0
 #: A connection that was silent for so long is made anew, seconds.
 _DEAD_S = 5.0
+#: A wait that was longer than asked by so much was a halt of this process, seconds.
+_HALTED_S = 2.0
 
 
 class LiveSource:
@@ -177,9 +179,14 @@ class Attachment(QObject):
     def _work(self) -> None:
         """Wait for the next look; close what is to be closed meanwhile."""
         pause = _RETRY_S if self._live is None else _HERE_S if self._here else _AFAR_S
+        began = time.monotonic()
         try:
             job = self._jobs.get(timeout=pause)
         except queue.Empty:
+            now = time.monotonic()
+            if now - began > pause + _HALTED_S:
+                # This process slept, not the server: what has come meanwhile is still to be read.
+                self._heard = now
             return
         try:
             job()

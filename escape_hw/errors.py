@@ -98,3 +98,7 @@ class RequestRefused(EscapeError):
     """A server does not take a request: malformed, not now, or not from here."""
 
     exit_code = 2
+
+
+class ClientUnknown(RequestRefused):
+    """A server does not know who asks: it was started anew, or had not heard of the client for long."""

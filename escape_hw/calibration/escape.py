@@ -21,6 +21,7 @@ from escape_hw.calibration.pseudo_synthetic import synthesise
 from escape_hw.calibration.sensor_setup import modal_basis
 from escape_hw.calibration.solvers import BY_MODES
 from escape_hw.calibration.sprint import sprint_steps
+from escape_hw.calibration.sprint_settings import as_configured
 from escape_hw.calibration.stopping import Target
 from escape_hw.calibration.telemetry_sprint import independent_columns
 from escape_hw.config.models import ESTIMATORS
@@ -147,14 +148,9 @@ def _fit(
             matrix,
             bench.model(grid),
             modes=modes,
-            choice=c.modes_choice,
-            solver=c.solver,
-            loss=c.loss,
-            actuators=c.actuators,
-            learning_rate=c.learning_rate,
             covariance=solution.covariance,
             learn=True,
-            also=c.also,
+            **as_configured(c),
         )
     )
 

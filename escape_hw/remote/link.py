@@ -23,6 +23,8 @@ from escape_hw.remote.faults import from_wire
 log = logging.getLogger(__name__)
 
 _POLL_MS = 500
+#: Number of a request whose answer nobody waits for.
+_BEAT = b"0"
 #: Largest answer that is taken, bytes.
 _LARGEST = 256 << 20
 
@@ -41,7 +43,8 @@ class Link:
     on_event
         Gets topic and document of every event, in the link's thread.
     beat
-        Gives a message to be sent every ``beat_s`` seconds, or ``None``.
+        Gives a message to be sent every ``beat_s`` seconds, or ``None``; is told whether the server refused
+        the last one.
     keys
         The server's public key, this client's public and secret key; ``None`` on the same machine.
     """
@@ -50,7 +53,7 @@ class Link:
         self,
         endpoint: Endpoint,
         on_event: Callable[[str, dict[str, Any]], object],
-        beat: Callable[[], Mapping[str, Any] | None],
+        beat: Callable[[bool], Mapping[str, Any] | None],
         beat_s: float = 0.5,
         keys: Keys | None = None,
     ) -> None:
@@ -66,7 +69,7 @@ class Link:
         self._outbox: deque[tuple[bytes, bytes]] = deque()
         self._waiting: dict[bytes, Future[Answer]] = {}
         self._numbers = itertools.count(1)
-        self._ending = False
+        self._ending = self._refused = False
         #: When the server was last heard of, monotonic seconds.
         self.heard = 0.0
         self._thread = threading.Thread(target=self._run, name="escape-link", daemon=True)
@@ -141,9 +144,13 @@ class Link:
                 self._take_events()
             if self._requests in ready:
                 self._take_answer()
-            if time.monotonic() - beaten > self._beat_s and (message := self._beat()) is not None:
+            if time.monotonic() - beaten > self._beat_s and (message := self._next_beat()) is not None:
                 beaten = time.monotonic()
-                self._put(b"0", json.dumps(message).encode())
+                self._put(_BEAT, json.dumps(message).encode())
+
+    def _next_beat(self) -> Mapping[str, Any] | None:
+        refused, self._refused = self._refused, False
+        return self._beat(refused)
 
     def _send_all(self) -> None:
         while True:
@@ -164,17 +171,24 @@ class Link:
         self.heard = time.monotonic()
         with self._lock:
             answer = self._waiting.pop(parts[0], None)
-        if answer is None:
+        if answer is None and parts[0] != _BEAT:
             return
         try:
             reply = json.loads(parts[1])
+            if answer is None:
+                self._refused = not reply["ok"]
+                return
             if reply["ok"]:
                 data = parts[2] if len(parts) > 2 else b""
                 answer.set_result((reply["answer"], data, int(reply.get("serial", 0))))
             else:
                 answer.set_exception(from_wire(reply["error"]))
         except (IndexError, KeyError, ValueError) as error:
-            answer.set_exception(ServerGone(f"the server's answer makes no sense: {error!r}"))
+            gone = ServerGone(f"the server's answer makes no sense: {error!r}")
+            if answer is None:
+                log.warning("%s", gone)
+            else:
+                answer.set_exception(gone)
 
     def _take_events(self) -> None:
         while True:

@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from escape_hw.errors import EscapeError, ServerGone
+from escape_hw.errors import ClientUnknown, EscapeError, ServerGone
 from escape_hw.remote import requests as ask
 from escape_hw.remote.address import Endpoint
 from escape_hw.remote.link import Link
@@ -91,9 +91,7 @@ class Viewer:
             raise
 
     def _hello(self) -> None:
-        name, host = (re.sub(r"[^\w .+@:-]", "-", text)[:80] for text in (self._name, socket.gethostname()))
-        hello = ask.Hello(client=self.client, schema_version=SCHEMA, name=name, host=host, pid=os.getpid())
-        answer, _, _ = self._link.ask(hello.model_dump(mode="json"), TIMEOUT_S)
+        answer, _, _ = self._link.ask(self._greeting(), TIMEOUT_S)
         self._known = True
         with self._changed:
             self._state = State.model_validate(answer)
@@ -102,6 +100,11 @@ class Viewer:
             known = {line.number for line in self._log}
             old = [LogLine.model_validate(line) for line in lines if line["number"] not in known]
             self._log = deque(sorted((*old, *self._log), key=lambda line: line.number), maxlen=_LINES)
+
+    def _greeting(self) -> Mapping[str, Any]:
+        name, host = (re.sub(r"[^\w .+@:-]", "-", text)[:80] for text in (self._name, socket.gethostname()))
+        hello = ask.Hello(client=self.client, schema_version=SCHEMA, name=name, host=host, pid=os.getpid())
+        return hello.model_dump(mode="json")
 
     # ------------------------------------------------------------ life
     def close(self) -> None:
@@ -129,11 +132,19 @@ class Viewer:
 
         return state_html(self.state)
 
-    def _beat(self) -> Mapping[str, Any] | None:
-        return {"verb": "heartbeat", "client": self.client} if self._known else None
+    def _beat(self, refused: bool) -> Mapping[str, Any] | None:
+        if not self._known:
+            return None
+        # Who was halted for long has been forgotten.
+        return self._greeting() if refused else {"verb": "heartbeat", "client": self.client}
 
     def _ask(self, request: ask.Request, timeout_s: float = TIMEOUT_S) -> tuple[Any, bytes]:
-        answer, data, serial = self._link.ask(request.model_dump(mode="json"), timeout_s)
+        document = request.model_dump(mode="json")
+        try:
+            answer, data, serial = self._link.ask(document, timeout_s)
+        except ClientUnknown:
+            self._hello()
+            answer, data, serial = self._link.ask(document, timeout_s)
         if isinstance(request, ask.CHANGING):
             # Events come another way than answers: who looks at the state next finds what was done.
             with self._changed:

@@ -119,10 +119,11 @@ class CalibrationTask:
         self._closing: MatrixProduct | None = None
         self._keep: Checkpoint | None = None
 
-    def load(self, config: SystemConfig) -> None:
+    def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """See :meth:`~escape_hw.runtime.task.Task.load`."""
         if self.request.closed_loop is not None:
-            self._closing = fitting_matrix(Path(self.request.closed_loop), config, self._force)
+            closed_loop = Path(self.request.closed_loop)
+            self._closing = fitting_matrix(closed_loop, config, self._force or simulated)
 
     def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[CalibrationResult]:
         """See :meth:`~escape_hw.runtime.task.Task.procedure`."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from escape_hw.api.procedure import Procedure
+from escape_hw.runtime.matrix_task import MatrixTask
 from escape_hw.runtime.task import Kept, fitting_matrix, refuse_simulated
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from escape_hw.runtime.records import BenchRecord
 
 
-class GainsTask:
+class GainsTask(MatrixTask):
     """A bootstrap of optical gains; see :class:`~escape_hw.runtime.task.Task`.
 
     Parameters
@@ -38,7 +39,6 @@ class GainsTask:
     """
 
     kind = "gains"
-    overrides: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -49,22 +49,15 @@ class GainsTask:
         force: bool = False,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        self._im, self._paths, self._strehl, self._force = im, tuple(beside), strehl, force
-        self._options = dict(options or {})
-        self._product: MatrixProduct | None = None
+        super().__init__(im, force=force)
+        self._paths, self._strehl, self._options = tuple(beside), strehl, dict(options or {})
         self._others: dict[str, MatrixProduct] = {}
 
-    @property
-    def product(self) -> MatrixProduct:
-        """The matrix to scale, once loaded."""
-        if self._product is None:
-            raise RuntimeError("load() comes first")
-        return self._product
-
-    def load(self, config: SystemConfig) -> None:
+    def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """See :meth:`~escape_hw.runtime.task.Task.load`."""
-        self._product = fitting_matrix(self._im, config, self._force)
-        self._others = {path.stem: fitting_matrix(path, config, self._force) for path in self._paths}
+        super().load(config, simulated)
+        any_mode = self._force or simulated
+        self._others = {path.stem: fitting_matrix(path, config, any_mode) for path in self._paths}
 
     def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[GainsRun]:
         """Model PSF where the bench can take one, then the bootstrap."""
@@ -118,6 +111,3 @@ class GainsTask:
             },
         )
         return Kept(document, found.converged)
-
-    def done(self) -> None:
-        """Nothing was kept to go on with."""

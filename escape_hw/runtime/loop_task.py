@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import LoopResult
 from escape_hw.errors import ConfigError
-from escape_hw.runtime.task import Kept, fitting_matrix, given, refuse_simulated
+from escape_hw.runtime.matrix_task import MatrixTask
+from escape_hw.runtime.task import Kept, given, refuse_simulated
 
 if TYPE_CHECKING:
     from escape_hw.bench import Bench
-    from escape_hw.config.models import SystemConfig
-    from escape_hw.io.fits import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
     from escape_hw.runtime.telemetry_tape import TelemetryTape
 
 
-class LoopTask:
+class LoopTask(MatrixTask):
     """A closed-loop run; see :class:`~escape_hw.runtime.task.Task`.
 
     Parameters
@@ -55,24 +54,12 @@ class LoopTask:
         record: int = 0,
         force: bool = False,
     ) -> None:
+        super().__init__(im, force=force)
         if best and gain is not None:
             raise ConfigError("--gain and --best-gain exclude each other")
         self.overrides = given({"loop.gain": gain, "loop.leak": leak, "loop.dropped_modes": dropped_modes})
-        self._im, self._frames, self._best, self._strehl, self._force = im, frames, best, strehl, force
-        self._record = record
+        self._frames, self._best, self._strehl, self._record = frames, best, strehl, record
         self._tape: TelemetryTape | None = None
-        self._product: MatrixProduct | None = None
-
-    @property
-    def product(self) -> MatrixProduct:
-        """The matrix, once loaded."""
-        if self._product is None:
-            raise RuntimeError("load() comes first")
-        return self._product
-
-    def load(self, config: SystemConfig) -> None:
-        """See :meth:`~escape_hw.runtime.task.Task.load`."""
-        self._product = fitting_matrix(self._im, config, self._force)
 
     def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[LoopResult]:
         """Model PSF where the bench can take one, best gain when asked, then the loop itself."""
@@ -121,6 +108,3 @@ class LoopTask:
             },
         )
         return Kept(document, result.stable)
-
-    def done(self) -> None:
-        """Nothing was kept to go on with."""

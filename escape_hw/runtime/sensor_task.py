@@ -30,7 +30,7 @@ class SensorTask:
     def __init__(self, frames: int) -> None:
         self._frames = frames
 
-    def load(self, config: SystemConfig) -> None:
+    def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """It needs nothing."""
 
     def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[SensorSetup]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.runtime.matrix_task import MatrixTask
 from escape_hw.runtime.task import Kept, given
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from escape_hw.runtime.records import BenchRecord
 
 
-class SprintTask:
+class SprintTask(MatrixTask):
     """The registration behind a measured matrix; see :class:`~escape_hw.runtime.task.Task`.
 
     Parameters
@@ -32,31 +33,14 @@ class SprintTask:
     kind = "sprint"
 
     def __init__(self, im: Path, settings: dict[str, object] | None = None) -> None:
-        self._im = im
+        super().__init__(im)
         self.overrides = given({f"calibration.{key}": value for key, value in (settings or {}).items()})
-        self._config: SystemConfig | None = None
-        self._product: MatrixProduct | None = None
 
-    @property
-    def config(self) -> SystemConfig:
-        """The configuration, once loaded."""
-        if self._config is None:
-            raise RuntimeError("load() comes first")
-        return self._config
-
-    @property
-    def product(self) -> MatrixProduct:
-        """The matrix, once loaded."""
-        if self._product is None:
-            raise RuntimeError("load() comes first")
-        return self._product
-
-    def load(self, config: SystemConfig) -> None:
-        """See :meth:`~escape_hw.runtime.task.Task.load`."""
+    def _read(self, config: SystemConfig, simulated: bool) -> MatrixProduct:
+        # Nothing moves: a matrix of other modes than the configured ones is as good.
         from escape_hw.io.fits import load_matrix
 
-        self._config = config
-        self._product = load_matrix(
+        return load_matrix(
             self._im,
             expect_system=config.system.name,
             expect_sensor=config.sensor.kind,
@@ -70,6 +54,7 @@ class SprintTask:
     def fit(self) -> Procedure[CalibrationResult]:
         """Find the registration; the result's matrix is the measured one."""
         from escape_hw.calibration.sprint import sprint_steps
+        from escape_hw.calibration.sprint_settings import as_configured
         from escape_hw.config.registry import model_factory
 
         settings, product = self.config.calibration, self.product
@@ -79,12 +64,7 @@ class SprintTask:
             measured,
             model_factory(settings.model)(self.config, product.grid),
             modes=min(settings.sprint_modes, measured.n_modes),
-            choice=settings.modes_choice,
-            solver=settings.solver,
-            loss=settings.loss,
-            actuators=settings.actuators,
-            learning_rate=settings.learning_rate,
-            also=settings.also,
+            **as_configured(settings),
         )
         return replace(product.result, matrix=measured, measured=None, registration=estimate)
 
@@ -132,6 +112,3 @@ class SprintTask:
             },
         )
         return Kept(document, estimate.converged)
-
-    def done(self) -> None:
-        """Nothing was kept to go on with."""

@@ -145,6 +145,7 @@ class System(LoopBench):
             Matrix and model have different actuators or sub-apertures.
         """
         from escape_hw.calibration.sprint import sprint
+        from escape_hw.calibration.sprint_settings import as_configured
 
         settings = self.config.calibration
         modes = min(settings.sprint_modes, matrix.n_modes)
@@ -152,12 +153,7 @@ class System(LoopBench):
             matrix,
             self.model(grid),
             modes=modes,
-            choice=settings.modes_choice,
-            solver=settings.solver,
-            loss=settings.loss,
-            actuators=settings.actuators,
-            learning_rate=settings.learning_rate,
-            also=settings.also,
+            **as_configured(settings),
         )
 
 

@@ -48,8 +48,15 @@ class Task(Protocol[T]):
         """How it changes the configuration, ``section.key=value`` each."""
         ...
 
-    def load(self, config: SystemConfig) -> None:
-        """Read what it needs; nothing is opened yet.
+    def load(self, config: SystemConfig, simulated: bool = False) -> None:
+        """Read what it needs; nothing is opened by it.
+
+        Parameters
+        ----------
+        config
+            The system's configuration.
+        simulated
+            The devices are open already, and are a simulation whatever the mode says.
 
         Raises
         ------
@@ -81,8 +88,8 @@ class Task(Protocol[T]):
         """It came to its end, and nobody needs what was kept to go on with."""
 
 
-def fitting_matrix(im: Path, config: SystemConfig, force: bool = False) -> MatrixProduct:
-    """Read a matrix that belongs to this system, basis, mirror and mode.
+def fitting_matrix(im: Path, config: SystemConfig, simulated: bool = False) -> MatrixProduct:
+    """Read a matrix that belongs to this system, basis, mirror and mode; ``simulated``: in any mode.
 
     Raises
     ------
@@ -98,7 +105,7 @@ def fitting_matrix(im: Path, config: SystemConfig, force: bool = False) -> Matri
         expect_basis=config.basis.kind,
         expect_modes=config.basis.n_modes,
         expect_actuators=config.devices.dm.n_act,
-        allow_simulated=force or config.system.mode == "sim",
+        allow_simulated=simulated or config.system.mode == "sim",
     )
 
 

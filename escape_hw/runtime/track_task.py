@@ -8,18 +8,16 @@ from typing import TYPE_CHECKING
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.tracking import TrackResult
-from escape_hw.runtime.task import Kept, fitting_matrix, given, refuse_simulated
+from escape_hw.runtime.matrix_task import MatrixTask
+from escape_hw.runtime.task import Kept, given, refuse_simulated
 
 if TYPE_CHECKING:
     from escape_hw.bench import Bench
-    from escape_hw.config.models import SystemConfig
-    from escape_hw.config.twin_models import TwinConfig
-    from escape_hw.io.fits import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
 
 
-class TrackTask:
+class TrackTask(MatrixTask):
     """The tracker; see :class:`~escape_hw.runtime.task.Task`.
 
     Parameters
@@ -52,23 +50,9 @@ class TrackTask:
         strehl: bool = True,
         force: bool = False,
     ) -> None:
+        super().__init__(im, force=force)
         self.overrides = given({"tracking.poke": poke, "tracking.memory_s": memory, "loop.gain": gain})
-        self._im, self._seconds, self._exchange = im, seconds, exchange
-        self._strehl, self._force = strehl, force
-        self._product: MatrixProduct | None = None
-        self._twin: TwinConfig | None = None
-
-    @property
-    def product(self) -> MatrixProduct:
-        """The matrix to begin with, once loaded."""
-        if self._product is None:
-            raise RuntimeError("load() comes first")
-        return self._product
-
-    def load(self, config: SystemConfig) -> None:
-        """See :meth:`~escape_hw.runtime.task.Task.load`."""
-        self._product = fitting_matrix(self._im, config, self._force)
-        self._twin = config.twin
+        self._seconds, self._exchange, self._strehl = seconds, exchange, strehl
 
     def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[TrackResult]:
         """Model PSF where the bench can take one, then the tracker."""
@@ -116,11 +100,9 @@ class TrackTask:
 
     def _planted(self, result: TrackResult, seconds: list[float]) -> dict[str, list[float]] | None:
         """True registration of the twin at some moments of the track; for reports only."""
-        if self._twin is None:
+        twin = self.config.twin
+        if twin is None:
             return None
-        start = self._twin.registration.to_registration().to_array()
-        course = [start + self._twin.drift.way(result.began_ns * 1e-9 + t) for t in seconds]
+        start = twin.registration.to_registration().to_array()
+        course = [start + twin.drift.way(result.began_ns * 1e-9 + t) for t in seconds]
         return {name: [float(there[k]) for there in course] for k, name in enumerate(PARAMETERS)}
-
-    def done(self) -> None:
-        """Nothing was kept to go on with."""

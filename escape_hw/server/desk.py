@@ -178,7 +178,7 @@ class Desk:
                 engine.board.require_idle()
             task = engine.offers.task(request.procedure, request.arguments, engine.shelf)
             config = jobs.configured(engine, task)
-            task.load(config)
+            task.load(config, self._engine.bench.simulated)
             run = engine.next_run
             engine.next_run += 1
             jobs.announce(engine, run, request.procedure, arguments, loop)

@@ -201,7 +201,7 @@ def fitting(engine: Engine, name: str) -> MatrixProduct:
         There is none of that name, or it belongs elsewhere.
     """
     # Real drivers may stand on stand-ins: what is open says whether this is a simulation.
-    product = fitting_matrix(engine.shelf.matrix(name), engine.config, force=engine.bench.simulated)
+    product = fitting_matrix(engine.shelf.matrix(name), engine.config, engine.bench.simulated)
     refuse_simulated(product, engine.bench, force=False)
     return product
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from escape_hw.errors import LeaseHeld, RequestRefused
+from escape_hw.errors import ClientUnknown, LeaseHeld, RequestRefused
 from escape_hw.io.provenance import utc_text
 from escape_hw.remote.requests import Hello
 from escape_hw.remote.state import Lease
@@ -98,12 +98,12 @@ class LeaseBook:
 
         Raises
         ------
-        RequestRefused
-            It has not said hello, or speaks for somebody else.
+        ClientUnknown
+            It has not said hello, was forgotten since, or speaks for somebody else.
         """
         known = self._clients.get(client)
         if known is None or known.route != route:
-            raise RequestRefused("say hello first: this connection is not known under that client number")
+            raise ClientUnknown("say hello first: this connection is not known under that client number")
         known.heard = self._clock()
         return known
 

@@ -77,6 +77,9 @@ def test_the_loop_does_not_notice_a_window_that_dies(number: int, tmp_path: Path
                 seconds = wait_for(lambda: bench.state.clients == alone + 2, "it is heard again", ATTACH_S)
                 print(f"the halted window was heard {seconds:.1f} s after it went on")
                 assert seconds < 20, "two seconds on an idle machine"
+                # Under its old number, with all that it knows.
+                known = f"process {windows[0].pid})"
+                assert sum(known in line.text for line in bench.log_after(-1)) == 1
             bench.open_loop()
         finally:
             for one in windows:

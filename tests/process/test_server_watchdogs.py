@@ -100,6 +100,13 @@ def made_safe(bench: Connection, spy: Spy, *words: str) -> None:
     assert bench.state.fault is None
 
 
+def test_a_matrix_of_stand_ins_serves_every_procedure_there(held) -> None:
+    bench, _, matrix = held
+    idle(bench)
+    run = bench.start("loop", im=matrix, frames=60, strehl=False).wait(120)
+    assert run.frames == 60
+
+
 def late(camera: object, wait_s: float) -> tuple[int, bytes]:
     """A camera whose frames do not come."""
     time.sleep(min(0.05, wait_s))

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -105,6 +106,18 @@ def test_who_did_not_say_hello_is_not_heard(raw: zmq.Socket[bytes], bench: Conne
     assert "belongs to another connection" in answer(raw)["error"]["message"]
     raw.send_multipart([b"3", json.dumps({**hello, "client": "0" * 8, "schema_version": 99}).encode()])
     assert "this server speaks version 1, the client 99" in answer(raw)["error"]["message"]
+
+
+def test_a_client_that_was_forgotten_says_hello_again(served: Served, bench: Connection) -> None:
+    with served.connect() as late:
+        # To the server it is all one whether it forgot a number or never heard it.
+        late.client = str(uuid.uuid4())
+        assert late.procedures()
+        wait_for(lambda: bench.state.clients >= 2, "both count")
+        before = bench.state.clients
+        late.client = str(uuid.uuid4())
+        # It asks for nothing: its sign of life alone makes it known.
+        wait_for(lambda: bench.state.clients > before, "it is counted")
 
 
 def test_slow_and_half_messages_on_a_plain_socket_stop_nothing(bench: Connection) -> None:
