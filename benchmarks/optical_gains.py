@@ -1,8 +1,6 @@
 """Optical gains on a pyramid twin: against the twin's truth, and what they do for the loop.
 
     python benchmarks/optical_gains.py gains --seeds 1 2 3      bias and errors against the truth
-    python benchmarks/optical_gains.py loops --seeds 1 2 3      Strehl ratios of three matrices on equal air
-    python benchmarks/optical_gains.py paired --read FILE       what its lines say: means, paired differences
     python benchmarks/optical_gains.py pokes --seeds 1 2 3      Strehl ratio with and without the last pokes
 
 One JSON document per seed and line. The truth is push-pull around wavefronts frozen while the loop ran.
@@ -14,27 +12,20 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from escape_hw.api.pyramid import PyramidPupils
-from escape_hw.api.results import CalibrationResult, LoopResult
-from escape_hw.calibration.closed_loop import closed_loop
-from escape_hw.calibration.gain_bootstrap import GainsRun, bootstrap_gains
+from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.gain_loop import GainLoop
 from escape_hw.calibration.gain_smoothing import smoothed
 from escape_hw.calibration.optical_gain import projector, slope_weights
 from escape_hw.calibration.poke_cost import noise_gain, strehl_loss, within_budget
-from escape_hw.calibration.pseudo_synthetic import at_rest
 from escape_hw.calibration.sensor_setup import poke_amplitudes
 from escape_hw.pipeline.strehl import strehl
 from escape_hw.runtime.system import System, open_system
 from escape_sim.local_response import FrozenWavefronts, local_gains, twin_behind
-
-#: Where on the twin's clock the judged loops begin, in seconds: behind the air of the scan.
-FROM_S = 4.0
 
 
 def calibrated(bench: System, options: argparse.Namespace) -> tuple[CalibrationResult, CalibrationResult]:
@@ -93,89 +84,6 @@ def gains(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def bootstrapped(bench: System, matrix: CalibrationResult, options: argparse.Namespace) -> GainsRun:
-    """The bootstrap from a matrix."""
-    return bench.run(
-        bootstrap_gains(
-            bench, matrix, frames=options.frames, accuracy=options.accuracy, shape=at_rest(bench, matrix)
-        )
-    )
-
-
-def scaled(result: CalibrationResult, factor: float) -> CalibrationResult:
-    """A calibration whose matrix is wrong by a factor."""
-    matrix, f = result.matrix, np.float32(factor)
-    return replace(
-        result, matrix=replace(matrix, data=matrix.data * f, sigma=matrix.sigma * f), measured=None
-    )
-
-
-def loops(bench: System, options: argparse.Namespace) -> dict[str, Any]:
-    """Strehl ratios with the baseline, with ESCAPE scaled by its optical gains, with DO-CRIME alone."""
-    escape, baseline = calibrated(bench, options)
-    if escape.measured is None:
-        raise SystemExit("too few frames for a DO-CRIME matrix")
-    psf = bench.take_model_psf(frames=5)
-    run = bootstrapped(bench, escape, options)
-    docrime = replace(escape, matrix=escape.measured, measured=None)
-    document: dict[str, Any] = {
-        "converged": run.result.converged,
-        "bootstrap_frames": run.result.frames,
-        "steps": len(run.result.closure),
-        "rounds": len(run.result.rounds),
-    }
-    usual = bench.config.loop.gain
-    for name, matrix in {"escape+og": run.rescaled, "baseline": baseline, "docrime": docrime}.items():
-        share = float(np.median(matrix.matrix.data.std(0) / run.rescaled.matrix.data.std(0)))
-        # Each at its own best gain, as a sweep would find it, from gains that are alike in their effect;
-        # and judged on other air than that which chose it, the same for all three.
-        scan = [
-            _judged(bench, matrix, usual * share * factor, options.scan, psf, options) | {"factor": factor}
-            for factor in options.factors
-        ]
-        best = max(scan, key=lambda one: one["strehl"][0] if one["strehl"] and one["stable"] else 0.0)
-        judged = _judged(bench, matrix, best["gain"], options.loop, psf, options, from_s=FROM_S)
-        document[name] = {"share": share, "scan": scan, "factor": best["factor"], **judged}
-    return document
-
-
-def _judged(
-    bench: System,
-    matrix: CalibrationResult,
-    gain: float,
-    frames: int,
-    psf: Any,
-    options: argparse.Namespace,
-    from_s: float = 0.0,
-) -> dict[str, Any]:
-    """A loop on a bench of its own with the same seed: the same turbulence from ``from_s`` on."""
-    with open_system(options.system, seed=bench.config.system.seed, set=options.set) as fresh:
-        twin_behind(fresh).advance_to(from_s)
-        result: LoopResult = fresh.run(
-            closed_loop(fresh, matrix.matrix, matrix.grid, gain=gain, frames=frames, model_psf=psf)
-        )
-    peak = result.strehl.peak if result.strehl is not None else None
-    return {
-        "gain": gain,
-        "strehl": None if peak is None else [peak.value, peak.sigma],
-        "stable": result.stable,
-    }
-
-
-def paired(lines: list[str]) -> list[str]:
-    """Mean Strehl ratios over the seeds, and of differences on the same air, from documents of ``loops``."""
-    seeds = [one for one in map(json.loads, lines) if one["what"] == "loops"]
-    names = ("escape+og", "baseline", "docrime")
-    ratios = {name: np.array([one[name]["strehl"][0] for one in seeds]) for name in names}
-    said = [f"{len(seeds)} seeds"]
-    said += [f"{name}: {100 * ratio.mean():.2f} %" for name, ratio in ratios.items()]
-    for one, other in (("escape+og", "baseline"), ("docrime", "baseline"), ("docrime", "escape+og")):
-        difference = 100 * (ratios[one] - ratios[other])
-        error = difference.std(ddof=1) / np.sqrt(len(seeds)) if len(seeds) > 1 else np.nan
-        said.append(f"{one} minus {other}: {difference.mean():+.2f} +- {error:.2f} % of Strehl ratio")
-    return said
-
-
 def pokes(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     """Strehl ratio with the budgeted pokes, with those of 0.2 % of the stroke, and with next to none."""
     _, baseline = calibrated(bench, options)
@@ -209,8 +117,7 @@ def options_of(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("gains", "loops", "paired", "pokes"))
-    parser.add_argument("--read", type=argparse.FileType("r"), help="lines that loops printed")
+    parser.add_argument("what", choices=("gains", "pokes"))
     parser.add_argument("--system", default="razor-pywfs")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
@@ -219,24 +126,18 @@ def options_of(arguments: list[str] | None = None) -> argparse.Namespace:
         "--baseline", type=int, default=20, help="frames of the baseline per push and per pull"
     )
     parser.add_argument("--frames", type=int, default=4000, help="frames of a measurement, at most")
-    parser.add_argument("--accuracy", type=float, default=0.02)
     parser.add_argument("--poke", type=float, default=0.002)
     parser.add_argument("--wavefronts", type=int, default=60)
     parser.add_argument(
         "--every", type=int, default=6, help="modes from one to the next that the truth is made for"
     )
-    parser.add_argument("--loop", type=int, default=1800, help="frames of each closed loop that is judged")
-    parser.add_argument(
-        "--scan", type=int, default=700, help="frames of each loop that looks for the best gain"
-    )
-    parser.add_argument("--factors", nargs="+", type=float, default=[0.55, 0.7, 0.85, 1.0, 1.2, 1.4])
     return parser.parse_args(arguments)
 
 
 def documents(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """One for each seed."""
     what: Callable[[System, argparse.Namespace], dict[str, Any]]
-    what = {"gains": gains, "loops": loops, "pokes": pokes}[options.what]
+    what = {"gains": gains, "pokes": pokes}[options.what]
     for seed in options.seeds:
         began = time.monotonic()
         with open_system(options.system, seed=seed, set=options.set) as bench:
@@ -245,12 +146,8 @@ def documents(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def main() -> None:
-    """Parse, and do one of the four."""
-    options = options_of()
-    if options.what == "paired":
-        print(*paired(options.read.read().splitlines()), sep="\n")
-        return
-    for one in documents(options):
+    """Parse, and do one of the two."""
+    for one in documents(options_of()):
         print(json.dumps(one), flush=True)
 
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.docrime_fit import (
     MIN_FREEDOM,
     empty_sums,
@@ -21,6 +20,7 @@ from escape_hw.calibration.docrime_fit import (
     require_excitation,
 )
 from escape_hw.calibration.docrime_solution import DocrimeSolution
+from escape_hw.calibration.lag_sums import ResponseEstimate
 from escape_hw.calibration.response import ResponseTracker, covariances, filtered
 from escape_hw.calibration.significance import require_response
 from escape_hw.calibration.telemetry import Recorder, Telemetry
@@ -49,6 +49,8 @@ class DocrimeEstimator:
     closed
         Frames come with the poke beside the whole command of a closed loop, and pokes are the
         instruments of the commands (:class:`~escape_hw.calibration.regression.InstrumentSums`).
+    known
+        The temporal response by other frames of the same mirror and sensor.
     """
 
     def __init__(
@@ -60,20 +62,20 @@ class DocrimeEstimator:
         lags: int = 5,
         correlations: bool = True,
         closed: bool = False,
+        known: ResponseEstimate | None = None,
     ) -> None:
         least = 1 if closed else 0
         if order < least or lags < 1:
             raise ValueError(f"order is {order} and lags {lags}; they must be at least {least} and 1")
         self.n_slopes, self.n_modes, self.order, self.lags = n_slopes, n_modes, order, lags
-        self.closed = closed
+        self.closed, self._known = closed, known
         self._recorder = Recorder(n_slopes, n_modes, BURN_IN, closed=closed)
         self._shapes = (n_slopes,), (n_modes,)
         self._driven = np.zeros(2 * n_modes)
         self._blind = 0
         self._next: int | None = None
         self._whitener: NDArray[np.float64] | None = None
-        self._response: TemporalResponse | None = None
-        self._response_covariance = np.zeros((lags, lags))
+        self._response: ResponseEstimate | None = None
         self._tracker: ResponseTracker | None = None
         self._spread = 1.0
         self._sums = empty_sums(n_slopes, n_modes, closed, correlations=correlations)
@@ -208,8 +210,7 @@ class DocrimeEstimator:
         arrays: dict[str, NDArray[Any]] = {
             "whitener": self._whitener,
             "response": self._response.weights,
-            "response_sigma": self._response.sigma,
-            "response_covariance": self._response_covariance,
+            "response_covariance": self._response.covariance,
             **{f"sums.{name}": array.copy() for name, array in self._sums.arrays().items()},
             **{f"tracker.{name}": array.copy() for name, array in self._tracker.arrays().items()},
         }
@@ -218,8 +219,6 @@ class DocrimeEstimator:
             "lost_frames": self.lost_frames,
             "spread": self._spread,
             "count": self._sums.count,
-            "first_rows": self._tracker.first_rows,
-            "later_rows": self._tracker.rows,
         }
         return values, arrays
 
@@ -241,20 +240,16 @@ class DocrimeEstimator:
             return
         self.frames, self.lost_frames = int(values["frames"]), int(values["lost_frames"])
         self._whitener, self._spread = arrays["whitener"], float(values["spread"])
-        self._response = TemporalResponse(arrays["response"], arrays["response_sigma"])
-        self._response_covariance = arrays["response_covariance"]
-        self._tracker = ResponseTracker(
-            np.zeros((self.n_slopes, self.n_modes)), self._response, self._response_covariance,
-            int(values["first_rows"]), arrays["tracker.spectra"],
-        )  # fmt: skip
-        self._tracker.rows, self._sums.count = int(values["later_rows"]), int(values["count"])
+        self._response = ResponseEstimate(arrays["response"], arrays["response_covariance"])
+        spectra = np.zeros((self.n_modes if self.closed else 1, self.lags, self.lags))
+        self._tracker, self._sums.count = ResponseTracker(self._response, spectra), int(values["count"])
         for prefix, own in (("sums", self._sums.arrays()), ("tracker", self._tracker.arrays())):
             for name, array in own.items():
-                if array.shape != arrays[f"{prefix}.{name}"].shape:
-                    raise ValueError(
-                        f"{prefix}.{name} is {arrays[f'{prefix}.{name}'].shape}, not {array.shape}"
-                    )
-                array[...] = arrays[f"{prefix}.{name}"]
+                kept = arrays.get(f"{prefix}.{name}")
+                if kept is None or kept.shape != array.shape:
+                    found = "missing" if kept is None else str(kept.shape)
+                    raise ValueError(f"{prefix}.{name} is {found}, not {array.shape}; begin the run again")
+                array[...] = kept
         self._recorder.resize(BLOCK + self._memory())
         # Rows before the first that is new: the mirror was flat, no slopes are known.
         self._recorder.lose_one(flat=True)
@@ -300,18 +295,20 @@ class DocrimeEstimator:
         covariance = residual if residual.ndim == 2 else None
         variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * self._spread
         sigma = np.outer(np.sqrt(variance), np.sqrt(sums.inverse_diagonal()))
-        scale = self._tracker.scale()
+        response = self._tracker.response()
+        scale = self._tracker.scale(response)
         return DocrimeSolution(
             matrix * scale,
             sigma * np.abs(scale),
-            self._tracker.response(),
+            response.response,
             covariance,
             information / np.multiply.outer(scale, scale),
             variance,
             self._whitener,
             self.frames,
             self.lost_frames,
-            self._tracker.gain_sigma(),
+            self._tracker.gain_sigma(response),
+            response.covariance,
         )
 
     def preview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
@@ -321,7 +318,8 @@ class DocrimeEstimator:
         """
         if self._tracker is None:
             return None
-        return quick_look(self._sums, self._tracker.scale(), self.lags, self._spread)
+        scale = self._tracker.scale(self._tracker.response())
+        return quick_look(self._sums, scale, self.lags, self._spread)
 
     def _absorb(self) -> None:
         """Move the gathered frames into the sums; fit the filter first if there is none yet."""
@@ -333,7 +331,8 @@ class DocrimeEstimator:
             found = first_fit(data, self.order, self.lags)
             if found is not None:
                 self._whitener, self._spread = found.whitener, found.spread
-                self._response, self._response_covariance = found.response, found.covariance
+                first = found.response
+                self._response = first if self._known is None else first.combined(self._known)
         if self._response is not None:
             self._sum(data, start)
         recorder.keep(recorder.filled if self._response is None else self._memory())
@@ -350,15 +349,14 @@ class DocrimeEstimator:
         block = filtered(data, self._whitener, self.lags, start)
         if not block.now.size:
             return
+        # Without the filter later frames would tell less than the first ones' differences did.
+        if self._tracker is not None and self.order:
+            before = self._sums.some()
+            matrix = before.solve()
+            self._tracker.add(block, matrix, before.power_of_modes(matrix))
         self._sums.add(block.slopes, block.driven(self._response.weights))
         if self._tracker is None:
-            self._tracker = ResponseTracker(
-                self._sums.centred().solve(), self._response, self._response_covariance, block.now.size,
-                covariances(block, self.lags),
-            )  # fmt: skip
-        elif self.order:
-            # Without the filter later frames would tell less than the first ones' differences did.
-            self._tracker.add(block)
+            self._tracker = ResponseTracker(self._response, covariances(block, self.lags))
 
 
 def _not_finite(index: int) -> ValueError:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from escape_hw.api.results import TemporalResponse
+from escape_hw.calibration.lag_sums import ResponseEstimate
 from escape_hw.calibration.late_response import require_whole_response
 from escape_hw.calibration.regression import InstrumentSums, RegressionSums
 from escape_hw.calibration.response import SLOPES, Filtered, filtered, fit_response, usable_rows
@@ -33,15 +33,12 @@ class FirstFit:
         Filter over time ``(order + 1,)``.
     response
         The temporal response.
-    covariance
-        Of the response's weights ``(lags, lags)``.
     spread
         Factor on the variance of an estimate whose noise is not white.
     """
 
     whitener: NDArray[np.float64]
-    response: TemporalResponse
-    covariance: NDArray[np.float64]
+    response: ResponseEstimate
     spread: float
 
 
@@ -80,17 +77,17 @@ def first_fit(data: Telemetry, order: int, lags: int) -> FirstFit | None:
     require_excitation(data.pokes.T @ data.pokes)
     # Differences tell the response well even where the plain estimator is asked for.
     difference, few = np.array([1.0, -1.0]), data.thinned(_FEW_SLOPES if order else SLOPES)
-    response, covariance = fit_response(few, difference, lags)
+    response = fit_response(few, difference, lags)
     if not order:
-        return FirstFit(np.ones(1), response, covariance, _plain_spread(few, difference, response, lags))
+        return FirstFit(np.ones(1), response, _plain_spread(few, difference, response, lags))
     residuals, usable = _residuals(few, difference, response, lags)
     whitener = prediction_error_filter(residuals, usable, order)
     require_whole_response(data, whitener, lags)
-    return FirstFit(whitener, *fit_response(data, whitener, lags), 1.0)
+    return FirstFit(whitener, fit_response(data, whitener, lags), 1.0)
 
 
 def _regressed(
-    block: Filtered, response: TemporalResponse
+    block: Filtered, response: ResponseEstimate
 ) -> tuple[NDArray[np.float32], RegressionSums, NDArray[np.float64]]:
     """Commands as the slopes saw them (pokes beside them in closed loop), sums and matrix of a block."""
     driven = block.driven(response.weights)
@@ -100,7 +97,7 @@ def _regressed(
 
 
 def _plain_spread(
-    few: Telemetry, difference: NDArray[np.float64], response: TemporalResponse, lags: int
+    few: Telemetry, difference: NDArray[np.float64], response: ResponseEstimate, lags: int
 ) -> float:
     """Factor on the plain estimator's variance; the differences must show that there is a response."""
     block = filtered(few, difference, lags)
@@ -114,7 +111,7 @@ def _plain_spread(
 
 
 def _residuals(
-    data: Telemetry, whitener: NDArray[np.float64], response: TemporalResponse, lags: int
+    data: Telemetry, whitener: NDArray[np.float64], response: ResponseEstimate, lags: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Slopes less what the commands explain ``(n_times, n_slopes)``, and the rows where that is known."""
     *_, matrix = _regressed(filtered(data, whitener, lags), response)

@@ -34,6 +34,8 @@ class DocrimeSolution:
     gain_sigma
         Relative standard error of the gain that all elements share: an error of the temporal response,
         which is scaled to sum 1, scales the whole matrix.
+    response_covariance
+        Of the response's weights ``(lags, lags)``.
     """
 
     matrix: NDArray[np.float64]
@@ -46,4 +48,5 @@ class DocrimeSolution:
     frames: int
     lost_frames: int
     gain_sigma: float
+    response_covariance: NDArray[np.float64]
     __repr__ = brief

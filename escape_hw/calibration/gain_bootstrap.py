@@ -4,42 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.gains import ClosureStep, GainRound, GainsResult, OpticalGains
+from escape_hw.api.gains import GainRound, GainsResult
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.procedure import Procedure, Progress
-from escape_hw.api.results import CalibrationResult, StrehlEstimate
+from escape_hw.api.procedure import Procedure
+from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import Bench
-from escape_hw.calibration.first_closure import close_first
-from escape_hw.calibration.gain_loop import GainLoop, Stretch
-from escape_hw.calibration.gain_meter import MeasuredGains
-from escape_hw.calibration.gain_smoothing import smoothed
+from escape_hw.calibration.gain_loop import GainLoop
+from escape_hw.calibration.gain_rounds import Asked, Bootstrap, first_closure, rms, rounds, smooth
+from escape_hw.calibration.gain_smoothing import usable
 from escape_hw.calibration.optical_gain import scaled_matrix
-from escape_hw.calibration.poke_cost import noise_gain, strehl_loss, within_budget
-from escape_hw.calibration.sensor_setup import poke_amplitudes
-from escape_hw.errors import Aborted, CalibrationError, ConfigError
-from escape_hw.pipeline.standard_error import LEAST
-from escape_hw.pipeline.strehl import strehl
+from escape_hw.errors import Aborted, ConfigError
 
-#: Poke of the first closure and first round; each round halves it.
-_FIRST_POKE, _LESS = 0.004, 0.5
-#: Frames per mode at each gain of the first closure, and at least.
-_CLOSING_FRAMES, _LEAST_FRAMES = 4, 400
-#: Accuracy of the rounds before the last poke, relative to the one asked for.
-_COARSE = 2.0
-#: Change between two rounds that counts as none, beside twice what the errors let expect.
-_TOLERANCE = 0.02
-#: Rounds at most at the last poke.
-_REPEATS = 4
 #: Name of the matrix that only lends its shape, among those beside.
 _SHAPE = "shape"
-#: How often, and by how much, the gain is lowered when a round finds the loop unstable.
-_RETRIES, _LOWER = 3, 0.7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,21 +36,6 @@ class GainsRun:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.result!r}\n  rescaled: {self.rescaled.matrix!r}>"
-
-
-@dataclass(slots=True, eq=False)
-class _State:
-    """What the bootstrap has so far."""
-
-    applied: OpticalGains | None = None
-    steps: list[ClosureStep] = field(default_factory=list)
-    rounds: list[GainRound] = field(default_factory=list)
-    beside: dict[str, OpticalGains] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    gain: float = math.nan
-    amplitude: float = math.nan
-    converged: bool = False
-    partial: bool = False
 
 
 def bootstrap_gains(
@@ -127,14 +94,14 @@ def bootstrap_gains(
     """
     wanted = bench.config.loop.gain if gain is None else gain
     _require_sense(poke=poke, accuracy=accuracy, budget=budget, gain=wanted)
-    state, others = _State(), {**(beside or {}), **({} if shape is None else {_SHAPE: shape})}
+    state, others = Bootstrap(), {**(beside or {}), **({} if shape is None else {_SHAPE: shape})}
     loop = GainLoop(bench, calibration, others, science=model_psf is not None)
     before = bench.wfs.status().lost
     try:
         loop.start()
         before = bench.wfs.status().lost
-        yield from _closed(loop, wanted, poke, state)
-        yield from _rounds(loop, wanted, poke, accuracy, budget, frames, list(others), model_psf, state)
+        yield from first_closure(loop, wanted, poke, state)
+        yield from rounds(loop, Asked(poke, accuracy, budget, frames, model_psf), list(others), state)
     except Aborted:
         state.partial = True
         _salvage(loop, state)
@@ -143,15 +110,15 @@ def bootstrap_gains(
     return _run_of(loop, calibration, shape, state, bench.wfs.status().lost - before)
 
 
-def _salvage(loop: GainLoop, state: _State) -> None:
+def _salvage(loop: GainLoop, state: Bootstrap) -> None:
     """Keep what a round told that was aborted after enough frames; the loop is about to be opened."""
     measured = loop.so_far()
     if state.applied is None or measured is None:
         return
-    found = _smooth(measured, 0)
+    found = smooth(measured)
     change = found.best / usable(state.applied) - 1
     state.rounds.append(
-        GainRound(found, state.amplitude, measured.frames, _rms(change), math.nan, math.nan, math.nan, False)
+        GainRound(found, state.amplitude, measured.frames, rms(change), math.nan, math.nan, math.nan, False)
     )
     state.applied = found
 
@@ -162,179 +129,11 @@ def _require_sense(**numbers: float) -> None:
             raise ConfigError(f"{name} is {value}; it must lie between 0 and 1")
 
 
-def _closed(loop: GainLoop, wanted: float, poke: float, state: _State) -> Procedure[None]:
-    """Close the loop and scale its matrix by what was measured."""
-    matrix = loop.reference
-    amplitude = poke_amplitudes(loop.bench, matrix.m2c, max(poke, _FIRST_POKE))
-    frames = max(_CLOSING_FRAMES * matrix.n_modes, _LEAST_FRAMES)
-    closure = yield from close_first(loop, wanted, amplitude, frames, state.steps)
-    state.applied = _smooth(closure.gains, 0)
-    state.gain = wanted
-    _apply(loop, state)
-    yield _shown(state)
-
-
-def _apply(loop: GainLoop, state: _State) -> None:
-    """Scale the matrix by the gains; then the loop's own gain is the one wanted."""
-    if state.applied is None:
-        raise RuntimeError("no gains were measured yet")
-    loop.scale(usable(state.applied))
-    loop.control.set_gain(state.gain)
-
-
-def _rounds(
-    loop: GainLoop,
-    wanted: float,
-    poke: float,
-    accuracy: float,
-    budget: float,
-    frames: int,
-    others: list[str],
-    model_psf: NDArray[np.float32] | None,
-    state: _State,
-) -> Procedure[None]:
-    size, repeats, retries = max(poke, _FIRST_POKE), 0, 0
-    least = max(_CLOSING_FRAMES * loop.reference.n_modes, _LEAST_FRAMES)
-    while repeats < _REPEATS and not state.converged:
-        last = size <= poke
-        amplitude = poke_amplitudes(loop.bench, loop.reference.m2c, size)
-        if last:
-            amplitude = within_budget(amplitude, budget, *_optics(loop.bench), _raised(loop, state))
-        state.amplitude = float(amplitude.max())
-        asked = accuracy if last else _COARSE * accuracy
-        stretch = yield from loop.measure(
-            least, amplitude, f"round {len(state.rounds) + 1}, poke {amplitude.max():.2g}",
-            most=frames, enough=partial(_accurate, asked=asked),
-        )  # fmt: skip
-        if stretch.diverged or stretch.gains is None or _swings(stretch, state):
-            retries += 1
-            if retries > _RETRIES:
-                why = "diverged" if stretch.diverged else (stretch.why or "swings")
-                raise CalibrationError(
-                    f"the loop does not stay closed: at an effective gain of {state.gain:.2f} it {why}; "
-                    "lower loop.gain, drop more modes, or measure the matrix again"
-                )
-            state.gain *= _LOWER
-            state.notes.append(f"the loop was not stable; its gain was lowered to {state.gain:.3g}")
-            loop.open_again()
-            loop.control.set_gain(state.gain)
-            continue
-        state.beside = {name: _smooth(stretch.gains, k + 1) for k, name in enumerate(others)}
-        _book(loop, stretch, stretch.gains, amplitude, asked, model_psf, state)
-        yield _shown(state)
-        state.converged = last and _agrees(state.rounds[-1])
-        repeats += last
-        size = max(poke, size * _LESS)
-
-
-def _shown(state: _State) -> Progress:
-    """The gains so far, round by round."""
-    gains, rounds = state.applied, state.rounds
-    if gains is None:
-        raise RuntimeError("no gains were measured yet")
-    arrays = {"gains": gains.value, "gains_sigma": gains.sigma, "gains_smooth": gains.trend}
-    if rounds:
-        arrays["gains_rounds"] = np.stack([one.gains.best for one in rounds])
-    count = len(rounds)
-    shown = {name: array.astype(np.float32) for name, array in arrays.items()}
-    return Progress("optical gains", count, max(count, 1), "round", arrays=shown)
-
-
-def _accurate(measured: MeasuredGains, asked: float) -> bool:
-    """Whether gains are known as well as asked for."""
-    return _error(_smooth(measured, 0)) <= asked
-
-
-def _swings(stretch: Stretch, state: _State) -> bool:
-    """Whether the residual is far above what it was: a pyramid's slopes saturate before the mirror does."""
-    known = [step.residual_nm for step in state.steps if step.stable and math.isfinite(step.residual_nm)]
-    return bool(known) and stretch.residual_nm > 1.5 * max(known)
-
-
-def _book(
-    loop: GainLoop,
-    stretch: Stretch,
-    measured: MeasuredGains,
-    amplitude: NDArray[np.float64],
-    asked: float,
-    model_psf: NDArray[np.float32] | None,
-    state: _State,
-) -> None:
-    """Take down a round, and scale the matrix by what it found."""
-    found, old = _smooth(measured, 0), state.applied
-    if old is None:
-        raise RuntimeError("the loop was never closed")
-    change = found.best / usable(old) - 1
-    expected = np.hypot(found.best_sigma / found.best, old.best_sigma / old.best)
-    expected = np.hypot(expected, math.hypot(found.common_sigma, old.common_sigma))
-    state.rounds.append(
-        GainRound(
-            found,
-            float(amplitude.max()),
-            stretch.frames,
-            _rms(change),
-            _rms(expected),
-            stretch.residual_nm,
-            strehl_loss(amplitude, *_optics(loop.bench), _raised(loop, state)),
-            _error(found) <= asked,
-            _strehl(stretch, model_psf),
-        )
-    )
-    state.applied = found
-    _apply(loop, state)
-
-
-def _strehl(stretch: Stretch, model_psf: NDArray[np.float32] | None) -> StrehlEstimate | None:
-    """Of the science frames of a round, when there were enough of them."""
-    if model_psf is None or stretch.record.science.count < LEAST:
-        return None
-    return strehl(stretch.record.science.images(), model_psf)
-
-
-def _agrees(one: GainRound) -> bool:
-    """Whether a round found, to the accuracy asked for, the gains that it ran with."""
-    return one.reached and one.change <= max(_TOLERANCE, 2 * one.expected_change)
-
-
-def _smooth(measured: MeasuredGains, reference: int) -> OpticalGains:
-    return smoothed(measured.value[reference], measured.sigma[reference], measured.common_sigma)
-
-
-def _error(gains: OpticalGains) -> float:
-    """Relative standard error, rms over the modes."""
-    return math.hypot(_rms(gains.best_sigma / gains.best), gains.common_sigma)
-
-
-def usable(gains: OpticalGains) -> NDArray[np.float64]:
-    """Gains to scale by: one mode's noise must not turn its sign, nor raise its gain many times."""
-    least = 0.3 * float(np.median(gains.trend))
-    if not least > 0:
-        raise CalibrationError(
-            "the optical gains are not positive: the loop works against the turbulence; "
-            "measure the matrix again"
-        )
-    return np.maximum(gains.best, least)
-
-
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _optics(bench: Bench) -> tuple[float, float]:
-    return bench.dm.info.stroke_m, bench.config.system.wavelength_m
-
-
-def _raised(loop: GainLoop, state: _State) -> float:
-    """Factor of the loop on the pokes' variance, by the delay known from the matrix."""
-    delay = float(loop.reference.metrics.get("delay_frames", 2.0))
-    return noise_gain(state.gain, loop.bench.config.loop.leak, delay)
-
-
 def _run_of(
     loop: GainLoop,
     calibration: CalibrationResult,
     shape: InteractionMatrix | None,
-    state: _State,
+    state: Bootstrap,
     lost: int,
 ) -> GainsRun:
     rescaled, notes = calibration, list(state.notes)

@@ -16,6 +16,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import next_frame
 from escape_hw.calibration.closed_loop import integrator_for
 from escape_hw.calibration.gain_meter import GainMeter, MeasuredGains
+from escape_hw.calibration.lag_sums import ResponseEstimate
 from escape_hw.calibration.loop_run import LoopRecord, RunningLoop
 from escape_hw.calibration.optical_gain import scaled_matrix, slope_weights
 from escape_hw.calibration.poke_patterns import RandomPokes
@@ -46,7 +47,9 @@ class Stretch:
 class GainLoop:
     """A loop whose pokes measure the optical gains of its matrix, and whose matrix can be scaled.
 
-    Whoever makes one calls :meth:`open_again` in a ``finally``.
+    Mirror and sensor answer in the same time from one measurement to the next, whatever the gains do: each
+    goes on with the temporal response that those before it found, from larger pokes as a rule. Whoever
+    makes one calls :meth:`open_again` in a ``finally``.
 
     Parameters
     ----------
@@ -81,6 +84,7 @@ class GainLoop:
         self.control: LeakyIntegrator = integrator_for(bench, self.reference, calibration.grid)
         self._dropped = bench.config.loop.dropped_modes
         self._stroke = np.sqrt(np.mean(np.square(self.reference.m2c), axis=0))
+        self._known: ResponseEstimate | None = None
         # Refused here, before anything moves, if a mode is noise.
         self._meter = self._new_meter()
         prepare_sensor(bench)
@@ -159,6 +163,8 @@ class GainLoop:
             if gains is not None and enough(gains):
                 break
         self.frames += loop.record.frames
+        if gains is not None and not loop.record.diverged:
+            self._known = gains.response
         residual = np.array(loop.record.residual[skipped:])
         rms = float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan
         return Stretch(gains, rms, done, loop.record.diverged, loop.record, why)
@@ -169,7 +175,9 @@ class GainLoop:
 
     def _new_meter(self) -> GainMeter:
         c = self.bench.config.calibration
-        return GainMeter(self._references, self._weights, order=c.whiten_order, lags=c.lags)
+        return GainMeter(
+            self._references, self._weights, order=c.whiten_order, lags=c.lags, known=self._known
+        )
 
 
 def _require_like(reference: InteractionMatrix, name: str, matrix: InteractionMatrix) -> None:

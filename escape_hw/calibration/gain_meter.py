@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.lag_sums import ResponseEstimate
 from escape_hw.calibration.optical_gain import projector
 from escape_hw.errors import TooFewFrames
 
@@ -27,7 +27,7 @@ class MeasuredGains:
     value, sigma
         ``(n_references, n_modes)``, relative to each reference.
     response
-        Response of the sensor to a step of the mirror.
+        Response of the sensor to a step of the mirror, what was known before included.
     common_sigma
         Relative standard error that all gains share, from that of the response.
     frames, lost_frames
@@ -36,7 +36,7 @@ class MeasuredGains:
 
     value: NDArray[np.float64]
     sigma: NDArray[np.float64]
-    response: TemporalResponse
+    response: ResponseEstimate
     common_sigma: float
     frames: int
     lost_frames: int
@@ -64,7 +64,7 @@ class GainMeter:
         Matrices that gains are wanted relative to, of the same slopes and modes.
     weights
         Of the slopes ``(n_slopes,)``.
-    order, lags
+    order, lags, known
         As for :class:`~escape_hw.calibration.docrime_estimator.DocrimeEstimator`.
     """
 
@@ -75,10 +75,11 @@ class GainMeter:
         *,
         order: int = 6,
         lags: int = 5,
+        known: ResponseEstimate | None = None,
     ) -> None:
         rows = np.concatenate([projector(reference, weights) for reference in references])
         self._rows = np.ascontiguousarray(rows, np.float32)
-        self._n_modes, self._order, self._lags = references[0].n_modes, order, lags
+        self._n_modes, self._order, self._lags, self._known = references[0].n_modes, order, lags, known
         self._signals = np.zeros(len(rows), np.float32)
         self._waiting: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] = []
         self._estimator: DocrimeEstimator | None = None
@@ -127,7 +128,7 @@ class GainMeter:
         return MeasuredGains(
             matrix[:, modes, modes],
             np.sqrt(np.maximum(noise, 0).reshape(-1, n) * left),
-            found.response,
+            ResponseEstimate(found.response.weights, found.response_covariance),
             found.gain_sigma,
             found.frames,
             found.lost_frames,
@@ -146,7 +147,9 @@ class GainMeter:
             noise[np.diag_indices(n)] += 1e-3 * np.trace(noise) / n
             self._turn[here, here] = np.linalg.inv(np.linalg.cholesky(noise))
         self._rows = np.ascontiguousarray(self._turn @ self._rows, np.float32)
-        self._estimator = DocrimeEstimator(size, n, order=self._order, lags=self._lags, closed=True)
+        self._estimator = DocrimeEstimator(
+            size, n, order=self._order, lags=self._lags, closed=True, known=self._known
+        )
         driven = np.stack([one[2] for one in self._waiting])
         self._estimator.extend(index, (signals @ self._turn.T).astype(np.float32), driven)
         self._waiting = []

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from escape_hw.api.gains import OpticalGains
+from escape_hw.errors import CalibrationError
 
 Pair = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -65,6 +66,17 @@ def smoothed(
     trend, trend_sigma = _averaged([(weight, fit.posterior(own=False)) for weight, fit in likely])
     best, best_sigma = _averaged([(weight, fit.posterior(own=True)) for weight, fit in likely])
     return OpticalGains(value, sigma, trend, trend_sigma, best, best_sigma, common_sigma)
+
+
+def usable(gains: OpticalGains) -> NDArray[np.float64]:
+    """Gains to scale by: one mode's noise must not turn its sign, nor raise its gain many times."""
+    least = 0.3 * float(np.median(gains.trend))
+    if not least > 0:
+        raise CalibrationError(
+            "the optical gains are not positive: the loop works against the turbulence; "
+            "measure the matrix again"
+        )
+    return np.maximum(gains.best, least)
 
 
 def _averaged(parts: list[tuple[float, Pair]]) -> Pair:

@@ -51,10 +51,11 @@ def require_whole_response(data: Telemetry, whitener: NDArray[np.float64], lags:
 
 def _late(part: Half, lags: int) -> NDArray[np.float64]:
     """For each later lag, its share of the response found, and by how many standard errors ``(2, n)``."""
-    left = part.slopes.astype(float)
-    for lag, weight in enumerate(part.weights):
+    left, weights = part.slopes.astype(float), part.sums.weights()
+    for lag, weight in enumerate(weights):
         left -= weight * shifted(part.predicted, part.now, lag)
-    size = np.abs(part.weights).max() * float(np.square(shifted(part.instrument, part.now, 0)).sum())
+    size = float(np.vdot(*(shifted(rows, part.now, 0) for rows in (part.instrument, part.predicted))))
+    size *= np.abs(weights).max()
     rows = []
     for lag in range(lags, lags + _BEYOND):
         # Neighbouring slopes err together, frames (whitened) do not.

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.results import TemporalResponse
-from escape_hw.calibration.response import SLOPES, Filtered
+from escape_hw.calibration.lag_sums import LagSums
+from escape_hw.calibration.response import SLOPES, Filtered, lagged
 
 #: Standard errors by which a known response may miss what is measured, and what is nothing in any case.
 _APART, _LITTLE = 6.0, 0.05
@@ -26,8 +27,8 @@ class ResponseSums:
     """
 
     def __init__(self, lags: int) -> None:
-        self._normal, self._right = np.zeros((lags, lags)), np.zeros(lags)
-        self._scores, self._auto = np.zeros((lags, lags)), np.zeros((lags, lags))
+        self._sums, self._lags = LagSums(lags), lags
+        self._auto = np.zeros((lags, lags))
 
     def add(self, block: Filtered, matrix: NDArray[np.float64]) -> None:
         """Take a block of filtered slopes, commands and pokes with the rows of the lags before it.
@@ -41,25 +42,17 @@ class ResponseSums:
         """
         step = max(1, -(-block.n_slopes // SLOPES))
         few = matrix[::step].T.astype(np.float32)
-        lags, n, n_modes = len(self._right), block.n_slopes, block.n_modes
-        rows = [block.before(lag)[:, n:] for lag in range(lags)]
-        made = np.stack([row[:, :n_modes] @ few for row in rows])
-        poked = np.stack([row[:, n_modes:] @ few for row in rows])
+        n_modes = block.n_modes
+        rows = block.rows[:, block.n_slopes :]
+        made = lagged(rows[:, :n_modes] @ few, block.now, self._lags)
+        poked = lagged(rows[:, n_modes:] @ few, block.now, self._lags)
         slopes = block.slopes[:, ::step]
         slopes = slopes - slopes.mean(axis=0)
         # Loud slopes tell little.
         quiet = 1 / np.maximum(slopes.var(axis=0), 1e-12 * float(slopes.var()) + 1e-30)
-        instruments = (poked - poked.mean(axis=1, keepdims=True)) * quiet
-        flat = instruments.reshape(lags, -1).astype(np.float64)
-        self._normal += flat @ made.reshape(lags, -1).T
-        self._right += flat @ slopes.ravel()
-        self._auto += flat @ poked.reshape(lags, -1).T
-        left = slopes - np.tensordot(self._solved().astype(np.float32), made, axes=1)
-        scores = np.einsum("lts,ts->lt", instruments, left).astype(np.float64)
-        self._scores += scores @ scores.T
-
-    def _solved(self) -> NDArray[np.float64]:
-        return np.asarray(np.linalg.lstsq(self._normal, self._right, rcond=1e-9)[0])
+        instruments = (poked - poked.mean(axis=0)) * quiet
+        self._sums.add(slopes, made - made.mean(axis=0), instruments)
+        self._auto += np.einsum("tls,tks->lk", instruments, poked, optimize=True)
 
     def response(self, known: TemporalResponse | None) -> TemporalResponse:
         """The response scaled to sum 1; the known one while it has the smaller errors and may be true.
@@ -69,24 +62,19 @@ class ResponseSums:
         known
             ``None``: none is.
         """
-        if not self._right.any():
+        if not self._auto.any():
             if known is None:
                 raise RuntimeError("no frames yet, and no response is known")
             return known
-        weights = self._solved()
-        total = float(weights.sum())
-        bread = np.linalg.pinv(self._normal)
-        # Scaled to sum 1, a weight errs with all others: d(w / sum) = (1 - w 1^T) dw / sum.
-        scaled = (np.eye(weights.size) - np.outer(weights / total, np.ones(weights.size))) @ bread / total
-        sigma = np.sqrt(np.diag(scaled @ self._scores @ scaled.T))
-        measured = TemporalResponse(weights / total, sigma)
-        if known is not None and known.sigma.max() < sigma.max() and not contradicts(measured, known):
+        measured = self._sums.response().response
+        better = known is not None and known.sigma.max() < measured.sigma.max()
+        if known is not None and better and not contradicts(measured, known):
             return known
         return measured
 
     def gain_sigma(self, response: TemporalResponse) -> float:
         """Relative error that the response's errors put on the gain of a matrix."""
-        if not self._right.any():
+        if not self._auto.any():
             return 0.0
         seen = self._auto @ response.weights
         here = float(response.weights @ seen)

@@ -34,7 +34,7 @@ class RegressionSums:
     @classmethod
     def zeros(cls, n_slopes: int, n_modes: int, *, correlations: bool) -> Self:
         """Empty sums."""
-        n_few = len(range(0, n_slopes, _step(n_slopes)))
+        n_few = len(range(0, n_slopes, few_step(n_slopes)))
         return cls(
             np.zeros((n_slopes, n_modes)),
             np.zeros((n_modes, n_modes)),
@@ -53,7 +53,7 @@ class RegressionSums:
         self.cross += slopes.T @ pokes
         self.gram += pokes.T @ pokes
         self.power += slopes.T @ slopes if self.power.ndim == 2 else np.einsum("ts,ts->s", slopes, slopes)
-        few = np.ascontiguousarray(slopes[:, :: _step(slopes.shape[1])])
+        few = np.ascontiguousarray(slopes[:, :: few_step(slopes.shape[1])])
         self.few += few.T @ few
         ones = np.ones(len(slopes), np.float32)
         self.slopes += ones @ slopes
@@ -64,7 +64,7 @@ class RegressionSums:
     def centred(self) -> Self:
         """The same sums about the means of slopes and pokes."""
         n = max(self.count, 1)
-        few = self.slopes[:: _step(self.slopes.size)]
+        few = self.slopes[:: few_step(self.slopes.size)]
         square = np.outer(self.slopes, self.slopes) if self.power.ndim == 2 else np.square(self.slopes)
         return type(self)(
             self.cross - np.outer(self.slopes, self.pokes) / n,
@@ -75,6 +75,23 @@ class RegressionSums:
             np.zeros_like(self.pokes),
             self.count,
         )
+
+    def some(self) -> Self:
+        """The same sums about the means for the few slopes alone; costs little."""
+        step = few_step(self.slopes.size)
+        few, n = self.slopes[::step], max(self.count, 1)
+        power = self.few - np.outer(few, few) / n
+        return type(self)(
+            self.cross[::step] - np.outer(few, self.pokes) / n,
+            self.gram - np.outer(self.pokes, self.pokes) / n,
+            power, power, np.zeros_like(few), np.zeros_like(self.pokes), self.count,
+        )  # fmt: skip
+
+    def power_of_modes(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum of squares of each column of the least-squares matrix, less what noise adds ``(n_modes,)``."""
+        residual = self.residual_power(matrix)
+        noise = float(np.trace(residual) if residual.ndim == 2 else residual.sum()) / self.freedom()
+        return np.asarray(np.square(matrix).sum(axis=0) - noise * self.inverse_diagonal())
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """All sums by name, themselves and no copies: written into, they are restored."""
@@ -111,7 +128,7 @@ class RegressionSums:
 
     def sample(self, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Some rows of the least-squares matrix, and the sum of their residuals times residuals."""
-        step = _step(len(matrix))
+        step = few_step(len(matrix))
         return matrix[::step], np.asarray(self.few - self.cross[::step] @ matrix[::step].T)
 
 
@@ -149,7 +166,7 @@ class InstrumentSums(RegressionSums):
 
     def sample(self, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Some rows of the matrix, and the sum of their residuals times residuals."""
-        step = _step(len(matrix))
+        step = few_step(len(matrix))
         rows, cross = matrix[::step], self.cross[::step, : matrix.shape[1]]
         return rows, _residual_power(self.few, cross, self._parts()[0], rows)
 
@@ -174,5 +191,6 @@ def _residual_power(
     return np.asarray(power - mixed - mixed.T + matrix @ gram @ matrix.T)
 
 
-def _step(n_slopes: int) -> int:
+def few_step(n_slopes: int) -> int:
+    """From one slope to the next of those whose correlations are always known."""
     return max(1, -(-n_slopes // FEW))

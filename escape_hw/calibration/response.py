@@ -6,14 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_toeplitz, toeplitz
+from scipy.linalg import toeplitz
 
-from escape_hw.api.results import TemporalResponse
+from escape_hw.calibration.lag_sums import LagSums, ResponseEstimate
+from escape_hw.calibration.regression import FEW, few_step
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.whitening import apply_filter
 
 #: Slopes that the response is estimated from, evenly spread; more tell little and take time.
-SLOPES = 64
+SLOPES = FEW
+#: Share of a matrix's power that is taken for signal at least.
+_LEAST_SIGNAL = 0.01
+#: Frames per lag without which the later frames' errors are not known.
+_ENOUGH = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +105,7 @@ def filtered(data: Telemetry, whitener: NDArray[np.float64], lags: int, start: i
 
 
 def covariances(data: Filtered, lags: int) -> NDArray[np.float64]:
-    """Covariance of the filtered commands ``l`` rows ago with the pokes ``k`` rows ago, any unit.
+    """Sums of the filtered commands ``l`` rows ago times the pokes ``k`` rows ago.
 
     Returns
     -------
@@ -108,20 +113,17 @@ def covariances(data: Filtered, lags: int) -> NDArray[np.float64]:
         Element ``[., l, k]``. In open loop every mode's pokes have the same spectrum, and one serves
         all; in closed loop the controller gives each mode its own.
     """
-    n = data.now.size
     commands = np.stack([shifted(data.commands, data.now, lag) for lag in range(lags)])
     if not data.closed:
         flat = commands.reshape(lags, -1)
         first = (flat[0] @ flat.T).astype(np.float64)
-        return np.asarray(toeplitz(first)[None] / n)
+        return np.asarray(toeplitz(first)[None])
     pokes = np.stack([shifted(data.pokes, data.now, lag) for lag in range(lags)])
     together = np.einsum("ltm,ktm->mlk", commands, pokes, optimize=True)
-    return np.asarray(together.astype(np.float64) / n)
+    return np.asarray(together.astype(np.float64))
 
 
-def fit_response(
-    data: Telemetry, whitener: NDArray[np.float64], lags: int
-) -> tuple[TemporalResponse, NDArray[np.float64]]:
+def fit_response(data: Telemetry, whitener: NDArray[np.float64], lags: int) -> ResponseEstimate:
     """Share of the final response in each of the frames after a command.
 
     Every slope answers to the same few lags, so the lags are regressed on what a provisional matrix
@@ -141,21 +143,52 @@ def fit_response(
 
     Returns
     -------
-    response : TemporalResponse
-        Standard errors hold for turbulence that moves neighbouring slopes together.
-    covariance : ndarray, ``(lags, lags)``
-        Of its weights; their errors sum to zero.
+    ResponseEstimate
+        Its errors hold for turbulence that moves neighbouring slopes together.
     """
-    weights, covariances = [], []
+    sums = LagSums(lags)
     for part in halves(filtered(data.thinned(SLOPES), whitener, lags), lags):
-        total = part.weights.sum()
-        weights.append(part.weights / total)
-        # Scaled to sum 1, a weight errs with all others: d(w / sum) = (1 - w 1^T) dw / sum.
-        scaled = (np.eye(lags) - weights[-1][:, None]) / total
-        covariances.append(scaled @ part.covariance @ scaled.T)
-    mean = np.mean(weights, axis=0)
-    covariance = np.sum(covariances, axis=0) / 4
-    return TemporalResponse(mean, np.sqrt(np.diag(covariance))), covariance
+        sums.merge(part.sums)
+    return sums.response()
+
+
+def predictions(
+    data: Filtered, matrix: NDArray[np.float32], power: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What a noisy matrix makes of commands and pokes, of all rows ``(n_rows, n_slopes)``, centred.
+
+    Noise makes a matrix longer and tells nothing. With ``c`` the power of its answer to the pokes without
+    its noise and ``v`` that with it, what it makes of the pokes weighs best by ``sqrt(c) / v``, whatever the
+    matrix's own scale. Where each mode's commands have a spectrum of their own, in closed loop, the noisy
+    modes' would count too much in what is predicted, and the lags be mistaken: there each mode is
+    shortened to what its noise leaves of it.
+
+    Parameters
+    ----------
+    data
+        Filtered telemetry.
+    matrix
+        Any matrix that owes nothing to the noise of these frames ``(n_modes, n_slopes)``.
+    power
+        Sum of squares of each mode's column without its noise ``(n_modes,)``.
+
+    Returns
+    -------
+    made, poked : ndarray
+        One and the same in open loop.
+    """
+    noisy = np.square(matrix, dtype=np.float64).sum(axis=1)
+    pushed = np.mean(np.square(data.pokes), axis=0, dtype=np.float64)
+    whole = max(float(pushed @ noisy), float(np.finfo(np.float32).tiny))
+    size = np.sqrt(max(float(pushed @ power) / whole, _LEAST_SIGNAL) / whole)
+    poked = data.pokes @ (matrix * np.float32(size))
+    poked -= poked.mean(axis=0)
+    if not data.closed:
+        return poked, poked
+    left = power / np.maximum(noisy, np.finfo(np.float32).tiny) / (size * whole)
+    made = data.commands @ (matrix * left[:, None]).astype(np.float32)
+    made -= made.mean(axis=0)
+    return made, poked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,19 +201,18 @@ class Half:
         Slopes of the half's rows ``(n, n_slopes)``.
     predicted, instrument
         What the other half's matrix makes of the commands and of the pokes alone, of all rows
-        ``(n_rows, n_slopes)``.
+        ``(n_rows, n_slopes)``, of any scale.
     now
         Where the half's rows stand among all ``(n,)``.
-    weights, covariance
-        Weights of the lags as regressed, not scaled ``(lags,)``, and their covariance.
+    sums
+        Regression of the slopes on what is predicted.
     """
 
     slopes: NDArray[np.float32]
     predicted: NDArray[np.float32]
     instrument: NDArray[np.float32]
     now: NDArray[np.intp]
-    weights: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    sums: LagSums
 
 
 def halves(few: Filtered, lags: int) -> list[Half]:
@@ -190,13 +222,26 @@ def halves(few: Filtered, lags: int) -> list[Half]:
     best = _strongest_lag(slopes, pokes, now, lags)
     middle = now.size // 2
     parts = [slice(0, middle), slice(middle, now.size)]
+    matrices = [
+        _matrix(slopes[part], shifted(commands, now[part], best), shifted(pokes, now[part], best))
+        for part in parts
+    ]
+    # The noise of one half knows nothing of the other's.
+    power = np.einsum("ms,ms->m", *matrices, dtype=np.float64)
     found = []
-    for here, there in (parts, parts[::-1]):
-        matrix = _matrix(slopes[here], shifted(commands, now[here], best), shifted(pokes, now[here], best))
-        predicted = commands @ matrix
-        instrument = pokes @ matrix if few.closed else predicted
-        found.append(_regress(slopes[there], predicted, instrument, now[there], lags))
+    for matrix, part in zip(matrices, parts[::-1], strict=True):
+        made, poked = predictions(few, matrix, power)
+        sums = LagSums(lags).add(slopes[part], lagged(made, now[part], lags), lagged(poked, now[part], lags))
+        # The noise of either half's matrix is also in the other half's slopes: errors of both are shared.
+        signal = float(power.sum() / max(np.square(matrix, dtype=np.float64).sum(), 1e-300))
+        sums.widen(2 - float(np.clip(signal, 0, 1)))
+        found.append(Half(slopes[part], made, poked, now[part], sums))
     return found
+
+
+def lagged(rows: NDArray[np.float32], now: NDArray[np.intp], lags: int) -> NDArray[np.float32]:
+    """``rows[now - lag]`` for every lag ``(n, lags, n_columns)``."""
+    return np.stack([shifted(rows, now, lag) for lag in range(lags)], axis=1)
 
 
 def _strongest_lag(
@@ -216,113 +261,65 @@ def _matrix(
     return np.asarray(np.linalg.solve(link, pokes.T @ slopes))
 
 
-def _regress(
-    y: NDArray[np.float32],
-    predicted: NDArray[np.float32],
-    instrument: NDArray[np.float32],
-    at: NDArray[np.intp],
-    lags: int,
-) -> Half:
-    """Regress slopes on what the matrix makes of the commands, the pokes being the instruments."""
-    x = np.stack([shifted(predicted, at, lag) for lag in range(lags)])
-    z = x if instrument is predicted else np.stack([shifted(instrument, at, lag) for lag in range(lags)])
-    flat = z.reshape(lags, -1)
-    normal = (flat @ x.reshape(lags, -1).T).astype(np.float64)
-    right = (flat @ y.ravel()).astype(np.float64)
-    weights = np.asarray(np.linalg.solve(normal, right), np.float64)
-    error = y - np.tensordot(weights.astype(np.float32), x, axes=1)
-    # One score per frame: neighbouring slopes err together, frames (whitened) do not.
-    scores = np.einsum("lts,ts->lt", z, error).astype(np.float64)
-    bread = np.linalg.inv(normal)
-    covariance = np.asarray(bread @ (scores @ scores.T) @ bread.T, np.float64)
-    return Half(y, predicted, instrument, at, weights, covariance)
-
-
 class ResponseTracker:
     """Keeps estimating the temporal response while a run goes on.
 
-    The matrix of the first frames predicts all later ones, whose noise knows nothing of it.
+    The matrix of all frames so far predicts the next ones, whose noise knows nothing of it.
 
     Parameters
     ----------
-    matrix
-        Matrix of the first frames ``(n_slopes, n_modes)``.
-    first, covariance
-        Response of the first frames and the covariance of its weights.
-    rows
-        Number of rows it came from.
+    first
+        Response of the first frames, through which the commands of the matrix are seen.
     spectra
-        From :func:`covariances`.
+        From :func:`covariances`, of the first frames.
     """
 
-    def __init__(
-        self,
-        matrix: NDArray[np.float64],
-        first: TemporalResponse,
-        covariance: NDArray[np.float64],
-        rows: int,
-        spectra: NDArray[np.float64],
-    ) -> None:
-        self._step = max(1, -(-matrix.shape[0] // SLOPES))
-        self._matrix = np.array(matrix[:: self._step].T, np.float32, order="C")
-        self._first, self._covariance, self.first_rows = first, covariance, rows
-        self._spectra = spectra
-        lags = first.weights.size
-        #: Products of what the pokes say with the slopes, and with what the commands say, by lag; and
-        #: those of commands past with pokes present, which in open loop are the same.
-        self._right, self._normal, self._past, self.rows = np.zeros(lags), np.zeros(lags), np.zeros(lags), 0
+    def __init__(self, first: ResponseEstimate, spectra: NDArray[np.float64]) -> None:
+        self._first, self._spectra = first, spectra
+        #: Of the frames after the first, whose matrices have one scale.
+        self._sums = LagSums(first.weights.size)
 
-    def add(self, data: Filtered) -> None:
-        """Take a block of filtered slopes and commands, with the rows of the lags before it."""
-        z = data.pokes @ self._matrix
-        x = data.commands @ self._matrix if data.closed else z
-        slopes = np.ascontiguousarray(data.slopes[:, :: self._step])
-        present, poked = shifted(x, data.now, 0), shifted(z, data.now, 0)
-        for lag in range(self._right.size):
-            past = shifted(z, data.now, lag)
-            self._right[lag] += np.vdot(slopes, past)
-            self._normal[lag] += np.vdot(present, past)
-            self._past[lag] += np.vdot(shifted(x, data.now, lag), poked) if data.closed else 0.0
-        if not data.closed:
-            self._past[:] = self._normal
-        self.rows += data.now.size
+    def add(self, data: Filtered, matrix: NDArray[np.float64], power: NDArray[np.float64]) -> None:
+        """Take a block of filtered slopes and commands, with the rows of the lags before it.
 
-    def arrays(self) -> dict[str, NDArray[np.floating]]:
+        Parameters
+        ----------
+        data
+            The block.
+        matrix
+            Of the frames before it ``(n_few, n_modes)``, of the slopes that ``RegressionSums.some`` has.
+        power
+            As for :func:`predictions`.
+        """
+        step, lags = few_step(data.n_slopes), self._first.weights.size
+        slopes = data.slopes[:, ::step]
+        made, poked = predictions(data, np.ascontiguousarray(matrix.T, np.float32), power)
+        z = lagged(poked, data.now, lags)
+        x = z if made is poked else lagged(made, data.now, lags)
+        self._sums.add(slopes - slopes.mean(axis=0), x, z)
+        self._spectra += covariances(data, lags)
+
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
         """What it has gathered by name, themselves and no copies: written into, they are restored."""
-        return {
-            "matrix": self._matrix,
-            "spectra": self._spectra,
-            "right": self._right,
-            "normal": self._normal,
-            "past": self._past,
-        }
+        return {"spectra": self._spectra, **self._sums.arrays()}
 
-    def response(self) -> TemporalResponse:
+    def response(self) -> ResponseEstimate:
         """The response of all rows so far."""
-        if self.rows < self.first_rows:
+        if self._sums.count < _ENOUGH * self._first.weights.size:
             return self._first
-        weights = solve_toeplitz((self._normal, self._past), self._right)
-        share = self._share()
-        mean = share * self._first.weights + (1 - share) * weights / weights.sum()
-        return TemporalResponse(mean, self._first.sigma * np.sqrt(share))
+        return self._first.combined(self._sums.response())
 
-    def scale(self) -> NDArray[np.float64]:
-        """Factors on the columns of a matrix whose commands were seen through the first response.
+    def scale(self, response: ResponseEstimate) -> NDArray[np.float64]:
+        """Factors on the columns of a matrix whose commands were seen through the assumed response.
 
         Every slope answers through the same response, so seeing a mode's commands through a slightly
         wrong one only scales its column: by one factor where all modes' pokes have one spectrum.
         """
-        assumed = self._first.weights
-        seen = self._spectra @ assumed
-        return np.asarray((seen @ assumed) / (seen @ self.response().weights))
+        seen = self._spectra @ self._first.weights
+        return np.asarray((seen @ self._first.weights) / (seen @ response.weights))
 
-    def gain_sigma(self) -> float:
+    def gain_sigma(self, response: ResponseEstimate) -> float:
         """Standard error of the factor that the response's errors put on all of a matrix."""
         seen = self._spectra.mean(axis=0) @ self._first.weights
-        variance = float(seen @ self._covariance @ seen) * self._share()
-        return float(np.sqrt(variance)) / abs(float(self.response().weights @ seen))
-
-    def _share(self) -> float:
-        """Share of the rows behind the first response; one as long as nothing else is used."""
-        later = self.rows if self.rows >= self.first_rows else 0
-        return self.first_rows / (self.first_rows + later)
+        variance = max(float(seen @ response.covariance @ seen), 0.0)
+        return float(np.sqrt(variance)) / abs(float(response.weights @ seen))

@@ -148,7 +148,7 @@ def with_and_without_gains(
     known: dict[str, CalibrationResult], result: Comparison
 ) -> Iterator[tuple[str, CalibrationResult]]:
     """Each matrix as it is, and scaled by its optical gains."""
-    from escape_hw.calibration.gain_bootstrap import usable
+    from escape_hw.calibration.gain_smoothing import usable
     from escape_hw.calibration.optical_gain import scaled_matrix
 
     if result.gains is None or result.gains.gains is None:

@@ -107,6 +107,27 @@ def test_gains_of_the_bench_are_those_of_the_frozen_residuals() -> None:
         assert_true(*measured(bench, result, 6000, 40, every=6), every=6)
 
 
+def test_small_pokes_go_on_with_the_response_that_larger_ones_told(
+    bench: System, baseline: CalibrationResult
+) -> None:
+    loop = GainLoop(bench, baseline, {})
+    loop.control.set_gain(bench.config.loop.gain)
+    modes = baseline.matrix.n_modes
+    try:
+        loop.start()
+        large, small = (
+            bench.run(loop.measure(600, np.full(modes, poke), "gains")).gains for poke in (POKE, POKE / 6)
+        )
+    finally:
+        loop.open_again()
+    assert large is not None
+    assert small is not None
+    # By themselves they tell the common scale to 5.6 %.
+    assert small.common_sigma <= large.common_sigma < 0.04
+    values, sigmas = zip(large.mean(), small.mean(), strict=True)
+    assert abs(values[1] - values[0]) < 4 * np.hypot(*sigmas)
+
+
 def gains_of(run: GainsRun) -> OpticalGains:
     assert run.result.gains is not None
     return run.result.gains

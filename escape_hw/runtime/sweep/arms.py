@@ -113,7 +113,7 @@ def read_arms(products: Sequence[MatrixProduct], gains: GainsResult | None, scal
 def _scaled(known: Mapping[str, CalibrationResult], gains: GainsResult) -> dict[str, CalibrationResult]:
     from dataclasses import replace
 
-    from escape_hw.calibration.gain_bootstrap import usable
+    from escape_hw.calibration.gain_smoothing import usable
     from escape_hw.calibration.optical_gain import scaled_matrix
 
     vectors = {METHOD_LABELS.get(gains.method, gains.method): gains.gains, **gains.beside}
