@@ -130,11 +130,16 @@ def everything(
         from escape_hw.io import documents
         from escape_hw.report.index import write_index
         from escape_hw.report.paper_results import write_results
-        from escape_hw.runtime.paper import chosen, finished, require_share, sweep_runs
+        from escape_hw.runtime.paper import asked_for, chosen, finished, require_share, sweep_runs
 
         parts: dict[str, Any] = {}
         swept = sweep_runs(sweeps or [])
-        done = {case.kind: finished(out / case.kind, case.kind) if resume else None for case in chosen(only)}
+        done = {
+            case.kind: finished(out / case.kind, case.kind, asked_for(case.shortened(share), set, seed))
+            if resume
+            else None
+            for case in chosen(only)
+        }
         left = [case for case in chosen(only) if done[case.kind] is None]
         choices = {case.kind: options.Choice.of(case.system, set, seed, None) for case in left}
         require_share(
@@ -215,16 +220,17 @@ def _case(
 
     What the user sets goes after what the case plants in the twin.
     """
-    from escape_hw.runtime.paper import CASES
+    from escape_hw.runtime.paper import CASES, asked_for
 
     case = CASES[kind]
+    asked = asked_for(counts, choice.set, choice.seed)
     choice = replace(choice, set=(*case.overrides, *choice.set))
     config = one.configured(choice)
     with one.run_folder(config, f"reproduce-{kind}", out) as folder:
         with one.bench(choice) as bench:
             from escape_hw.runtime.records import BenchRecord
 
-            record = BenchRecord.of(bench)
+            record = replace(BenchRecord.of(bench), asked=asked)
             result, stop = one.attempt(case.procedure(bench, **counts))
         with one.saving(stop):
             document = case.keep(folder, record, result, one.wall_seconds)

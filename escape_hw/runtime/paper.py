@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -140,7 +140,12 @@ def require_share(cases: Sequence[tuple[PaperCase, SystemConfig]], share: float)
         )
 
 
-def finished(folder: Path, kind: str) -> dict[str, Any] | None:
+def asked_for(counts: Mapping[str, int], overrides: Sequence[str] | None, seed: int | None) -> dict[str, Any]:
+    """What a part is asked for, as its document keeps it."""
+    return {**counts, "set": list(overrides or ()), "seed": seed}
+
+
+def finished(folder: Path, kind: str, asked: Mapping[str, Any]) -> dict[str, Any] | None:
     """The document of a part that ran to its end in this folder; ``None`` when there is none.
 
     Raises
@@ -148,14 +153,24 @@ def finished(folder: Path, kind: str) -> dict[str, Any] | None:
     ProductError
         What lies there is damaged.
     ConfigError
-        It is another run.
+        It is another run, or was asked for something else.
     """
     if not (folder / "result.json").is_file():
         return None
     document = read_result(folder)
     if document.get("command") != f"reproduce {kind}":
         raise ConfigError(f"{folder} holds the run of 'escape {document.get('command')}'; take another --out")
+    kept = document.get("asked", asked)
+    if kept != asked:
+        raise ConfigError(
+            f"{folder} was run with {_told(kept)}; asked for is {_told(asked)}: give the same --share, --set "
+            "and --seed, or another --out"
+        )
     return None if document.get("partial") else {**document, "folder": str(folder)}
+
+
+def _told(asked: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in asked.items() if value not in (None, []))
 
 
 def sweep_runs(folders: Sequence[Path]) -> dict[str, Path]:

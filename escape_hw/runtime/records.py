@@ -19,7 +19,8 @@ from escape_hw.io.provenance import Provenance, git_state, software_version, utc
 class BenchRecord:
     """Identity of an opened bench, kept after it is closed.
 
-    ``planted`` is the registration hidden in a twin: for reports only, no estimator may see it.
+    ``planted`` is the registration hidden in a twin: for reports only, no estimator may see it. ``asked``
+    is what a run that can be gone on with was asked for.
     """
 
     system: str
@@ -33,6 +34,7 @@ class BenchRecord:
     psf_px: float | None
     planted: Registration | None
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
+    asked: Mapping[str, Any] | None = None
 
     @classmethod
     def of(cls, bench: Bench) -> BenchRecord:
@@ -67,6 +69,7 @@ class BenchRecord:
             "software": software_version(),
             "git": git_state(),
             "started_utc": utc_text(self.started),
+            **({} if self.asked is None else {"asked": dict(self.asked)}),
             "planted": None if self.planted is None else self.planted.to_dict(),
             "bench": {
                 "layout": list(self.layout),

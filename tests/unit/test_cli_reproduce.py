@@ -126,6 +126,11 @@ def test_reproduce_all_goes_on_where_it_was(document, bench, tmp_path):
     assert list(found["parts"]) == ["table1", "maps"]
     assert found["parts"]["maps"]["finished_utc"] == first["finished_utc"]
     assert 'href="maps/report.html"' in (tmp_path / "all" / "index.html").read_text()
+    # What was asked for otherwise is not taken for it.
+    for other in (("--share", 0.2), ("--seed", 5), ("--set", "loop.gain=0.2")):
+        code, refused, _ = document(*words, "--only", "maps", "--resume", *other)
+        assert code == 2
+        assert "was run with" in refused["error"]["message"]
 
 
 @pytest.mark.usefixtures("reports")
