@@ -33,7 +33,7 @@ _TIPS = {
 
 
 #: What stands here while no server was heard of, and in a recording.
-NOBODY = "There is no loop to close here: no server has answered.\nStart one with 'escape serve SYSTEM'."
+NOBODY = "There is no loop to close here: only a server has one.\nStart it with 'escape serve SYSTEM'."
 
 
 class LoopPanel(Panel):

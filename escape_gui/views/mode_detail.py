@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from escape_gui.views.mode_mosaic import LIMIT
 from escape_hw.api.matrix import InteractionMatrix, snr_of
 
-#: Ends that the scales of signal-to-noise ratios and of differences may take.
-_SNR_LIMITS = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+#: Ends that the scale of differences may take.
 _LIMITS = (0.1, 0.25, 0.5, 1.0, LIMIT)
 
 
@@ -117,7 +116,7 @@ def _errors(label: str, matrix: InteractionMatrix, mode: int) -> list[Tile]:
     column, sigma = matrix.data[:, mode].astype(float), matrix.sigma[:, mode].astype(float)
     rms = _rms(column) or 1.0
     relative = sigma / rms
-    top = float(np.nanmax(relative[np.isfinite(relative)], initial=0.0)) or 1.0
+    top = float(np.nanmax(relative[np.isfinite(relative)], initial=0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.abs(column) / sigma
     middle = float(np.nanmedian(ratio))
@@ -126,14 +125,14 @@ def _errors(label: str, matrix: InteractionMatrix, mode: int) -> list[Tile]:
             f"Error of {label}",
             f"1 σ, rms {_rms(sigma) / rms:.2g}",
             pair(matrix.valid, relative),
-            (0.0, top),
+            (0.0, _round_up(top)),
             False,
         ),
         Tile(
             f"SNR of {label}",
             f"median {middle:.3g}",
             pair(matrix.valid, ratio),
-            (0.0, _enough(2 * middle, _SNR_LIMITS)),
+            (0.0, _round_up(2 * middle)),
             False,
         ),
     ]
@@ -142,6 +141,14 @@ def _errors(label: str, matrix: InteractionMatrix, mode: int) -> list[Tile]:
 def _enough(wanted: float, limits: tuple[float, ...]) -> float:
     """The least of the limits that is not below what is wanted, or the last."""
     return next((one for one in limits if one >= wanted), limits[-1])
+
+
+def _round_up(value: float) -> float:
+    """The next of 1, 2, 5, 10, ...; the end of a scale that stays put while numbers move a little."""
+    if not 0 < value < np.inf:
+        return 1.0
+    decade = 10.0 ** np.floor(np.log10(value))
+    return float(next(step for step in (1, 2, 5, 10) if step * decade >= value * (1 - 1e-9)) * decade)
 
 
 def _rms(values: NDArray[np.float64]) -> float:

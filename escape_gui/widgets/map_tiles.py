@@ -20,7 +20,7 @@ _LINE = 14
 
 
 def best_columns(count: int, width: float, height: float, title: float) -> int:
-    """Columns that make pictures twice as wide as high, below titles, largest; at least two.
+    """Columns that make pictures twice as wide as high, below titles, largest.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def best_columns(count: int, width: float, height: float, title: float) -> int:
         rows = -(-max(count, 1) // columns)
         return min(width / columns / 2, height / rows - title)
 
-    return max(range(2, max(count, 2) + 1), key=size)
+    return max(range(1, max(count, 1) + 1), key=size)
 
 
 class MapPicture(QWidget):
@@ -139,7 +139,7 @@ class MapTiles(QWidget):
 
     def _title(self, tile: Tile) -> str:
         low, high = tile.limits
-        scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:.4g}"
+        scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:g}"
         muted = self._theme.colours.muted
         return f"<b>{tile.title}</b><br><span style='color:{muted}'>{tile.note}<br>colours {scale}</span>"
 

@@ -154,8 +154,8 @@ class SubApertureGrid(SensorGeometry):
     background
         Level of the dark pixels in counts that was subtracted when no dark frame was at hand.
     air_px
-        The part of that motion that lasts from frame to frame, which is the turbulence's and not the
-        pokes'; rms along an axis in pixels, 0 if unknown.
+        The part of ``motion_px`` that lasts from frame to frame in open loop, which is the turbulence's and
+        not the pokes'; rms along an axis in pixels, 0 if unknown.
     """
 
     kind: ClassVar[str] = "shack-hartmann"

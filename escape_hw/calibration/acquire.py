@@ -125,14 +125,14 @@ class Motion:
         self._blocks = [row.copy() for row in state[7:]]
         self._past.clear()
 
-    def of(self, grid: SensorGeometry) -> SensorGeometry:
-        """The geometry with the motion filled in."""
+    def of(self, grid: SensorGeometry, *, closed: bool = False) -> SensorGeometry:
+        """The geometry with the motion filled in; in closed loop what lasts of it is not the air's."""
         if self._n < 2:
             return grid
         variance = float(np.maximum(self._squares / self._n - np.square(self._sum / self._n), 0).mean())
         pokes, steady = float(np.sqrt(self._pokes / self._n)), self._steady(variance)
         looks = self._looks(variance, steady if pokes else 1.0)
-        return grid.with_motion(float(np.sqrt(variance)), pokes, looks, steady)
+        return grid.with_motion(float(np.sqrt(variance)), pokes, looks, 0.0 if closed else steady)
 
     def _steady(self, variance: float) -> float:
         """Correlation of the slopes with those :data:`_LATER` frames later, between 0 and 1."""

@@ -204,6 +204,25 @@ def steady(residual: NDArray[np.float32]) -> bool:
     return bool(np.isfinite(residual).all() and last < 2.0 * middle)
 
 
+def settled_residual(record: LoopRecord, rate_hz: float) -> NDArray[np.float32]:
+    """Residuals ``(n,)`` in nanometres since the loop has been closed for :data:`CLOSING_S`."""
+    return np.array(record.residual[int(CLOSING_S * rate_hz) :], np.float32)
+
+
+def loop_notes(record: LoopRecord, rate_hz: float) -> list[str]:
+    """What to know of a loop that was poked, for whoever uses what the pokes told."""
+    notes = []
+    if not steady(settled_residual(record, rate_hz)):
+        notes.append("the loop's residual grew to the end; was it about to diverge? Lower loop.gain")
+    shortened = record.shortened / max(record.frames, 1)
+    if shortened > 0.01:
+        notes.append(
+            f"the mirror's limits shortened {shortened:.0%} of the commands, pokes with them; they are "
+            "accounted for, and cost signal: lower the pokes, or the turbulence is more than the mirror takes"
+        )
+    return notes
+
+
 def percentiles(latency_ns: Sequence[int]) -> dict[str, float]:
     """Median, 99th percentile and largest of the latencies, in microseconds."""
     if not latency_ns:

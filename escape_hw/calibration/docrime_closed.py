@@ -17,7 +17,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import next_frame, some_frames
 from escape_hw.calibration.background import BackgroundEstimator
 from escape_hw.calibration.checkpoint import Checkpoint, fingerprint
-from escape_hw.calibration.closed_loop import integrator_for, steady
+from escape_hw.calibration.closed_loop import integrator_for, loop_notes, settled_residual
 from escape_hw.calibration.docrime import (
     MOST_CORRELATED,
     DocrimeRun,
@@ -83,7 +83,7 @@ class ClosedLoopPokes:
     @property
     def grid(self) -> SensorGeometry:
         """The geometry with the motion of the closed loop, which a model of the sensor has to match."""
-        return self._beside.motion.of(self._grid)
+        return self._beside.motion.of(self._grid, closed=True)
 
     def restore(self, state: RunState) -> None:
         """Go on from what a run that was broken off has kept."""
@@ -199,7 +199,7 @@ def docrime_closed_run(
         if partial:
             raise Aborted(f"aborted after {estimator.taken} frames, too few for a matrix") from None
         raise
-    residual = np.array(loop.record.residual)[int(CLOSING_S * bench.wfs.settings.frame_rate_hz) :]
+    residual = settled_residual(loop.record, bench.wfs.settings.frame_rate_hz)
     matrix = matrix_of(
         bench, grid, m2c, solution, method, poke=float(poke), shortened=loop.record.shortened,
         skipped=loop.skipped, loop_gain=bench.config.loop.gain,
@@ -208,7 +208,7 @@ def docrime_closed_run(
     seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
     result = CalibrationResult(
         matrix, loop.grid, solution.frames, solution.lost_frames, seconds, solution.response,
-        partial=partial, notes=(*notes_on(solution, matrix), *_loop_notes(loop, residual)),
+        partial=partial, notes=(*notes_on(solution, matrix), *_loop_notes(bench, loop)),
     )  # fmt: skip
     return DocrimeRun(result, solution)
 
@@ -265,17 +265,9 @@ def _method(pattern: type[Pattern]) -> str:
     return f"{pattern.method}-closed"
 
 
-def _loop_notes(loop: ClosedLoopPokes, residual: NDArray[np.float32]) -> list[str]:
+def _loop_notes(bench: Bench, loop: ClosedLoopPokes) -> list[str]:
     """What to know of the loop that a matrix was measured in."""
-    notes = []
-    if not steady(residual):
-        notes.append("the loop's residual grew to the end; was it about to diverge? Lower loop.gain")
-    shortened = loop.record.shortened / max(loop.record.frames, 1)
-    if shortened > 0.01:
-        notes.append(
-            f"the mirror's limits shortened {shortened:.0%} of the commands, pokes with them; they are "
-            "accounted for, and cost signal: lower the pokes, or the turbulence is more than the mirror takes"
-        )
+    notes = loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)
     if loop.skipped:
         notes.append(f"{loop.skipped} frames were lost to the estimate: its sums were behind the loop")
     return notes

@@ -8,7 +8,7 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import Motion, next_frame
-from escape_hw.calibration.closed_loop import integrator_for
+from escape_hw.calibration.closed_loop import integrator_for, loop_notes
 from escape_hw.calibration.escape_few import few_frames_result, order_for
 from escape_hw.calibration.loop_run import CLOSING_S, RunningLoop, require_undiverged
 from escape_hw.calibration.loop_tape import LoopTape
@@ -60,7 +60,7 @@ def escape_closed_from_few(
     tape = LoopTape(closing.grid.n_slopes, closing.matrix.n_modes, past + frames, past)
     motion = Motion(closing.grid.n_slopes)
     yield from _recorded(loop, frames, poke, past, tape, motion)
-    found, data = motion.of(closing.grid), _whole(tape, c.whiten_order + c.lags)
+    found, data = motion.of(closing.grid, closed=True), _whole(tape, c.whiten_order + c.lags)
     registration = closing.registration
     fit = yield from telemetry_sprint(
         data, closing.matrix, bench.model(found), order=order, lags=c.lags, known=closing.response,
@@ -72,7 +72,8 @@ def escape_closed_from_few(
         bench, fit, found, closing.matrix.m2c, frames=frames, lost=tape.lost, poke=float(poke), order=order,
         shortened=loop.record.shortened,
     )  # fmt: skip
-    return replace(result, grid=found)
+    notes = loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)
+    return replace(result, grid=found, notes=(*result.notes, *notes))
 
 
 def _recorded(
@@ -90,7 +91,7 @@ def _recorded(
     try:
         yield from loop.run(closing, report=Reporter("closing the loop", closing))
         yield from loop.run(past, observe=(tape,), report=Reporter("closing the loop", past))
-        watch = (tape, lambda _index, slopes, _command, sent: motion.add(slopes, sent))
+        watch = (tape, lambda _index, slopes, _command, _poke: motion.add(slopes))
         yield from loop.run(frames, inject=pokes, observe=watch, report=Reporter(stage, frames))
     except Aborted:
         raise Aborted(

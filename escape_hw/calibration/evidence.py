@@ -49,8 +49,8 @@ def believed(
         Posterior mean, and standard error.
     """
     data = (information - np.diag(precision)) / noise**2
-    # At the solution the data pull as hard as the priors do.
-    pull = data @ value + precision * value / noise**2
+    # At the solution data and priors are in balance.
+    pull = information @ value / noise**2
     prior = precision.copy()
     for _ in range(_ROUNDS):
         covariance = np.linalg.inv(data + np.diag(prior))

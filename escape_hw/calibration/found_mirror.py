@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.departures import PEDESTAL, MirrorDepartures
+from escape_hw.api.departures import PEDESTAL
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate
 from escape_hw.calibration.derivatives import modal_jacobian, modal_matrix
+from escape_hw.calibration.extra_unknowns import extra_unknowns, family_of
 
 
 def found_matrix(
@@ -26,15 +27,13 @@ def found_matrix(
     here
         Where the mirror sits.
     estimate
-        What SPRINT found of it; without departures, the drawing's mirror at the estimated width.
+        What SPRINT found of it, extra unknowns included; without departures, the drawing's mirror at the
+        estimated width.
     m2c
         Modes ``(n_act, n_modes)``.
     """
-    apart, width = estimate.departures, estimate.width.value
-    if apart is None:
-        return modal_matrix(model, here, m2c, width)
-    acted = (1 + apart.gain)[:, None] * m2c
-    return modal_matrix(model, here, acted, width) + _reshaped(model, here, apart, acted, width)
+    acted = _acted(estimate, m2c)
+    return _whole(modal_matrix(model, here, acted, estimate.width.value), model, here, estimate, acted)
 
 
 def found_jacobian(
@@ -56,23 +55,34 @@ def found_jacobian(
         Of the matrix, from the errors of the actuators' gains; 0 without departures.
     """
     here, apart, width = estimate.registration, estimate.departures, estimate.width.value
-    if apart is None:
-        unit, derivatives = modal_jacobian(model, here, m2c, width)
-        return unit, derivatives, np.zeros_like(unit)
-    acted = (1 + apart.gain)[:, None] * m2c
+    acted = _acted(estimate, m2c)
     unit, derivatives = modal_jacobian(model, here, acted, width)
-    open_to = np.square(model.zonal_matrix(here, width)) @ np.square(apart.gain_sigma[:, None] * m2c)
-    return unit + _reshaped(model, here, apart, acted, width), derivatives, open_to
+    open_to = np.zeros_like(unit)
+    if apart is not None:
+        open_to = np.square(model.zonal_matrix(here, width)) @ np.square(apart.gain_sigma[:, None] * m2c)
+    return _whole(unit, model, here, estimate, acted), derivatives, open_to
 
 
-def _reshaped(
+def _acted(estimate: RegistrationEstimate, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Modes as actuators of unequal gains make them ``(n_act, n_modes)``."""
+    apart = estimate.departures
+    return m2c if apart is None else (1 + apart.gain)[:, None] * m2c
+
+
+def _whole(
+    unit: NDArray[np.float64],
     model: SyntheticModel,
     here: Registration,
-    apart: MirrorDepartures,
+    estimate: RegistrationEstimate,
     acted: NDArray[np.float64],
-    width: float,
 ) -> NDArray[np.float64]:
-    """What unequal widths and the pedestal add to modes' slopes, to first order."""
+    """A matrix with what extra unknowns add to it, and unequal widths and the pedestal to first order."""
+    apart, width = estimate.departures, estimate.width.value
+    for one in extra_unknowns(model, tuple(dict.fromkeys(map(family_of, estimate.extras)))):
+        share = estimate.extras[one.name].value / one.scatter
+        unit = unit + share * (one.per_share(here, width, share) @ acted)
+    if apart is None:
+        return unit
     unequal = modal_jacobian(model, here, apart.width[:, None] * acted, width)[1][5] * width
     broad = modal_matrix(model, here, acted, width * PEDESTAL) - modal_matrix(model, here, acted, width)
-    return np.asarray(unequal + apart.pedestal * broad)
+    return np.asarray(unit + unequal + apart.pedestal * broad)

@@ -175,13 +175,7 @@ class Problem:
         m2c
             Modes ``(n_act, n)``.
         """
-        zonal = self._shapes(state)
-        acted = (1 + state.actuator_gain)[:, None] * m2c
-        half = len(zonal.shaped) // 2
-        sampled = np.concatenate([zonal.moved[0, :half], zonal.moved[1, half:]])
-        whole = zonal.shaped + state.sampling[self.lines, None] * sampled
-        scale = state.gain * (1 + state.slope_gain) * self.weighted.by_slope
-        return np.asarray(scale[:, None] * (whole @ acted))
+        return self.zonal(state) @ m2c
 
     def linearise(self, state: State) -> NormalEquations:
         """Model and derivatives about a state."""
@@ -214,17 +208,12 @@ class Problem:
 
     def zonal(self, state: State) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)`` at a state, random effects included."""
-        here, w = Registration.from_array(state.alpha), 1.0 + state.width
-        zonal, moved = zonal_jacobian(self.model, here, w)
-        shaped = zonal + state.actuator_width * moved[5] * w
-        shaped += state.shape * (self.model.zonal_matrix(here, w * PEDESTAL) - zonal)
-        changes = [variant.zonal_matrix(here, w) - zonal for variant in self.variants]
-        changes += self._changes(state)
-        for share, change in zip(state.variant, changes, strict=True):
-            shaped += share * change
-        half = len(zonal) // 2
-        shaped += state.sampling[self.lines, None] * np.concatenate([moved[0, :half], moved[1, half:]])
-        return np.asarray(state.gain * (1 + state.slope_gain)[:, None] * shaped * (1 + state.actuator_gain))
+        z = self._shapes(state)
+        half = len(z.shaped) // 2
+        sampled = np.concatenate([z.moved[0, :half], z.moved[1, half:]])
+        whole = z.shaped + state.sampling[self.lines, None] * sampled
+        scale = state.gain * (1 + state.slope_gain) * self.weighted.by_slope
+        return np.asarray(scale[:, None] * whole * (1 + state.actuator_gain))
 
     def learned(self, state: State, system: NormalEquations) -> Learned:
         """What a solution says about the scatter of the random effects.

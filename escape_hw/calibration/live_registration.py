@@ -98,8 +98,8 @@ class LiveRegistration:
         The synthetic model on the same sub-apertures.
     start
         Registration to start from, within SPRINT's linear reach. Its width of the influence functions,
-        which small pokes hardly show, is taken over with its error, and what it says of single actuators is
-        what a matrix at the live registration will have.
+        which small pokes hardly show, is taken over with its error, and what it says of single actuators
+        and beside the registration is what a matrix at the live registration will have.
     order, lags
         Of the whitening filter and the temporal response, in frames.
     memory
@@ -128,8 +128,8 @@ class LiveRegistration:
         self._frame, self._model, self._start = frame, model, start.registration
         scatter = min(Priors().width, max(start.width.sigma, _WIDTH_SIGMA))
         self._priors = Priors(width=scatter, mean_width=start.width.value - 1)
-        # Small pokes tell little of single actuators: what the calibration found of them stays.
-        self._mirror = start.departures
+        # Small pokes tell little of single actuators or of a shear: what the calibration found of them stays.
+        self._mirror, self._extras = start.departures, start.extras
         self._order, self._lags, self._response = order, lags, response
         self._basis = curve_basis(frame.n_modes, curved)
         self._bends = bends_of(frame.m2c, self._basis)
@@ -267,6 +267,7 @@ class LiveRegistration:
             (),
             float(np.mean(np.square(system.residual))),
             departures=self._mirror,
+            extras=self._extras,
         )
         unit = found_matrix(self._model, self._start, estimate, self._frame.m2c)
         gains = np.asarray((self._now * unit).sum(axis=0) / np.square(unit).sum(axis=0))

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.model import SyntheticModel
+from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquire import measured_matrix
 from escape_hw.calibration.derivatives import modal_matrix
-from escape_hw.calibration.extra_unknowns import extra_unknowns, family_of
 from escape_hw.calibration.found_mirror import found_jacobian
 
 
@@ -38,13 +38,8 @@ def pseudo_synthetic(
     matrix, sigma : ndarray, ``(n_slopes, n_modes)``
         The errors are those of registration, gain and the actuators' gains, propagated to first order.
     """
-    gain, width = estimate.gain.value, estimate.width.value
+    gain = estimate.gain.value
     unit, derivatives, unequal = found_jacobian(model, estimate, m2c)
-    apart = estimate.departures
-    acted = m2c if apart is None else (1 + apart.gain)[:, None] * m2c
-    for one in extra_unknowns(model, tuple(dict.fromkeys(map(family_of, estimate.extras)))):
-        share = estimate.extras[one.name].value / one.scatter
-        unit += share * (one.per_share(estimate.registration, width, share) @ acted)
     jacobian = gain * derivatives[:5]
     variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
     variance += np.square(unit * estimate.gain.sigma) + gain**2 * unequal
@@ -95,9 +90,11 @@ def synthetic_of(
 
 
 def at_rest(bench: Bench, calibration: CalibrationResult) -> InteractionMatrix | None:
-    """The pseudo-synthetic matrix for light that hardly moves, as a closed loop leaves it; nothing moves.
+    """A pyramid's pseudo-synthetic matrix for light that hardly moves, as a closed loop leaves it.
 
     Under the turbulence of the open loop, where its matrix was fitted, a pyramid's answer has another shape.
+    Lenslets answer alike, and their model is the better for the motion, which averages over the pixels.
+    Nothing moves.
 
     Parameters
     ----------
@@ -109,12 +106,12 @@ def at_rest(bench: Bench, calibration: CalibrationResult) -> InteractionMatrix |
     Returns
     -------
     InteractionMatrix or None
-        Of the same modes; ``None`` for a matrix that is not pseudo-synthetic.
+        Of the same modes; ``None`` for a matrix that is not pseudo-synthetic, or not a pyramid's.
     """
-    if calibration.registration is None or calibration.matrix.method != "escape":
+    estimate, pupils = calibration.registration, calibration.grid
+    if estimate is None or calibration.matrix.method != "escape" or not isinstance(pupils, PyramidPupils):
         return None
-    model = bench.model(calibration.grid.with_motion(0.0))
-    return synthetic_of(calibration, model, calibration.registration).matrix
+    return synthetic_of(calibration, bench.model(pupils.with_motion(0.0)), estimate).matrix
 
 
 def simulated(bench: Bench, grid: SensorGeometry, m2c: NDArray[np.float64]) -> CalibrationResult:

@@ -79,9 +79,9 @@ class Solution:
     """Where a descent ended, alike for every solver.
 
     ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``, ``learned`` what the data say about the
-    scatter of the random effects, and ``departures`` those of the mirror, where there are any; ``scatter`` is
-    what is to be added to the covariance of the registration ``(5, 5)``; ``extras`` is what was fitted beside
-    it.
+    scatter of the random effects, and ``departures`` those of the mirror, where there are any; each is
+    worked out when asked for. ``scatter`` is what is to be added to the covariance of the registration
+    ``(5, 5)``; ``extras`` is what was fitted beside it.
     """
 
     system: Linearised
@@ -93,7 +93,7 @@ class Solution:
     scatter: NDArray[np.float64] | None = None
     learned: Callable[[], Learned] | None = None
     extras: tuple[FoundExtra, ...] = ()
-    departures: MirrorDepartures | None = None
+    departures: Callable[[], MirrorDepartures] | None = None
 
 
 def solve(
@@ -183,8 +183,7 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
     return Solution(
         system, state.alpha, state.gain, 1 + state.width, settled,
         lambda: problem.zonal(state), learned=lambda: problem.learned(state, system),
-        extras=problem.extras_found(state),
-        departures=problem.departures(state, system),
+        extras=problem.extras_found(state), departures=lambda: problem.departures(state, system),
     )  # fmt: skip
 
 

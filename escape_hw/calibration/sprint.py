@@ -184,8 +184,8 @@ def fit_steps(
             weighted = whole.trusting(shares)
             found = yield from solve(descent, weighted, found.alpha, False)
         estimate = _estimate(descent, weighted, found, covariance)
-    if actuators == "alike":
-        estimate = replace(estimate, departures=None)
+        if actuators == "found" and found.departures is not None:
+            estimate = replace(estimate, departures=found.departures())
     yield descent.progress(estimate.sigma)
     return SprintFit(estimate, found.zonal, found.learned)
 
@@ -317,6 +317,5 @@ def _estimate(
         float(np.mean(np.square(residual))),
         tuple(warnings),
         notes,
-        found.departures,
-        {one.unknown.name: one.measured(sigma, np.hypot(FLOOR, doubt)) for one in found.extras},
+        extras={one.unknown.name: one.measured(sigma, np.hypot(FLOOR, doubt)) for one in found.extras},
     )

@@ -172,7 +172,8 @@ def telemetry_sprint(
     filters = [np.ones(1), np.array([1.0, -1.0])][: 2 if order else 1]
     matrix = frame.data.astype(np.float64) if data.closed else None
     priors, decided = Priors(), 0.0
-    for _ in range(_CLOSED_ROUNDS if data.closed else _ROUNDS):
+    rounds = _CLOSED_ROUNDS if data.closed else _ROUNDS
+    for number in range(rounds):
         frames = _Whitened.of(data, filters, lags)
         n = len(frames.slopes)
         if n < MIN_ROWS:
@@ -189,7 +190,9 @@ def telemetry_sprint(
         fit = yield from fit_steps(
             frames.columns(frame, response.weights, matrix, variance), model,
             solver=solver, loss=loss, start=start, learning_rate=learning_rate,
-            covariance=covariance, priors=priors, reach=start is None, also=also, actuators=actuators,
+            covariance=covariance, priors=priors, reach=start is None, also=also,
+            # Single actuators are looked for once, in the end.
+            actuators=actuators if number == rounds - 1 else "alike",
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal() @ frame.m2c

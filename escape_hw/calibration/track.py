@@ -34,6 +34,7 @@ from escape_hw.calibration.loop_tape import LoopTape
 from escape_hw.calibration.pseudo_synthetic import synthesise
 from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepare_sensor
 from escape_hw.calibration.sprint import sprint
+from escape_hw.calibration.sprint_settings import as_configured
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.track_proposal import InUse, Proposal, inverted, propose, taken
 from escape_hw.calibration.track_watch import RunawayWatch, TrackWatch
@@ -155,9 +156,7 @@ class _Tracker:
         c, t = bench.config.calibration, bench.config.tracking
         self.bench, self.grid, self.exchange, self.psf = bench, grid, exchange, model_psf
         self.control = integrator_for(bench, matrix, grid, gain=gain)
-        start = registration or sprint(
-            matrix, bench.model(grid), learning_rate=c.learning_rate, actuators=c.actuators
-        )
+        start = registration or sprint(matrix, bench.model(grid), **as_configured(c))
         if not start.converged:
             raise CalibrationError(f"no registration to begin with: {'; '.join(start.warnings)}")
         self.amplitude = poke_amplitudes(bench, matrix.m2c, poke)
@@ -182,7 +181,7 @@ class _Tracker:
         """
         bench, matrix, start = self.bench, self.used.matrix, self.used.registration
         c = bench.config.calibration
-        self.grid = motion.of(self.grid)
+        self.grid = motion.of(self.grid, closed=True)
         self.model = bench.model(self.grid)
         self.live = LiveRegistration(
             matrix, self.model, start, order=c.whiten_order, lags=c.lags,

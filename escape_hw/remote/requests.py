@@ -225,4 +225,4 @@ REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)
 #: Requests that need the lease.
 WRITING = (Start, Pause, Resume, CloseLoop, SetLoop, LoadProduct, Record, ClearFault, Shutdown)
 #: Those after which the state is another one.
-CHANGING = (*WRITING[:-1], Acquire, Release, OpenLoop, Flatten, Abort)
+CHANGING = (*(kind for kind in WRITING if kind is not Shutdown), Acquire, Release, OpenLoop, Flatten, Abort)

@@ -41,7 +41,7 @@ TIMEOUT_S, SLOW_S = 3.0, 30.0
 _STALE_S = 2.0
 _LINES = 5000
 #: Longest wait for the event that belongs to an answer, seconds.
-_EVENT_S = 1.0
+_EVENT_S = 10.0
 
 
 class Viewer:

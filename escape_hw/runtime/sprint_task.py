@@ -11,6 +11,7 @@ from escape_hw.runtime.matrix_task import MatrixTask
 from escape_hw.runtime.task import Kept, given
 
 if TYPE_CHECKING:
+    from escape_hw.api.model import SyntheticModel
     from escape_hw.api.results import CalibrationResult
     from escape_hw.bench import Bench
     from escape_hw.config.models import SystemConfig
@@ -34,6 +35,7 @@ class SprintTask(MatrixTask):
 
     def __init__(self, im: Path, settings: dict[str, object] | None = None) -> None:
         super().__init__(im)
+        self._model: SyntheticModel | None = None
         self.overrides = given({f"calibration.{key}": value for key, value in (settings or {}).items()})
 
     def _read(self, config: SystemConfig, simulated: bool) -> MatrixProduct:
@@ -55,18 +57,25 @@ class SprintTask(MatrixTask):
         """Find the registration; the result's matrix is the measured one."""
         from escape_hw.calibration.sprint import sprint_steps
         from escape_hw.calibration.sprint_settings import as_configured
-        from escape_hw.config.registry import model_factory
 
         settings, product = self.config.calibration, self.product
         measured = product.result.measured or product.matrix
         yield Reporter("synthetic model", 1, "model")(0)
         estimate = yield from sprint_steps(
             measured,
-            model_factory(settings.model)(self.config, product.grid),
+            self._synthetic(),
             modes=min(settings.sprint_modes, measured.n_modes),
             **as_configured(settings),
         )
         return replace(product.result, matrix=measured, measured=None, registration=estimate)
+
+    def _synthetic(self) -> SyntheticModel:
+        """The model that is inverted; a pyramid's takes seconds to make."""
+        from escape_hw.config.registry import model_factory
+
+        if self._model is None:
+            self._model = model_factory(self.config.calibration.model)(self.config, self.product.grid)
+        return self._model
 
     def keep(
         self, folder: RunFolder, record: BenchRecord, result: CalibrationResult, wall_seconds: float
@@ -83,7 +92,6 @@ class SprintTask(MatrixTask):
             They cannot be written.
         """
         from escape_hw.calibration.pseudo_synthetic import synthetic_of
-        from escape_hw.config.registry import model_factory
         from escape_hw.io import documents
         from escape_hw.io.fits import save_matrix
         from escape_hw.io.provenance import utc_text
@@ -96,8 +104,7 @@ class SprintTask(MatrixTask):
             raise RuntimeError("a fit without a registration")
         origin = replace(config_record(self.config), parents={name: self.product.sha256})
         folder.add("im", save_matrix(folder.file("im.fits"), result, origin))
-        model = model_factory(self.config.calibration.model)(self.config, self.product.grid)
-        synthetic = synthetic_of(result, model, estimate)
+        synthetic = synthetic_of(result, self._synthetic(), estimate)
         folder.add("escape", save_matrix(folder.file("escape.fits"), synthetic, origin))
         document = finish(
             folder,

@@ -206,7 +206,7 @@ class Desk:
         engine = self._engine
         with engine.board.lock:
             engine.board.require_idle()
-            jobs.close_loop(engine, request, lambda: self._reply(number))
+            jobs.close_loop(engine, request, lambda error: self._reply(number, error=error))
         return LATER
 
     def _set_loop(self, request: ask.SetLoop, number: int) -> object:

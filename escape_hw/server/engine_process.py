@@ -84,9 +84,16 @@ class EngineProcess:
         return guardian
 
     def replace_guardian(self) -> None:
-        """Have another guardian at the same pipe: the one before was killed, and the engine goes on."""
+        """Have another guardian at the same pipe: the one before was killed, and the engine goes on.
+
+        Where none can be started now, one is at the next call.
+        """
         log.error("the guardian (process %d) died; another one takes its place", self._guardian.pid)
-        self._guardian = self._guard()
+        try:
+            self._guardian = self._guard()
+        except OSError as error:
+            # Whatever killed the guardian, such as want of memory, must not end the server, too.
+            log.error("no guardian could be started, which is tried again: %s", error)
 
     @property
     def pid(self) -> int:

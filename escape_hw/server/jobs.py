@@ -44,9 +44,9 @@ def configured(engine: Engine, task: Task[Any]) -> SystemConfig:
 
 
 def loop_to_return_to(engine: Engine) -> LoopChoice | None:
-    """The closed loop as it is, for whoever closes one of his own meanwhile; ``None``: it is open."""
+    """The closed loop, for whoever closes one of his own meanwhile; ``None``: it is open, or being opened."""
     board = engine.board
-    if board.orders is None or board.fault is not None or board.running is not None:
+    if board.orders is None or board.stop.is_set() or board.fault is not None or board.running is not None:
         return None
     return board.loop
 
@@ -70,8 +70,6 @@ def do_task(engine: Engine, task: Task[Any], config: SystemConfig, before: LoopC
         raise RuntimeError("a task begins that was not announced")
     log.info("run %d: %s %s", running.id, running.name, _words(running.arguments))
     usual, bench.config = bench.config, config
-    # A procedure finds the camera as the command line hands it over.
-    bench.wfs.stop()
     engine.publisher.forget_residual()
     board.closed = board.needs_loop
     try:
@@ -128,6 +126,8 @@ def _measured(engine: Engine, task: Task[Any], folder: RunFolder) -> tuple[Kept,
     """Run the procedure and keep what it measured, a partial result as well."""
     if engine.board.fault is not None:
         raise Aborted(f"nothing was begun: {engine.board.fault.reason}")
+    # A procedure finds the camera as the command line hands it over.
+    engine.bench.wfs.stop()
     began, stop = time.monotonic(), None
     record = BenchRecord.of(engine.bench)
     try:
@@ -171,7 +171,10 @@ def _shelve(engine: Engine, ended: Ended) -> None:
     for key, path in ended.products.items():
         if key in _SHELVED:
             name = f"{ended.name}-{ended.id}" + ("" if key == main else f"-{key}")
-            engine.shelf.put(Path(path), name)
+            try:
+                engine.shelf.put(Path(path), name)
+            except EscapeError as error:
+                log.error("%s of run %d is not offered: %s", key, ended.id, error)
 
 
 def _words(arguments: dict[str, Any]) -> str:
@@ -187,8 +190,13 @@ def _return_to(engine: Engine, ended: Ended, before: LoopChoice | None) -> None:
         log.warning("the loop, closed before run %d, stays open", ended.id)
         return
     try:
-        close_loop(engine, before)
+        close_loop(engine, before, lambda error: _say_open(ended, error))
     except EscapeError as error:
+        _say_open(ended, error)
+
+
+def _say_open(ended: Ended, error: EscapeError | None) -> None:
+    if error is not None:
         log.error("the loop, closed before run %d, stays open: %s", ended.id, error)
 
 
@@ -207,9 +215,11 @@ def fitting(engine: Engine, name: str) -> MatrixProduct:
 
 
 def close_loop(
-    engine: Engine, request: CloseLoop | LoopChoice, closed: Callable[[], object] = lambda: None
+    engine: Engine, request: CloseLoop | LoopChoice, told: Callable[[EscapeError | None], object]
 ) -> None:
-    """Close the loop and keep it closed until it is told to open; ``closed`` is called when it is closed.
+    """Close the loop and keep it closed until it is told to open.
+
+    ``told`` is called when it is closed, with ``None``, or with the reason for which it cannot be.
 
     Raises
     ------
@@ -225,7 +235,7 @@ def close_loop(
     )  # fmt: skip
     board.loop, board.orders = wanted, orders
     board.phase, board.stop, board.needs_loop = Phase.LOOP, Flag(), True
-    engine.post(lambda: _keep_loop_closed(engine, orders, closed))
+    engine.post(lambda: _keep_loop_closed(engine, orders, told))
 
 
 def change_loop(engine: Engine, request: SetLoop) -> None:
@@ -260,15 +270,17 @@ def _wanted(engine: Engine, request: CloseLoop | SetLoop | LoopChoice) -> LoopCh
     return replace(engine.board.loop, **{key: value for key, value in asked.items() if value is not None})
 
 
-def _keep_loop_closed(engine: Engine, orders: LoopOrders, closed: Callable[[], object]) -> None:
+def _keep_loop_closed(
+    engine: Engine, orders: LoopOrders, told: Callable[[EscapeError | None], object]
+) -> None:
     board, bench = engine.board, engine.bench
-    bench.wfs.stop()
-    engine.publisher.forget_residual()
-    board.closed = True
-    engine.pulse.beat()
-    closed()
-    log.info("loop closed on '%s', gain %g", board.loop.matrix, board.loop.gain)
     try:
+        bench.wfs.stop()
+        engine.publisher.forget_residual()
+        board.closed = True
+        engine.pulse.beat()
+        told(None)
+        log.info("loop closed on '%s', gain %g", board.loop.matrix, board.loop.gain)
         end = run_procedure(
             keep_closed(bench, orders, model_psf=engine.model_psf),
             observers=(engine.observe,), abort=board.stop,
@@ -281,7 +293,10 @@ def _keep_loop_closed(engine: Engine, orders: LoopOrders, closed: Callable[[], o
     except Aborted:
         log.info("loop open, mirror flat")
     except EscapeError as error:
+        was_closed = board.closed
         engine.make_safe(str(error), "mend it, then clear the fault")
+        if not was_closed:
+            told(error)
     finally:
         board.closed = False
         # A procedure that waits for this end has said already whether it needs one.

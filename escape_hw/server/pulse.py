@@ -70,7 +70,7 @@ class Pulse:
     ) -> None:
         self._bench, self._board, self._publisher, self._shelf = bench, board, publisher, shelf
         self._runs, self._tell, self._telemetry = runs, tell, telemetry
-        self._ending = threading.Event()
+        self._ending, self._telling = threading.Event(), threading.Lock()
         self._last: tuple[float, Frame | None] = (0.0, None)
         self._rate, self._lost = 0.0, 0
         self._clipped: deque[tuple[int, int]] = deque(maxlen=_SECOND + 1)
@@ -91,9 +91,10 @@ class Pulse:
         self.beat()
 
     def beat(self) -> None:
-        """Tell the state now."""
+        """Tell the state now; from any thread, and never an older one after a newer one."""
         try:
-            self._tell(self.state())
+            with self._telling:
+                self._tell(self.state())
         except Exception:
             # A number that cannot be had must not be taken for an engine that is dead.
             log.exception("the state could not be told")

@@ -125,6 +125,7 @@ class PyramidModel:
         self._response *= np.float32(scale)
         self._helper = ThreadPoolExecutor(1, "pyramid-model")
         self._variants: list[PyramidModel] | None = None
+        self._shifted: dict[tuple[float, float], PyramidModel] = {}
         self._scatter: NDArray[np.float64] | None = None
 
     @property
@@ -189,9 +190,12 @@ class PyramidModel:
 
     def with_pupil_shift(self, shift_x: float, shift_y: float) -> PyramidModel:
         """The same air and the same mirror behind shifted images, see :class:`MovablePupil`."""
-        by = np.array([shift_x, shift_y]) / 100 * self._pupils.diameter_px / self._pupil.n_sub
-        pupils = replace(self._pupils, centres_px=self._pupils.centres_px + by)
-        return PyramidModel(self._config, pupils, modulation=self._modulation, turbulence=self.turbulence)
+        place = shift_x, shift_y
+        if place not in self._shifted:
+            by = np.array(place) / 100 * self._pupils.diameter_px / self._pupil.n_sub
+            pupils = replace(self._pupils, centres_px=self._pupils.centres_px + by)
+            self._shifted[place] = self._like(self._modulation, self.turbulence, pupils)
+        return self._shifted[place]
 
     def variants(self) -> list[PyramidModel]:
         """The sensor under stronger turbulence, with an oval modulation, and with misplaced images."""

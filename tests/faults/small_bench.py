@@ -30,6 +30,18 @@ def faulty(
     return bench
 
 
+def dead(bench: System, *actuators: int) -> None:
+    """Make actuators take commands and not move, which nobody knows."""
+    real = bench.dm._send
+
+    def send(command: np.ndarray) -> None:
+        reached = command.copy()
+        reached[list(actuators)] = 0.0
+        real(reached)
+
+    bench.dm._send = send
+
+
 def settled_shape(bench: System) -> np.ndarray:
     """Where the twin's actuators really go, whatever anybody believes about it: ``(n_act,)``."""
     twin = getattr(bench.dm, "inner", bench.dm)._bench

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_bench import PLANTED, assert_flat, small
+from small_bench import PLANTED, assert_flat, dead, small
 
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.docrime import docrime
@@ -120,18 +120,6 @@ def test_faults_that_bias_nothing(closing, truth, more, allowed):
     if "limits" in more[0]:
         assert found.matrix.metrics["shortened"] > 30
         assert any("limits shortened" in note for note in found.notes)
-
-
-def dead(bench, *actuators):
-    """Actuators that take commands and do not move, which nobody knows."""
-    real = bench.dm._send
-
-    def send(command):
-        reached = command.copy()
-        reached[list(actuators)] = 0.0
-        real(reached)
-
-    bench.dm._send = send
 
 
 def test_dead_actuators_that_nobody_knows_show_in_the_matrix(closing, truth):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_bench import PLANTED, assert_flat, small
+from small_bench import PLANTED, assert_flat, dead, small
 
 from escape_hw.calibration.escape import escape
 from escape_hw.errors import CalibrationError
@@ -19,17 +19,10 @@ FAULTS = {
 }
 
 
-def measured(*more: str, seed: int, dead: tuple[int, ...] = ()):
+def measured(*more: str, seed: int, broken: tuple[int, ...] = ()):
     with small(*more) as bench:
         bench.rng = np.random.default_rng(seed)
-        real = bench.dm._send
-
-        def send(command):
-            reached = command.copy()
-            reached[list(dead)] = 0.0
-            real(reached)
-
-        bench.dm._send = send
+        dead(bench, *broken)
         try:
             return bench.run(escape(bench, frames=FRAMES))
         finally:
@@ -40,7 +33,7 @@ def measured(*more: str, seed: int, dead: tuple[int, ...] = ()):
 def test_right_within_its_errors(name):
     pulls = []
     for seed in SEEDS:
-        found = measured(*FAULTS[name], seed=seed, dead=(18, 25) if "dead" in name else ())
+        found = measured(*FAULTS[name], seed=seed, broken=(18, 25) if "dead" in name else ())
         assert found.registration.converged, found.registration.warnings
         if name == "clipped pokes":
             assert found.matrix.metrics["shortened"] > FRAMES / 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from small_bench import assert_flat, small
 from small_system import configuration
 
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_hw.api.results import TemporalResponse
+from escape_hw.api.results import Measured, TemporalResponse
 from escape_hw.calibration.track import track
 from escape_hw.calibration.track_proposal import inverted
 from escape_hw.cli import main
@@ -104,6 +105,21 @@ def test_proposals_alone_change_nothing(start):
     np.testing.assert_array_equal(
         inverted(found.latest.matrix, 4).shape, (found.latest.matrix.n_modes, start.grid.n_slopes)
     )
+
+
+def test_what_was_fitted_beside_the_registration_stays(start):
+    extras = {"anamorphosis": Measured(0.4, 0.1, "% of the diameter")}
+    told = replace(start, registration=replace(start.registration, extras=extras))
+    with small(QUIET) as bench:
+        found = followed(bench, told, 2, exchange=False)
+    assert found.latest.registration.extras == extras
+
+
+def test_a_matrix_without_a_registration_is_fitted_as_configured(start):
+    with small(QUIET, 'calibration.also=["anamorphosis"]') as bench:
+        found = followed(bench, replace(start, registration=None), 2, exchange=False)
+    assert set(found.latest.registration.extras) == {"anamorphosis"}
+    assert abs(found.column("shift_x")[-1] - start.registration.registration.shift_x) < 3
 
 
 def test_too_large_a_change_is_not_exchanged_without_asking(start):

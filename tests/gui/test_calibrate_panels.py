@@ -160,7 +160,9 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     assert names == ["matrix", "sigma"]
 
 
-@pytest.mark.parametrize(("width", "height", "columns"), [(900, 260, 6), (480, 300, 3), (500, 1200, 2)])
+@pytest.mark.parametrize(
+    ("width", "height", "columns"), [(900, 260, 6), (480, 300, 3), (500, 700, 2), (500, 1200, 1)]
+)
 def test_tiles_use_their_room(width, height, columns):
     assert best_columns(6, width, height, 56) == columns
 

@@ -166,7 +166,7 @@ def test_a_note_covers_nothing(
 ) -> None:
     window, toasts = small_window, small_window.toasts
     where = {name: dock.geometry() for name, dock in window.docks.items()}
-    monkeypatch.setattr("escape_gui.widgets.toasts.SHOWN_MS", 1000)
+    monkeypatch.setattr("escape_gui.widgets.toasts.SHOWN_MS", 2000)
     toasts.tell(Level.BAD, "Not saved", "the disk is full, " * 40 + "\n/runs/2")
     toasts.tell(Level.GOOD, "Saved", "/runs/3")
     qapp.processEvents()
@@ -178,7 +178,7 @@ def test_a_note_covers_nothing(
     assert window.width() == 1280
     assert "/runs/2" in bad.toolTip()
     # What informs goes by itself; what is bad comes back and stays.
-    qtbot.waitUntil(lambda: toasts.notes == [bad])
+    qtbot.waitUntil(lambda: toasts.notes == [bad], timeout=60_000)
     qapp.processEvents()
     assert bad.isVisible()
     assert bad.shut.mapTo(window, QPoint(0, 0)).x() < window.width()

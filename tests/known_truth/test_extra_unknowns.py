@@ -11,6 +11,7 @@ from small_system import configuration as small_lenslets
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
+from escape_hw.calibration.found_mirror import found_matrix
 from escape_hw.calibration.pseudo_synthetic import pseudo_synthetic
 from escape_hw.calibration.sprint import sprint
 from escape_hw.errors import ConfigError
@@ -100,6 +101,20 @@ def test_a_shear_is_in_the_pseudo_synthetic_matrix(model):
     assert missed(sprint(matrix, model, also=("anamorphosis",))) < 0.2 * missed(sprint(matrix, model))
 
 
+def test_a_shear_stays_with_a_mirror_that_moves_on(model):
+    """As for a tracker, which follows the registration alone."""
+    truth, basis = plant(1), np.eye(model.n_act)
+    found = sprint(noisy(model.zonal_matrix(truth.sheared(SHEAR)), model, 1), model, also=("anamorphosis",))
+    there = Registration.from_array(found.registration.to_array() + np.array([8.0, -5.0, 0.2, 0.0, 0.0]))
+    sheared = model.zonal_matrix(there.sheared(found.extras["anamorphosis"].value), found.width.value)
+    alike = replace(found, departures=None)
+    np.testing.assert_allclose(
+        found_matrix(model, there, alike, basis), sheared, atol=1e-3 * np.abs(sheared).max()
+    )
+    bare = found_matrix(model, there, replace(alike, extras={}), basis)
+    assert np.abs(bare - sheared).max() > 1e-2 * np.abs(sheared).max()
+
+
 def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
     config = small_pyramid()
     model = make_model(config, None)
@@ -139,4 +154,4 @@ def test_what_a_model_or_solver_does_not_know_is_refused():
         sprint(matrix, model, also=("pupil_shift",))
     with pytest.raises(ConfigError, match="takes solver = 'effects'"):
         sprint(matrix, model, also=("anamorphosis",), solver="light")
-    assert not replace(sprint(matrix, model)).extras
+    assert not sprint(matrix, model).extras

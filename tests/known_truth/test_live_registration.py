@@ -34,7 +34,7 @@ def looked(bench, blocks, frames, poke=0.002, gain=None, curved=0, memory=1e9, s
     bench.run(loop.run(300, observe=[lambda *frame: motion.add(frame[1])]))
     c = bench.config.calibration
     live = LiveRegistration(
-        start.matrix, bench.model(motion.of(start.grid)), start.registration,
+        start.matrix, bench.model(motion.of(start.grid, closed=True)), start.registration,
         order=c.whiten_order, lags=c.lags, memory=memory, curved=curved, response=start.response,
         step_s=frames / bench.wfs.settings.frame_rate_hz,
     )  # fmt: skip

@@ -21,8 +21,10 @@ from escape_sim.stand_ins.bench_server import BenchServer
 
 #: On the increments of the real camera.
 REGION = "devices.wfs.region=[216,152,208,208]"
+#: Short enough for a test, and long enough for a machine whose processors all have other work; the loop's own
+#: patience with a camera ends after five seconds.
 LIMITS = {
-    "lease_s": 1.5, "abandoned_s": 1, "no_frames_s": 1, "diverging_factor": 2, "diverging_s": 0.4,
+    "lease_s": 15, "abandoned_s": 1, "no_frames_s": 2.5, "diverging_factor": 2, "diverging_s": 0.4,
     "silent_s": 60,
 }  # fmt: skip
 
@@ -117,7 +119,7 @@ def test_no_frames(closed, mirror, monkeypatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(bench_server._CameraEnd, "_frame", late)
         wait_for(lambda: closed.state.fault is not None, "the fault")
-    made_safe(closed, mirror[1], "no frame for")
+    made_safe(closed, mirror[1], "in closed loop (limit 2.5 s)")
 
 
 def test_saturated_actuators(closed, mirror) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fake_results as fake
 import numpy as np
 import pytest
 
@@ -65,3 +66,16 @@ def test_a_run_that_goes_on_later_tells_the_same() -> None:
     # Two pairs across the interruption are lost.
     assert other.looks == pytest.approx(one.looks, rel=0.03)
     assert other.steady == pytest.approx(one.steady, abs=0.02)
+
+
+def test_a_closed_loop_tells_nothing_of_the_air_within_a_lenslet() -> None:
+    rng, lenslets = np.random.default_rng(3), fake.grid(8)
+    motion, slopes = Motion(lenslets.n_slopes), np.zeros(lenslets.n_slopes)
+    for _ in range(200):
+        # What a loop leaves lasts for some frames as well.
+        slopes = 0.8 * slopes + 0.02 * rng.standard_normal(slopes.size)
+        motion.add(slopes.astype(np.float32))
+    opened, closed = motion.of(lenslets), motion.of(lenslets, closed=True)
+    assert 0 < opened.air_px < 0.2 * lenslets.air_px
+    assert closed.air_px == lenslets.air_px
+    assert closed.motion_px == opened.motion_px < lenslets.motion_px

@@ -104,7 +104,8 @@ class MilkStream:
             descriptor = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_EXCL, _MODE)
             try:
                 os.fchmod(descriptor, _MODE)
-                os.truncate(descriptor, sections.total)
+                # A file with holes would end this process at its first write, were memory short.
+                os.posix_fallocate(descriptor, 0, sections.total)
                 head.inode = os.fstat(descriptor).st_ino
                 memory = mmap.mmap(descriptor, sections.total)
             finally:

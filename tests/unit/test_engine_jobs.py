@@ -1,0 +1,127 @@
+"""An engine whose jobs cannot begin, what order it tells its states in, and a front without a guardian."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from escape_hw.errors import DeviceLost, EscapeError, RequestRefused
+from escape_hw.remote.state import Finish, Phase
+from escape_hw.server import jobs
+from escape_hw.server.board import Board, LoopChoice
+from escape_hw.server.engine_process import EngineProcess
+from escape_hw.server.pulse import Pulse
+
+
+class Engine:
+    """An engine whose camera has gone, as its jobs see it."""
+
+    def __init__(self) -> None:
+        self.board = Board(LoopChoice(gain=0.4), phase=Phase.IDLE)
+        self.bench = SimpleNamespace(wfs=self, config=SimpleNamespace(to_toml=str))
+        self.config = SimpleNamespace(system=SimpleNamespace(name="small"))
+        self.publisher = SimpleNamespace(forget_residual=lambda: None)
+        self.pulse = SimpleNamespace(beat=lambda: None)
+        self.posted: list[dict[str, Any]] = []
+        self.channel = SimpleNamespace(post=self.posted.append)
+        self.flat = 0
+
+    def stop(self) -> None:
+        raise DeviceLost("wfs", "the camera has gone")
+
+    def post(self, job: Any) -> None:
+        job()
+
+    def flatten(self) -> None:
+        self.flat += 1
+
+    def make_safe(self, reason: str, way_out: str) -> None:
+        self.board.latch(reason, way_out)
+        self.board.phase, self.board.closed = Phase.FAULT, False
+
+    def answer_flat(self) -> None:
+        """Nobody waits."""
+
+
+@pytest.fixture
+def engine(monkeypatch: pytest.MonkeyPatch) -> Engine:
+    monkeypatch.setattr(jobs, "fitting", lambda engine, name: SimpleNamespace(result=None))
+    monkeypatch.setattr(jobs, "LoopOrders", lambda *args, **options: SimpleNamespace(opened=False))
+    return Engine()
+
+
+def test_a_loop_that_cannot_be_closed_is_told_and_none_is_thought_closed(engine: Engine) -> None:
+    told: list[EscapeError | None] = []
+    jobs.close_loop(engine, LoopChoice("im"), told.append)
+    assert [str(error) for error in told] == ["wfs: the camera has gone"]
+    assert engine.board.fault is not None
+    assert (engine.board.orders, engine.board.closed) == (None, False)
+
+
+def test_a_run_that_cannot_begin_ends(
+    engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jobs, "_place", lambda engine, task, run: tmp_path / "run")
+    jobs.announce(engine, 3, "docrime", {}, loop=False)
+    jobs.do_task(engine, SimpleNamespace(kind="docrime"), engine.bench.config)
+    assert engine.board.running is None
+    assert engine.board.last.finish is Finish.FAILED
+    assert engine.board.last.message == "wfs: the camera has gone"
+    assert engine.board.phase is Phase.FAULT
+    assert engine.flat == 1
+    assert engine.posted[-1]["ended"]["id"] == 3
+
+
+def test_a_loop_that_somebody_opens_is_none_to_return_to(engine: Engine) -> None:
+    board = engine.board
+    board.orders, board.phase = SimpleNamespace(opened=False), Phase.LOOP
+    assert jobs.loop_to_return_to(engine) == board.loop
+    board.stop.set()
+    assert jobs.loop_to_return_to(engine) is None
+    with pytest.raises(RequestRefused, match="the loop is closed"):
+        board.require_idle()
+
+
+def test_a_guardian_that_cannot_be_started_is_no_end_of_the_server(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    process = EngineProcess.__new__(EngineProcess)
+    process._guardian = SimpleNamespace(pid=4711)
+
+    def refuse(process: EngineProcess) -> None:
+        raise BlockingIOError("Resource temporarily unavailable")
+
+    monkeypatch.setattr(EngineProcess, "_guard", refuse)
+    with caplog.at_level(logging.ERROR):
+        process.replace_guardian()
+    assert process._guardian.pid == 4711
+    assert "tried again: Resource temporarily unavailable" in caplog.text
+
+
+def test_no_older_state_is_told_after_a_newer_one() -> None:
+    """Else a client that waits for what it asked for would find what was before."""
+    told: list[int] = []
+    begun, numbers = threading.Event(), itertools.count()
+
+    class Slow(Pulse):
+        def state(self) -> Any:
+            number = next(numbers)
+            begun.set()
+            time.sleep(0.3 if number == 0 else 0.0)
+            return number
+
+    nothing: Any = None
+    pulse = Slow(nothing, nothing, nothing, nothing, Path(), told.append)
+    first = threading.Thread(target=pulse.beat)
+    first.start()
+    assert begun.wait(60)
+    pulse.beat()
+    first.join()
+    assert told == [0, 1]
