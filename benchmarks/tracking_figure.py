@@ -120,6 +120,7 @@ def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]
     panels[1].axhline(0, color=style.INK, lw=0.8)
     for bar in (-SHIFT_BAR, SHIFT_BAR):
         panels[1].axhline(bar, color=style.MUTED, lw=1.0, ls=":", label="asked for" if bar > 0 else None)
+    panels[1].margins(y=0.2)
     style.tidy(panels[1]).set_title("shift x, tracked less truth [% of a sub-aperture]", fontsize=9.5)
     band(panels[3], t, rows["optical_gain"], rows["optical_gain_sigma"])
     panels[3].plot(gains[:, 0], gains[:, 1], "o", ms=3, color=style.INK, label="truth")
