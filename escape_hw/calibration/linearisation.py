@@ -21,6 +21,10 @@ from escape_hw.calibration.weighted import WeightedMatrix
 GAIN, WIDTH, SHAPE = 0, 6, 7
 
 
+#: Shares of a variant below which its derivatives are taken for the model's own.
+_SMALL_SHARE = 0.25
+#: Share of the gain down to which a step may take it for shares to follow its product with them.
+_LEAST_KEPT = 0.05
 #: Random effects of which there are many of a kind, in the order of the unknowns ...
 _EFFECTS = ("sampling", "actuator_gain", "actuator_width", "slope_gain")
 #: ... and the shares of their usual scatter below and above which none is taken to be.
@@ -155,9 +159,18 @@ class Problem:
         """The zonal matrix of a state and what it is made of, weighted."""
         here, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
         zonal, moved = (weigh(part) for part in zonal_jacobian(self.model, here, w))
+        base = moved
+        variants = []
+        for variant, share in zip(self.variants, state.variant, strict=False):
+            if abs(share) < _SMALL_SHARE:
+                variants.append(weigh(variant.zonal_matrix(here, w)) - zonal)
+                continue
+            # What a large share brings with it moves with the mirror in a way of its own.
+            changed, changes = (weigh(part) for part in zonal_jacobian(variant, here, w))
+            variants.append(changed - zonal)
+            moved = moved + share * (changes - base)
         by_width = moved[5] * w
         by_shape = weigh(self.model.zonal_matrix(here, w * PEDESTAL)) - zonal
-        variants = [weigh(v.zonal_matrix(here, w)) - zonal for v in self.variants]
         variants += [weigh(change) for change in self._changes(state)]
         variants += [zonal @ bend for bend in self.bends]
         shaped = zonal + state.shape * by_shape + state.actuator_width * by_width
@@ -270,12 +283,15 @@ class Problem:
         n_act = self.model.n_act
         v, n = self.n_variants, self.n_variants + self.n_lines
         variant, sampling, gains, widths, slopes = np.split(step[8:], [v, n, n + n_act, n + 2 * n_act])
+        # What gain and shares make together is linear in their product: there the step is exact.
+        gain = state.gain + step[GAIN]
+        kept = state.gain / gain if gain > _LEAST_KEPT * state.gain else 1.0
         return State(
-            state.gain + step[GAIN],
+            gain,
             state.alpha + step[1:6],
             float(np.clip(state.width + step[WIDTH], -0.5, 1.0)),
-            float(np.clip(state.shape + step[SHAPE], -0.5, 0.5)),
-            state.variant + variant,
+            float(np.clip(state.shape + kept * step[SHAPE], -0.5, 0.5)),
+            state.variant + kept * variant,
             state.sampling + sampling,
             state.actuator_gain + gains,
             state.actuator_width + widths,

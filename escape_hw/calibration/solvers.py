@@ -21,8 +21,8 @@ from escape_hw.calibration.covariance import Linearised
 from escape_hw.calibration.diagonal import DiagonalProblem
 from escape_hw.calibration.extra_unknowns import ExtraUnknown, FoundExtra
 from escape_hw.calibration.light import SMALL, LightFit, LightProblem
-from escape_hw.calibration.linearisation import Learned, Problem
-from escape_hw.calibration.misfit import Priors
+from escape_hw.calibration.linearisation import Learned, Problem, State
+from escape_hw.calibration.misfit import NormalEquations, Priors
 from escape_hw.calibration.weighted import WeightedMatrix
 from escape_hw.config.models import Solver
 
@@ -30,6 +30,8 @@ T = TypeVar("T")
 
 #: Largest move in one iteration: the model is only locally linear.
 LARGEST = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
+#: A step is halved, so many times at most, as long as it makes squares grow by more than this factor.
+_HALVINGS, _WORSE = 6, 1.02
 #: Solvers that take the columns for modes, and so need a matrix.
 BY_MODES: tuple[Solver, ...] = ("batches", "diagonal")
 
@@ -178,13 +180,37 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
             settled = True
             break
         damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / LARGEST)))
-        state = problem.move(state, step * damping * descent.learning_rate)
-        system = problem.linearise(state)
+        step = step * damping * descent.learning_rate
+        state, system = _moved(problem, state, system, step)
     return Solution(
         system, state.alpha, state.gain, 1 + state.width, settled,
         lambda: problem.zonal(state), learned=lambda: problem.learned(state, system),
         extras=problem.extras_found(state), departures=lambda: problem.departures(state, system),
     )  # fmt: skip
+
+
+def _moved(
+    problem: Problem, state: State, system: NormalEquations, step: NDArray[np.float64]
+) -> tuple[State, NormalEquations]:
+    """The state after a step, or after a part of it where the whole would make things clearly worse.
+
+    Gain and shares multiply: on a pyramid that is far from its model at rest a whole step may end where
+    the model is another one.
+    """
+    bearable = _WORSE * _cost(problem, state, system)
+    for _ in range(_HALVINGS):
+        moved = problem.move(state, step)
+        found = problem.linearise(moved)
+        if _cost(problem, moved, found) <= bearable:
+            break
+        step = step / 2
+    return moved, found
+
+
+def _cost(problem: Problem, state: State, system: NormalEquations) -> float:
+    """Squares of what is left and of the distances from the priors, in standard errors."""
+    offset = state.offset(problem.mean_width)
+    return float(np.vdot(system.residual, system.residual) + offset @ (problem.precision * offset))
 
 
 def _record(

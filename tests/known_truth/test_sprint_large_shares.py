@@ -1,0 +1,70 @@
+"""A sensor far from its model: what the model doubts has large shares, and the gain goes with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.model import SyntheticModel
+from escape_hw.api.procedure import run
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.modes import karhunen_loeve
+from escape_hw.calibration.sprint import fit_steps
+from escape_hw.config.load import load_system
+from escape_sim.model import make_model, nominal_grid
+
+SMALL = (
+    "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
+    "devices.dm.pitches_across_pupil=5.0", "basis.n_modes=25", "loop.dropped_modes=0",
+)  # fmt: skip
+#: Share of the doubt in the truth, in prior scatters, and the gain: as of a pyramid in weaker turbulence.
+SHARE, GAIN = -7.0, 0.5
+
+
+@dataclass
+class Dull:
+    """A model whose sensor is less sensitive, and sees each actuator a second time beside it."""
+
+    sharp: SyntheticModel
+
+    def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
+        aside = replace(registration, shift_x=registration.shift_x + 60.0)
+        return np.asarray(
+            0.8 * self.sharp.zonal_matrix(registration, width) + 0.1 * self.sharp.zonal_matrix(aside, width)
+        )
+
+
+class Doubtful:
+    """A model that knows that its sensor may be dull."""
+
+    def __init__(self, sharp: SyntheticModel) -> None:
+        self._sharp = sharp
+
+    def variants(self) -> list[Dull]:
+        return [Dull(self._sharp)]
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._sharp, name)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_large_shares_are_found_with_the_registration(seed: int) -> None:
+    config = load_system("razor-shwfs", overrides=SMALL)
+    sharp = make_model(config, None)
+    m2c = karhunen_loeve(*sharp.influence_functions(), 25, 4 * config.system.pupil_m)
+    rng = np.random.default_rng(seed)
+    planted = Registration(*(rng.uniform(-1, 1, 5) * (40.0, 40.0, 1.5, 3.0, 3.0)))
+    there = sharp.zonal_matrix(planted)
+    exact = GAIN * (there + SHARE * (Dull(sharp).zonal_matrix(planted) - there)) @ m2c
+    sigma = np.full(exact.shape, 0.05 * exact.std(), np.float32)
+    data = (exact + sigma * rng.standard_normal(exact.shape)).astype(np.float32)
+    matrix = InteractionMatrix(data, sigma, m2c, nominal_grid(config).valid, "razor-shwfs", "docrime", True)
+    estimate = run(fit_steps(matrix, Doubtful(sharp))).estimate
+    assert estimate.converged, estimate.warnings
+    assert len(estimate.iterations) <= 25
+    pulls = (estimate.registration.to_array() - planted.to_array()) / np.sqrt(np.diag(estimate.covariance))
+    assert np.abs(pulls).max() < 4.5
