@@ -12,6 +12,8 @@ from escape_hw.cli.session import session
 app = typer.Typer(
     no_args_is_help=True, help="Keys for servers and clients on different machines (escape serve --bind)."
 )
+#: A key may begin with a minus sign.
+_ANY = {"ignore_unknown_options": True}
 Name = Annotated[str, typer.Argument(help="What to call it.")]
 Key = Annotated[str, typer.Argument(help="Its public key, 40 characters.")]
 
@@ -61,7 +63,7 @@ def list_keys(json: options.Json = False) -> None:
         one.show(*(f"server: {name} {key.decode()}" for name, key in trusted_keys().items()))
 
 
-@app.command("allow")
+@app.command("allow", context_settings=_ANY)
 def allow(name: Name, key: Key, json: options.Json = False) -> None:
     """Let a client in to your servers; counts at once."""
     with session("keys", json=json) as one:
@@ -72,7 +74,7 @@ def allow(name: Name, key: Key, json: options.Json = False) -> None:
         one.show(f"{name} is let in")
 
 
-@app.command("trust")
+@app.command("trust", context_settings=_ANY)
 def trust(host: Name, key: Key, json: options.Json = False) -> None:
     """Take the server on a host for the right one when it has this key."""
     with session("keys", json=json) as one:

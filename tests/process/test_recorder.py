@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -26,7 +27,7 @@ from escape_hw.streams.segments import segment_name
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="shared memory as on Linux")
 
-SYSTEM = "test.recorder"
+SYSTEM = f"test.recorder-{os.getpid()}"
 #: Enough for a machine that is busy with other things.
 SLOTS = 1024
 

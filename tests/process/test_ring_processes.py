@@ -19,7 +19,8 @@ from escape_hw.streams.segments import segment_name
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="shared memory as on Linux")
 
-SYSTEM = "test.processes"
+#: Of this process alone: the same tests may run beside it.
+SYSTEM = f"test.processes-{os.getpid()}"
 #: Writes frames that are the same number all over, as fast as it can; says its name first.
 WRITER = f"""
 import itertools, sys

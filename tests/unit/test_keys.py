@@ -66,6 +66,14 @@ def test_other_addresses_than_the_loopback_need_keys_and_somebody_to_let_in(esca
     assert servers() == ()
 
 
+def test_a_key_may_begin_with_a_minus_sign(document) -> None:
+    key = f"-{OTHER[1:]}"
+    assert document("keys", "allow", "alice", key)[0] == 0
+    assert document("keys", "trust", "bench.example.org", key)[0] == 0
+    assert document("keys", "list")[1]["allowed"] == {"alice": key}
+    assert document("keys", "allow", "bob", "--nonsense")[0] == 2
+
+
 def test_clients_are_let_in_and_out_by_name(document) -> None:
     assert document("keys", "allow", "alice", OTHER)[0] == 0
     assert document("keys", "trust", "bench.example.org", OTHER)[0] == 0
