@@ -40,14 +40,16 @@ class Watchdog:
         self._frames_at = self._clipped_since = clock()
         self._residuals: deque[float] = deque(maxlen=_USUAL)
         self._diverging_since: float | None = None
-        self._closed = False
+        #: Whether a loop is closed, and by which run: a run may close its own before anybody sees one open.
+        self._loop: tuple[bool, int | None] = (False, None)
 
     def judge(self, state: State) -> Verdict | None:
         """The verdict on a state; ``None``: all is well."""
         if state.fault is not None:
             return None
-        if state.loop.closed != self._closed:
-            self._closed = state.loop.closed
+        loop = state.loop.closed, None if state.procedure is None else state.procedure.id
+        if loop != self._loop:
+            self._loop = loop
             self._residuals.clear()
             self._frames_at = self._clipped_since = self._clock()
             self._diverging_since = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from escape_hw.config.server_models import ServerSection
-from escape_hw.remote.state import Fault, LoopState, Mirror, Rates, State
+from escape_hw.remote.state import Fault, LoopState, Mirror, Rates, Running, State
 from escape_hw.server.watchdog import Verdict, Watchdog
 
 
@@ -18,7 +18,7 @@ class Engine:
 
     def tell(
         self, seconds: float, *, closed: bool = True, frames: int = 100, residual: float = 50.0,
-        clipped: float = 0.0, fault: Fault | None = None, fresh: bool = True,
+        clipped: float = 0.0, fault: Fault | None = None, fresh: bool = True, run: int | None = None,
     ) -> Verdict | None:  # fmt: skip
         """So many seconds alike; the first verdict."""
         for _ in range(round(4 * seconds)):
@@ -27,6 +27,7 @@ class Engine:
             self.told += fresh
             state = State(
                 rates=Rates(frames=self.frames), mirror=Mirror(clipped=clipped), fault=fault,
+                procedure=None if run is None else Running(id=run, name="gains", arguments={}),
                 # No two residuals are quite the same.
                 loop=LoopState(closed=closed, residual_nm=residual * (1 + 1e-6 * self.told)),
             )  # fmt: skip
@@ -46,6 +47,17 @@ def test_a_good_loop_is_left_alone_for_an_hour(engine: Engine) -> None:
         # A gust, and some actuators at their limits for a moment.
         assert engine.tell(9, residual=110, clipped=0.1) is None
         assert engine.tell(0.8, clipped=0.9) is None
+
+
+def test_a_run_that_closes_a_loop_of_its_own_is_not_held_against_the_one_before(engine: Engine) -> None:
+    assert engine.tell(20, residual=60) is None
+    # No state came between the two loops.
+    assert engine.tell(20, residual=250, run=5) is None
+    # Nor is the loop that comes back after it.
+    assert engine.tell(20, residual=60) is None
+    verdict = engine.tell(5, residual=250)
+    assert verdict is not None
+    assert "the residual grew" in verdict.reason
 
 
 def test_no_frames_in_closed_loop(engine: Engine) -> None:
