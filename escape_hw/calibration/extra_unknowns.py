@@ -8,7 +8,7 @@ mirror then seems to have moved with them, and only the rims tell the two apart.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -161,3 +161,27 @@ def extra_unknowns(model: SyntheticModel, also: Sequence[Extra]) -> tuple[ExtraU
         found.append(PupilShift(model, model.with_pupil_shift(_PUPIL_SHIFT, 0.0), "pupil_shift_x"))
         found.append(PupilShift(model, model.with_pupil_shift(0.0, _PUPIL_SHIFT), "pupil_shift_y"))
     return tuple(found)
+
+
+def unknowns_told(model: SyntheticModel, told: Iterable[str]) -> tuple[ExtraUnknown, ...]:
+    """The unknowns that an earlier fit has told of, by their names; raises as :func:`extra_unknowns`."""
+    return extra_unknowns(model, tuple(dict.fromkeys(map(family_of, told))))
+
+
+def as_told(
+    unknowns: Sequence[ExtraUnknown], told: Mapping[str, Measured]
+) -> tuple[tuple[float, float], ...]:
+    """Mean and scatter of each unknown in its own prior scatters, as an earlier fit has told them.
+
+    Parameters
+    ----------
+    unknowns
+        Which.
+    told
+        The earlier fit's values by name. What it told nothing of keeps its wide prior about zero.
+    """
+    known = [(told.get(one.name), one.scatter) for one in unknowns]
+    return tuple(
+        (0.0, 1.0) if fit is None else (fit.value / wide, min(1.0, max(fit.sigma / wide, _NEAR)))
+        for fit, wide in known
+    )

@@ -10,7 +10,7 @@ from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate
 from escape_hw.calibration.derivatives import modal_jacobian, modal_matrix
-from escape_hw.calibration.extra_unknowns import extra_unknowns, family_of
+from escape_hw.calibration.extra_unknowns import unknowns_told
 
 
 def found_matrix(
@@ -78,7 +78,7 @@ def _whole(
 ) -> NDArray[np.float64]:
     """A matrix with what extra unknowns add to it, and unequal widths and the pedestal to first order."""
     apart, width = estimate.departures, estimate.width.value
-    for one in extra_unknowns(model, tuple(dict.fromkeys(map(family_of, estimate.extras)))):
+    for one in unknowns_told(model, estimate.extras):
         share = estimate.extras[one.name].value / one.scatter
         unit = unit + share * (one.per_share(here, width, share) @ acted)
     if apart is None:

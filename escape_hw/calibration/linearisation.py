@@ -53,11 +53,12 @@ class State:
     actuator_width: NDArray[np.float64]
     slope_gain: NDArray[np.float64]
 
-    def offset(self, mean_width: float = 0.0) -> NDArray[np.float64]:
+    def offset(self, mean_width: float, mean_variant: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance from the priors' means, in the order of the unknowns."""
         head = np.concatenate([[0.0], np.zeros(5), [self.width - mean_width, self.shape]])
+        variant = self.variant - mean_variant
         return np.concatenate(
-            [head, self.variant, self.sampling, self.actuator_gain, self.actuator_width, self.slope_gain]
+            [head, variant, self.sampling, self.actuator_gain, self.actuator_width, self.slope_gain]
         )
 
 
@@ -100,10 +101,11 @@ class Problem:
     ) -> None:
         self.weighted, self.bends, self.priors = weighted, tuple(bends), priors
         self.extras = tuple(extras)
-        self.mean_width = priors.mean_width
         self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
         rows, cols = np.nonzero(weighted.valid)
+        means, scatters = self._told()
+        self._means = priors.mean_width, means
         # x slopes share what their column does to them, y slopes what their row does.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
@@ -111,7 +113,7 @@ class Problem:
             [
                 np.zeros(6),
                 [priors.width**-2, priors.shape**-2],
-                np.ones(self.n_variants),
+                scatters**-2,
                 np.full(self.n_lines, priors.sampling**-2),
                 np.full(model.n_act, priors.actuator_gain**-2),
                 np.full(model.n_act, priors.actuator_width**-2),
@@ -128,14 +130,26 @@ class Problem:
         return State(
             gain,
             registration.to_array(),
-            self.mean_width,
+            self.priors.mean_width,
             0.0,
-            np.zeros(self.n_variants),
+            self._means[1].copy(),
             np.zeros(self.n_lines),
             zeros,
             zeros.copy(),
             np.zeros(n_slopes),
         )
+
+    def _told(self) -> NDArray[np.float64]:
+        """Prior means and scatters of variants, extra unknowns and bends in shares ``(2, n_variants)``."""
+        shares = np.array([np.zeros(self.n_variants), np.ones(self.n_variants)])
+        if self.priors.extras:
+            first = len(self.variants)
+            shares[:, first : first + len(self.extras)] = np.transpose(self.priors.extras)
+        return shares
+
+    def offset(self, state: State) -> NDArray[np.float64]:
+        """Distance of a state from the priors' means, in the order of the unknowns."""
+        return state.offset(*self._means)
 
     @property
     def n_variants(self) -> int:
@@ -214,7 +228,7 @@ class Problem:
             state.gain * (shaped @ acted),
             self.weighted.data - model,
             self.precision,
-            state.offset(self.mean_width),
+            self.offset(state),
             sampled,
             self.lines,
         )
@@ -272,7 +286,7 @@ class Problem:
         # Where the model does not fit, single actuators are to be believed less.
         rms = float(np.sqrt(np.mean(np.square(system.residual))))
         value, sigma = believed(
-            system.whole, state.offset(self.mean_width)[:inner], self.precision[:inner], kinds, bounds,
+            system.whole, self.offset(state)[:inner], self.precision[:inner], kinds, bounds,
             max(rms, self.weighted.noise(system.residual)),
         )  # fmt: skip
         gains, widths = kinds

@@ -18,10 +18,11 @@ from escape_hw.api.model import DoubtfulModel, SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import Measured, RegistrationEstimate, TemporalResponse
 from escape_hw.calibration.covariance import sandwich
+from escape_hw.calibration.extra_unknowns import as_told, unknowns_told
 from escape_hw.calibration.fading_sums import FadingSums, turned
 from escape_hw.calibration.found_mirror import found_matrix
 from escape_hw.calibration.gain_curve import bends_of, curve_basis
-from escape_hw.calibration.linearisation import GAIN, WIDTH, Problem, State
+from escape_hw.calibration.linearisation import GAIN, SHAPE, WIDTH, Problem, State
 from escape_hw.calibration.live_response import ResponseSums
 from escape_hw.calibration.misfit import NormalEquations, Priors
 from escape_hw.calibration.response import Filtered, filtered
@@ -98,8 +99,9 @@ class LiveRegistration:
         The synthetic model on the same sub-apertures.
     start
         Registration to start from, within SPRINT's linear reach. Its width of the influence functions,
-        which small pokes hardly show, is taken over with its error, and what it says of single actuators
-        and beside the registration is what a matrix at the live registration will have.
+        which small pokes hardly show, is taken over with its error, and so are a shear or shifted images
+        where it tells of them; what it says of single actuators is what a matrix at the live registration
+        will have.
     order, lags
         Of the whitening filter and the temporal response, in frames.
     memory
@@ -127,9 +129,12 @@ class LiveRegistration:
     ) -> None:
         self._frame, self._model, self._start = frame, model, start.registration
         scatter = min(Priors().width, max(start.width.sigma, _WIDTH_SIGMA))
-        self._priors = Priors(width=scatter, mean_width=start.width.value - 1)
-        # Small pokes tell little of single actuators or of a shear: what the calibration found of them stays.
-        self._mirror, self._extras = start.departures, start.extras
+        self._extras = unknowns_told(model, start.extras)
+        self._priors = Priors(
+            width=scatter, mean_width=start.width.value - 1, extras=as_told(self._extras, start.extras)
+        )
+        # Small pokes tell little of single actuators: what the calibration found of them stays.
+        self._mirror = start.departures
         self._order, self._lags, self._response = order, lags, response
         self._basis = curve_basis(frame.n_modes, curved)
         self._bends = bends_of(frame.m2c, self._basis)
@@ -226,7 +231,7 @@ class LiveRegistration:
         for _ in range(_FIRST_STEPS if state is None else 1):
             columns = self._sums.columns(self._frame, self._matrix)
             weighted = WeightedMatrix.of(columns, np.arange(columns.n_modes))
-            problem = Problem(weighted, self._model, self._priors, self._bends)
+            problem = Problem(weighted, self._model, self._priors, self._bends, self._extras)
             state = state or problem.start(self._start)
             system = problem.linearise(state)
             step = system.solve()
@@ -245,10 +250,9 @@ class LiveRegistration:
         own: FadingSums,
         response: TemporalResponse,
     ) -> LiveEstimate:
-        variants = len(problem.variants)
         present = self._present(problem, system, state)
         value = present.value
-        here = np.concatenate([state.variant[:variants], value[6:]])
+        here = np.concatenate([state.variant[: _unbent(problem)], value[6:]])
         there = replace(state, gain=float(value[GAIN]), alpha=value[1:6], variant=here)
         self._now = problem.matrix(there, self._frame.m2c)
         self._start = Registration.from_array(value[1:6])
@@ -257,17 +261,20 @@ class LiveRegistration:
         left /= columns.sigma
         gain, timing = present.value[GAIN], value[GAIN] * self._weights.gain_sigma(response)
         gain_sigma = float(np.hypot(np.sqrt(present.covariance[GAIN, GAIN]), timing))
-        width_sigma = float(np.sqrt(np.linalg.inv(system.information())[WIDTH, WIDTH]))
+        sigma = np.sqrt(np.diag(np.linalg.inv(system.information())))
         estimate = RegistrationEstimate(
             Registration.from_array(present.value[1:6]),
             present.covariance[1:6, 1:6],
             Measured(float(gain), gain_sigma),
-            Measured(1 + state.width, width_sigma),
+            Measured(1 + state.width, float(sigma[WIDTH])),
             True,
             (),
             float(np.mean(np.square(system.residual))),
             departures=self._mirror,
-            extras=self._extras,
+            extras={
+                one.unknown.name: one.measured(sigma, _doubt(self._model))
+                for one in problem.extras_found(state)
+            },
         )
         unit = found_matrix(self._model, self._start, estimate, self._frame.m2c)
         gains = np.asarray((self._now * unit).sum(axis=0) / np.square(unit).sum(axis=0))
@@ -280,16 +287,15 @@ class LiveRegistration:
 
     def _present(self, problem: Problem, system: NormalEquations, state: State) -> Present:
         """Gain, registration and curve now, without the memory's lag."""
-        n_variants = len(problem.variants)
-        after = WIDTH + 2 + n_variants
+        unbent = _unbent(problem)
+        after = SHAPE + 1 + unbent
         picked = np.r_[0:6, after : after + len(self._bends)]
         whole = sandwich(problem.weighted, system, self._sums.covariance)[np.ix_(picked, picked)]
         noise = system.noise(problem.precision)[np.ix_(picked, picked)]
-        if isinstance(self._model, DoubtfulModel):
-            whole[np.arange(1, 6), np.arange(1, 6)] += np.square(self._model.registration_doubt)
+        whole[np.arange(1, 6), np.arange(1, 6)] += np.square(_doubt(self._model))
         shares, directions = np.linalg.eigh(whole - noise)
         static = (directions * np.maximum(shares, 0.0)) @ directions.T
-        values = np.concatenate([[state.gain], state.alpha, state.variant[n_variants:]])
+        values = np.concatenate([[state.gain], state.alpha, state.variant[unbent:]])
         return self._line.update(values, noise, static)
 
     def _gains_sigma(self, present: Present, timing: float) -> NDArray[np.float64]:
@@ -301,6 +307,16 @@ class LiveRegistration:
         covariance[GAIN, GAIN] += timing**2
         variance = np.einsum("pm,pq,qm->m", jacobian, covariance, jacobian)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _unbent(problem: Problem) -> int:
+    """Shares of variants and extra unknowns, which come before those of the gains' curve."""
+    return problem.n_variants - len(problem.bends)
+
+
+def _doubt(model: SyntheticModel) -> NDArray[np.float64]:
+    """What a model itself is in doubt of, of the registration ``(5,)``."""
+    return model.registration_doubt if isinstance(model, DoubtfulModel) else np.zeros(5)
 
 
 def scaled_to_gains(matrix: InteractionMatrix, live: LiveEstimate) -> InteractionMatrix:

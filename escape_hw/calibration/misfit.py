@@ -31,6 +31,9 @@ class Priors:
         Common width of the influence functions, and the share of a broad pedestal in them.
     mean_width
         Width to expect beyond nominal: zero, unless an earlier fit has told it.
+    extras
+        Mean and scatter of each extra unknown, in its own prior scatters; zero and one, where none are
+        given because no earlier fit has told them.
     """
 
     actuator_gain: float = 0.1
@@ -40,6 +43,7 @@ class Priors:
     shape: float = 0.2
     sampling: float = 0.5
     mean_width: float = 0.0
+    extras: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(slots=True, eq=False)

@@ -209,7 +209,7 @@ def _moved(
 
 def _cost(problem: Problem, state: State, system: NormalEquations) -> float:
     """Squares of what is left and of the distances from the priors, in standard errors."""
-    offset = state.offset(problem.mean_width)
+    offset = problem.offset(state)
     return float(np.vdot(system.residual, system.residual) + offset @ (problem.precision * offset))
 
 
