@@ -17,12 +17,10 @@ from escape_hw.calibration.docrime_fit import (
     empty_sums,
     first_fit,
     quick_look,
-    require_excitation,
 )
-from escape_hw.calibration.docrime_solution import DocrimeSolution
+from escape_hw.calibration.docrime_solution import DocrimeSolution, solution_of
 from escape_hw.calibration.lag_sums import ResponseEstimate
 from escape_hw.calibration.response import ResponseTracker, covariances, filtered
-from escape_hw.calibration.significance import require_response
 from escape_hw.calibration.telemetry import Recorder, Telemetry
 from escape_hw.errors import TooFewFrames
 
@@ -283,33 +281,10 @@ class DocrimeEstimator:
                 f"{self._sums.count} complete frames cannot constrain {self.n_modes} modes; "
                 f"at least {needed + self.order + self.lags} frames are needed"
             )
-        sums = self._sums.centred()
-        information = sums.information()
-        require_excitation(information)
-        matrix = sums.solve()
-        freedom = sums.freedom() - self.lags
-        if self.order:
-            rows, power = sums.sample(matrix)
-            require_response(information, rows, power / freedom, self.lags)
-        residual = sums.residual_power(matrix) / freedom
-        covariance = residual if residual.ndim == 2 else None
-        variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * self._spread
-        sigma = np.outer(np.sqrt(variance), np.sqrt(sums.inverse_diagonal()))
-        response = self._tracker.response()
-        scale = self._tracker.scale(response)
-        return DocrimeSolution(
-            matrix * scale,
-            sigma * np.abs(scale),
-            response.response,
-            covariance,
-            information / np.multiply.outer(scale, scale),
-            variance,
-            self._whitener,
-            self.frames,
-            self.lost_frames,
-            self._tracker.gain_sigma(response),
-            response.covariance,
-        )
+        return solution_of(
+            self._sums, self._tracker, self._whitener, self._spread,
+            lags=self.lags, frames=self.frames, lost_frames=self.lost_frames,
+        )  # fmt: skip
 
     def preview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Matrix and standard errors by the frames summed so far, for those who watch; ``None``: too few.

@@ -1,4 +1,4 @@
-"""What DO-CRIME found."""
+"""What DO-CRIME found, and how its sums say so."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 
 from escape_hw.api.brief import brief
 from escape_hw.api.results import TemporalResponse
+from escape_hw.calibration.docrime_fit import require_excitation
+from escape_hw.calibration.regression import RegressionSums
+from escape_hw.calibration.response import ResponseTracker
+from escape_hw.calibration.significance import require_response
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,3 +54,64 @@ class DocrimeSolution:
     gain_sigma: float
     response_covariance: NDArray[np.float64]
     __repr__ = brief
+
+
+def solution_of(
+    whole: RegressionSums,
+    tracker: ResponseTracker,
+    whitener: NDArray[np.float64],
+    spread: float,
+    *,
+    lags: int,
+    frames: int,
+    lost_frames: int,
+) -> DocrimeSolution:
+    """The matrix, its standard errors and the temporal response that sums hold.
+
+    Parameters
+    ----------
+    whole
+        Sums over all filtered frames, of slopes and of what the pokes made of them; not changed.
+    tracker
+        Follows the temporal response over the same frames.
+    whitener
+        The filter ``(order + 1,)``; one weight is none, and then nothing tells whether the mirror responds.
+    spread
+        Factor on the variance of an estimate whose noise is not white.
+    lags
+        Frames over which the temporal response was estimated.
+    frames, lost_frames
+        As the solution tells them.
+
+    Raises
+    ------
+    CalibrationError
+        The mirror does not respond, or the pokes do not span the modes.
+    """
+    sums = whole.centred()
+    information = sums.information()
+    require_excitation(information)
+    matrix = sums.solve()
+    freedom = sums.freedom() - lags
+    if whitener.size > 1:
+        rows, power = sums.sample(matrix)
+        require_response(information, rows, power / freedom, lags)
+    residual = sums.residual_power(matrix) / freedom
+    covariance = residual if residual.ndim == 2 else None
+    variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * spread
+    sigma = np.outer(np.sqrt(variance), np.sqrt(sums.inverse_diagonal()))
+    response = tracker.response()
+    scale = tracker.scale(response)
+    return DocrimeSolution(
+        matrix * scale,
+        sigma * np.abs(scale),
+        response.response,
+        covariance,
+        information / np.multiply.outer(scale, scale),
+        variance,
+        whitener,
+        frames,
+        lost_frames,
+        tracker.gain_sigma(response),
+        response.covariance,
+    )

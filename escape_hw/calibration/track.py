@@ -12,15 +12,14 @@ import logging
 import math
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Progress, Reporter
-from escape_hw.api.registration import PARAMETERS, TO_PLAIN
-from escape_hw.api.results import CalibrationResult, RegistrationEstimate, TemporalResponse
+from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.tracking import Alarm, TrackResult
 from escape_hw.bench import Bench
@@ -28,7 +27,7 @@ from escape_hw.calibration.acquire import Motion, next_frame
 from escape_hw.calibration.closed_loop import integrator_for
 from escape_hw.calibration.found_mirror import found_matrix
 from escape_hw.calibration.gain_curve import SCATTER
-from escape_hw.calibration.live_registration import LiveEstimate, LiveRegistration
+from escape_hw.calibration.live_registration import LiveRegistration
 from escape_hw.calibration.loop_run import RunningLoop
 from escape_hw.calibration.loop_tape import LoopTape
 from escape_hw.calibration.pseudo_synthetic import synthesise
@@ -36,6 +35,7 @@ from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepa
 from escape_hw.calibration.sprint import sprint
 from escape_hw.calibration.sprint_settings import as_configured
 from escape_hw.calibration.telemetry import Telemetry
+from escape_hw.calibration.track_answer import SHOWN, Answer, row_of, to_show
 from escape_hw.calibration.track_proposal import InUse, Proposal, inverted, propose, taken
 from escape_hw.calibration.track_watch import RunawayWatch, TrackWatch
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
@@ -53,24 +53,6 @@ _CLOSING_S, _MOTION_S = 0.3, 1.0
 _FIRST_EXCHANGE = 3
 #: Updates over which a Strehl ratio is taken.
 _STREHL_EVERY = 5
-#: What progress reports tell of the last look.
-_SHOWN = ("shift_x", "shift_x_sigma", "shift_y", "shift_y_sigma", "rotation", "rotation_sigma",
-          "optical_gain", "optical_gain_sigma", "misfit")  # fmt: skip
-
-
-#: Updates that a picture of the registration's course shows.
-_COURSE = 4096
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Answer:
-    """What the frames up to a moment say, the matrix that follows, and the latest Strehl ratio."""
-
-    seconds: float
-    live: LiveEstimate
-    made: CalibrationResult
-    proposal: Proposal
-    ratio: tuple[float, float]
 
 
 def track(
@@ -168,7 +150,7 @@ class _Tracker:
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.tape = LoopTape(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
         self.updates, self.residual_at = 0, 0
-        self.pending: Future[_Answer | None] | None = None
+        self.pending: Future[Answer | None] | None = None
         self.metrics: dict[str, float] = {}
         self.arrays: dict[str, NDArray[np.float32]] = {}
         self.runaway = RunawayWatch()
@@ -267,7 +249,7 @@ class _Tracker:
         images, loop.record.science = loop.record.science, FrameStack()
         return images
 
-    def _look(self, data: Telemetry, start: int, seconds: float, images: FrameStack | None) -> _Answer | None:
+    def _look(self, data: Telemetry, start: int, seconds: float, images: FrameStack | None) -> Answer | None:
         """What a block of frames says, if there are enough of them; in the thread."""
         try:
             live = self.live.update(data, start)
@@ -276,7 +258,7 @@ class _Tracker:
         made = synthesise(self.bench, self.grid, live.registration, self.used.matrix.m2c)
         worth = self.bench.config.tracking.worth
         found = propose(made.matrix, self.model, live, self.used, self.dropped, seconds, worth)
-        return _Answer(seconds, live, made, found, self._strehl(images))
+        return Answer(seconds, live, made, found, self._strehl(images))
 
     def _strehl(self, images: FrameStack | None) -> tuple[float, float]:
         """Strehl ratio and its error; NaN without images, or when they are off the middle of the camera."""
@@ -313,28 +295,18 @@ class _Tracker:
             self.used = proposal.to_use
         return within
 
-    def _book(self, answer: _Answer, loop: RunningLoop, exchanged: bool) -> None:
+    def _book(self, answer: Answer, loop: RunningLoop, exchanged: bool) -> None:
         """Append a row, and keep the latest matrix."""
         result, live, proposal = self.result, answer.live, answer.proposal
-        found = live.registration.measured()
         relative, relative_sigma = live.gains / self.begun, live.gains_sigma / self.begun
         result.optical_gain, result.optical_gain_sigma = relative, relative_sigma
         result.latest = replace(answer.made, matrix=proposal.to_use.matrix, response=live.response)
         residual = np.asarray(loop.record.residual[self.residual_at :])
         self.residual_at = len(loop.record.residual)
-        row = {
-            "seconds": answer.seconds,
-            **{name: one.value for name, one in found.items()},
-            **{f"{name}_sigma": one.sigma for name, one in found.items()},
-            "optical_gain": float(relative.mean()), "optical_gain_sigma": float(relative_sigma.mean()),
-            "misfit": live.misfit, "surprise": live.surprise, "noise": live.noise,
-            "mismatch": proposal.evidence.mismatch,
-            "residual_nm": float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
-            "strehl": answer.ratio[0], "strehl_sigma": answer.ratio[1], "exchanged": float(exchanged),
-        }  # fmt: skip
+        row = row_of(answer, relative, relative_sigma, residual, exchanged)
         result.add(**row)
-        self.metrics = {name: row[name] for name in _SHOWN}
-        self.arrays = _to_show(result)
+        self.metrics = {name: row[name] for name in SHOWN}
+        self.arrays = to_show(result)
 
     def _lose(self) -> None:
         """The loop diverged."""
@@ -342,16 +314,3 @@ class _Tracker:
         self.result.alarms.append(
             Alarm(self._now(), "diverged", "the loop diverged and was opened; calibrate anew")
         )
-
-
-def _to_show(result: TrackResult) -> dict[str, NDArray[np.float32]]:
-    """Course of the registration and present gains, in the units of streams."""
-    names = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS))
-    course = np.array([result.rows[name][-_COURSE:] for name in names]).T
-    course[:, 1:] *= np.tile(TO_PLAIN, 2)
-    arrays = {
-        "registration_track": course,
-        "gains": result.optical_gain,
-        "gains_sigma": result.optical_gain_sigma,
-    }
-    return {name: array.astype(np.float32) for name, array in arrays.items()}
