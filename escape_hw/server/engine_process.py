@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from escape_hw.server.channel import Lines, encode
+from escape_hw.server.growing_pause import GrowingPause
 from escape_hw.server.guardian import Watch
 from escape_hw.server.setup import Setup
 from escape_hw.streams.segments import process_start
@@ -56,7 +57,7 @@ class EngineProcess:
             self._watch = Watch(
                 config_text=setup.config_text, incidents=incidents, pid=self._process.pid, started=started
             )
-            self._guardian = self._guard()
+            self._guardian, self._pause = self._guard(), GrowingPause()
         finally:
             theirs.close()
             os.close(held)
@@ -83,17 +84,32 @@ class EngineProcess:
         guardian.stdin.close()
         return guardian
 
-    def replace_guardian(self) -> None:
-        """Have another guardian at the same pipe: the one before was killed, and the engine goes on.
+    def mind_guardian(self, alive: bool) -> None:
+        """Have another guardian at the same pipe where the one before was killed and the engine goes on.
 
-        Where none can be started now, one is at the next call.
+        To be called every second. One that dies at once, or cannot be started, is tried again after a
+        pause that grows.
+
+        Parameters
+        ----------
+        alive
+            Whether there was a guardian, when the engine was last seen alive.
         """
-        log.error("the guardian (process %d) died; another one takes its place", self._guardian.pid)
+        if alive:
+            self._pause.lives()
+            return
+        if not self._pause.over():
+            return
+        pause = self._pause.start()
+        log.error(
+            "the guardian (process %d) died; another one takes its place, and the next not within %g s",
+            self._guardian.pid, pause,
+        )  # fmt: skip
         try:
             self._guardian = self._guard()
         except OSError as error:
             # Whatever killed the guardian, such as want of memory, must not end the server, too.
-            log.error("no guardian could be started, which is tried again: %s", error)
+            log.error("no guardian could be started, which is tried again in %g s: %s", pause, error)
 
     @property
     def pid(self) -> int:

@@ -92,8 +92,8 @@ class Keeper:
         if engine.ended():
             self._bury(engine)
             return
-        if tick and not guarded:
-            engine.replace_guardian()
+        if tick:
+            engine.mind_guardian(guarded)
         self._mind_abandoned(engine)
         # On a busy machine a compiler may hold an engine up; that harms nobody while the mirror is flat.
         moving = self._state.mirror.peak > 0 or self._state.loop.closed

@@ -17,6 +17,7 @@ from escape_hw.remote.state import Finish, Phase
 from escape_hw.server import jobs
 from escape_hw.server.board import Board, LoopChoice
 from escape_hw.server.engine_process import EngineProcess
+from escape_hw.server.growing_pause import GrowingPause
 from escape_hw.server.pulse import Pulse
 
 
@@ -89,20 +90,50 @@ def test_a_loop_that_somebody_opens_is_none_to_return_to(engine: Engine) -> None
         board.require_idle()
 
 
-def test_a_guardian_that_cannot_be_started_is_no_end_of_the_server(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    process = EngineProcess.__new__(EngineProcess)
-    process._guardian = SimpleNamespace(pid=4711)
+@pytest.fixture
+def process() -> Any:
+    """The front's side of an engine whose guardian is dead, and a clock."""
+    made: Any = EngineProcess.__new__(EngineProcess)
+    made.now = 1000.0
+    made._guardian, made._pause = SimpleNamespace(pid=4711), GrowingPause(lambda: made.now)
+    return made
 
+
+def test_a_guardian_that_cannot_be_started_is_no_end_of_the_server(
+    process: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     def refuse(process: EngineProcess) -> None:
         raise BlockingIOError("Resource temporarily unavailable")
 
     monkeypatch.setattr(EngineProcess, "_guard", refuse)
+    process.now += 1
     with caplog.at_level(logging.ERROR):
-        process.replace_guardian()
+        process.mind_guardian(alive=False)
     assert process._guardian.pid == 4711
-    assert "tried again: Resource temporarily unavailable" in caplog.text
+    assert "tried again in 2 s: Resource temporarily unavailable" in caplog.text
+
+
+def test_a_guardian_that_dies_at_once_is_started_less_and_less_often(
+    process: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    starts: list[float] = []
+
+    def start(process: Any) -> SimpleNamespace:
+        starts.append(process.now - 1000)
+        return SimpleNamespace(pid=4712)
+
+    monkeypatch.setattr(EngineProcess, "_guard", start)
+    with caplog.at_level(logging.ERROR):
+        for _ in range(183):
+            process.now += 1
+            process.mind_guardian(alive=False)
+    assert starts == [1, 3, 7, 15, 31, 63, 123, 183]
+    assert caplog.text.count("died; another one takes its place") == len(starts)
+    # One that lived for a minute and is then killed is replaced at once, as the first one was.
+    for alive in [True] * 60 + [False]:
+        process.now += 1
+        process.mind_guardian(alive)
+    assert starts[-1] == 244
 
 
 def test_no_older_state_is_told_after_a_newer_one() -> None:
