@@ -76,6 +76,8 @@ class DeformableMirror(Device):
 
     Attributes
     ----------
+    flattened_count
+        How often it was flattened; every loop begins with that.
     tap
         Told of every shape that was sent, see :class:`~escape_hw.api.taps.Taps`.
     """
@@ -89,6 +91,7 @@ class DeformableMirror(Device):
         self.sent_count = 0
         self.clipped_count = 0
         self.rejected_count = 0
+        self.flattened_count = 0
         self.tap: Callable[[NDArray[np.float64]], object] | None = None
         self._flat: NDArray[np.float64] | None = None
         self._guard: CommandGuard | None = None
@@ -227,6 +230,7 @@ class DeformableMirror(Device):
             guard = self._checked()
             if not self._movable():
                 return
+            self.flattened_count += 1
             target = self.flat
             step = min(self.RAMP_STEP, self.limits.max_slew or self.RAMP_STEP)
             distance = float(np.abs(target - guard.last).max(initial=0.0))
@@ -262,7 +266,7 @@ class DeformableMirror(Device):
         present = self._present_shape()
         guard.reset(present)
         self._guard, self._shape_known = guard, present is not None
-        self.sent_count = self.clipped_count = self.rejected_count = 0
+        self.sent_count = self.clipped_count = self.rejected_count = self.flattened_count = 0
 
     def _before_close(self) -> None:
         self.flatten()

@@ -102,6 +102,8 @@ class Mirror(Part):
     peak: float = 0.0
     #: Share of the actuators held at a limit, mean over the last second.
     clipped: float = 0.0
+    #: How often it was flattened: no loop is the same one before and after.
+    flattened: int = 0
 
 
 class Latency(Part):

@@ -150,6 +150,7 @@ class Pulse:
             rms=float(np.sqrt(np.mean(np.square(command)))),
             peak=float(np.abs(command).max(initial=0.0)),
             clipped=clipped / (sent * command.size) if sent > 0 else 0.0,
+            flattened=dm.flattened_count,
         )
 
     def _disk(self) -> Disk:

@@ -40,14 +40,16 @@ class Watchdog:
         self._frames_at = self._clipped_since = clock()
         self._residuals: deque[float] = deque(maxlen=_USUAL)
         self._diverging_since: float | None = None
-        #: Whether a loop is closed, and by which run: a run may close its own before anybody sees one open.
-        self._loop: tuple[bool, int | None] = (False, None)
+        #: Whether a loop is closed, by which run, and after how many flattenings of the mirror: a run may
+        #: close its own, or close it again, before anybody sees one open.
+        self._loop: tuple[bool, int | None, int] = (False, None, 0)
 
     def judge(self, state: State) -> Verdict | None:
         """The verdict on a state; ``None``: all is well."""
         if state.fault is not None:
             return None
-        loop = state.loop.closed, None if state.procedure is None else state.procedure.id
+        run = None if state.procedure is None else state.procedure.id
+        loop = state.loop.closed, run, state.mirror.flattened
         if loop != self._loop:
             self._loop = loop
             self._residuals.clear()

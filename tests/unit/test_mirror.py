@@ -316,6 +316,17 @@ def test_two_threads_never_break_the_slew_rule_between_them() -> None:
         assert steps(dm.history) <= 0.01 + 1e-9
 
 
+def test_flattenings_are_counted() -> None:
+    with RecordingMirror(limits=MirrorLimits()) as dm:
+        before = dm.flattened_count
+        dm.send([0.3] * N)
+        assert dm.flattened_count == before
+        dm.flatten()
+        # Flat already: whoever asks begins anew all the same.
+        dm.flatten()
+        assert dm.flattened_count == before + 2
+
+
 def test_guard_report_reaches_the_counters() -> None:
     with RecordingMirror(limits=MirrorLimits(max_stroke=0.5)) as dm:
         report = dm.send([0.9] * 5 + [0.0] * (N - 5))

@@ -19,6 +19,7 @@ class Engine:
     def tell(
         self, seconds: float, *, closed: bool = True, frames: int = 100, residual: float = 50.0,
         clipped: float = 0.0, fault: Fault | None = None, fresh: bool = True, run: int | None = None,
+        flattened: int = 1,
     ) -> Verdict | None:  # fmt: skip
         """So many seconds alike; the first verdict."""
         for _ in range(round(4 * seconds)):
@@ -26,7 +27,7 @@ class Engine:
             self.frames += frames
             self.told += fresh
             state = State(
-                rates=Rates(frames=self.frames), mirror=Mirror(clipped=clipped), fault=fault,
+                rates=Rates(frames=self.frames), mirror=Mirror(clipped=clipped, flattened=flattened), fault=fault,
                 procedure=None if run is None else Running(id=run, name="gains", arguments={}),
                 # No two residuals are quite the same.
                 loop=LoopState(closed=closed, residual_nm=residual * (1 + 1e-6 * self.told)),
@@ -58,6 +59,15 @@ def test_a_run_that_closes_a_loop_of_its_own_is_not_held_against_the_one_before(
     verdict = engine.tell(5, residual=250)
     assert verdict is not None
     assert "the residual grew" in verdict.reason
+
+
+def test_a_loop_that_a_run_closes_again_is_not_held_against_its_round_before(engine: Engine) -> None:
+    assert engine.tell(20, residual=60, run=5) is None
+    # Opened, the mirror flat, and closed at a lower gain: no state came in between.
+    assert engine.tell(20, residual=250, run=5, flattened=2) is None
+    verdict = engine.tell(5, residual=1100, run=5, flattened=2)
+    assert verdict is not None
+    assert "the residual grew to 1100 nm" in verdict.reason
 
 
 def test_no_frames_in_closed_loop(engine: Engine) -> None:
