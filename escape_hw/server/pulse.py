@@ -37,10 +37,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PERIOD_S = 0.2
-#: Pulses over which the share of clipped actuators is averaged.
-_SECOND = round(1 / PERIOD_S)
-
-
+#: Seconds over which the share of clipped actuators is averaged.
+_CLIPPED_S = 1.0
 #: Time over which the camera's rate is taken; longer than a frame may need while nothing runs.
 _RATE_S = 0.5
 
@@ -56,6 +54,8 @@ class Pulse:
         Gets each state.
     telemetry
         What the recorder says.
+    clock
+        Monotonic seconds.
     """
 
     def __init__(
@@ -67,13 +67,15 @@ class Pulse:
         runs: Path,
         tell: Callable[[State], object],
         telemetry: Callable[[], Telemetry] = Telemetry,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bench, self._board, self._publisher, self._shelf = bench, board, publisher, shelf
         self._runs, self._tell, self._telemetry = runs, tell, telemetry
+        self._clock = clock
         self._ending, self._telling = threading.Event(), threading.Lock()
         self._last: tuple[float, Frame | None] = (0.0, None)
         self._rate, self._lost = 0.0, 0
-        self._clipped: deque[tuple[int, int]] = deque(maxlen=_SECOND + 1)
+        self._clipped: deque[tuple[float, int, int]] = deque()
         self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
 
     def start(self) -> None:
@@ -125,7 +127,7 @@ class Pulse:
         )  # fmt: skip
 
     def _rates(self, frame: Frame | None) -> Rates:
-        now, (at, before) = time.monotonic(), self._last
+        now, (at, before) = self._clock(), self._last
         if frame is not None and now - at > _RATE_S:
             self._last = (now, frame)
             self._rate = 0.0 if before is None else _rate(before, frame)
@@ -144,8 +146,12 @@ class Pulse:
         dm, command = self._bench.dm, self._publisher.command
         if command is None or not dm.is_open:
             return Mirror()
-        self._clipped.append((dm.clipped_count, dm.sent_count))
-        clipped, sent = (b - a for a, b in zip(self._clipped[0], self._clipped[-1], strict=True))
+        now = self._clock()
+        self._clipped.append((now, dm.clipped_count, dm.sent_count))
+        # The one kept longest is the newest that is a second old.
+        while len(self._clipped) > 2 and now - self._clipped[1][0] >= _CLIPPED_S:
+            self._clipped.popleft()
+        _, clipped, sent = (b - a for a, b in zip(self._clipped[0], self._clipped[-1], strict=True))
         return Mirror(
             rms=float(np.sqrt(np.mean(np.square(command)))),
             peak=float(np.abs(command).max(initial=0.0)),

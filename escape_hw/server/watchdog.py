@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from escape_hw.config.server_models import ServerSection
 from escape_hw.remote.state import State
 
-#: Residuals over which the present and the usual one are taken, in states (five a second).
-_NOW, _USUAL = 5, 150
+#: Seconds over which the present and the usual residual are taken, and those without which none is judged.
+_NOW_S, _USUAL_S, _LEAST_S = 1.0, 30.0, 4.0
+#: A residual that follows the one before sooner is left out: states told out of turn weigh no more.
+_SOONEST_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +39,13 @@ class Watchdog:
     def __init__(self, limits: ServerSection, clock: Callable[[], float] = time.monotonic) -> None:
         self._limits, self._clock = limits, clock
         self._frames = -1
-        self._frames_at = self._clipped_since = clock()
-        self._residuals: deque[float] = deque(maxlen=_USUAL)
+        #: Since when something was seen to be so, state after state. What was not told is held against
+        #: nobody: this process itself may have been held up.
+        self._still_since: float | None = None
+        self._clipped_since: float | None = None
         self._diverging_since: float | None = None
+        #: Residuals and when they were told.
+        self._residuals: deque[tuple[float, float]] = deque()
         #: Whether a loop is closed, by which run, and after how many flattenings of the mirror: a run may
         #: close its own, or close it again, before anybody sees one open.
         self._loop: tuple[bool, int | None, int] = (False, None, 0)
@@ -53,16 +59,17 @@ class Watchdog:
         if loop != self._loop:
             self._loop = loop
             self._residuals.clear()
-            self._frames_at = self._clipped_since = self._clock()
-            self._diverging_since = None
+            self._still_since = self._clipped_since = self._diverging_since = None
         return self._frames_arrive(state) or self._clipping(state) or self._diverging(state)
 
     def _frames_arrive(self, state: State) -> Verdict | None:
         now, limit = self._clock(), self._limits.no_frames_s
         if state.rates.frames != self._frames or not state.loop.closed:
-            self._frames, self._frames_at = state.rates.frames, now
+            self._frames, self._still_since = state.rates.frames, None
             return None
-        silent = now - self._frames_at
+        if self._still_since is None:
+            self._still_since = now
+        silent = now - self._still_since
         if silent <= limit:
             return None
         return Verdict(
@@ -73,8 +80,10 @@ class Watchdog:
     def _clipping(self, state: State) -> Verdict | None:
         now, limit, most = self._clock(), self._limits.saturated_s, self._limits.saturated_share
         if not state.loop.closed or state.mirror.clipped <= most:
-            self._clipped_since = now
+            self._clipped_since = None
             return None
+        if self._clipped_since is None:
+            self._clipped_since = now
         if now - self._clipped_since <= limit:
             return None
         return Verdict(
@@ -86,15 +95,19 @@ class Watchdog:
     def _diverging(self, state: State) -> Verdict | None:
         if not state.loop.closed or state.loop.residual_nm <= 0:
             return None
-        if self._residuals and state.loop.residual_nm == self._residuals[-1]:
+        now, told = self._clock(), self._residuals
+        if told and (state.loop.residual_nm == told[-1][1] or now - told[-1][0] < _SOONEST_S):
             # No frame since the last state: a procedure that closes a loop of its own has not begun with it.
             return None
-        self._residuals.append(state.loop.residual_nm)
-        if len(self._residuals) < 4 * _NOW:
+        told.append((now, state.loop.residual_nm))
+        while now - told[0][0] > _USUAL_S:
+            told.popleft()
+        before = [residual for at, residual in told if now - at >= _NOW_S]
+        if now - told[0][0] < _LEAST_S or not before:
             return None
-        values = list(self._residuals)
-        present, usual = statistics.median(values[-_NOW:]), statistics.median(values[:-_NOW])
-        now, factor, limit = self._clock(), self._limits.diverging_factor, self._limits.diverging_s
+        present = statistics.median(residual for at, residual in told if now - at < _NOW_S)
+        usual = statistics.median(before)
+        factor, limit = self._limits.diverging_factor, self._limits.diverging_s
         if present <= factor * usual:
             self._diverging_since = None
             return None

@@ -10,10 +10,10 @@ from escape_hw.server.watchdog import Verdict, Watchdog
 
 
 class Engine:
-    """Tells a state four times a second."""
+    """Tells a state every so many seconds."""
 
-    def __init__(self) -> None:
-        self.now, self.frames, self.told = 0.0, 0, 0
+    def __init__(self, every: float = 0.25) -> None:
+        self.now, self.frames, self.told, self.every = 0.0, 0, 0, every
         self.dog = Watchdog(ServerSection(), lambda: self.now)
 
     def tell(
@@ -22,12 +22,13 @@ class Engine:
         flattened: int = 1,
     ) -> Verdict | None:  # fmt: skip
         """So many seconds alike; the first verdict."""
-        for _ in range(round(4 * seconds)):
-            self.now += 0.25
+        for _ in range(round(seconds / self.every)):
+            self.now += self.every
             self.frames += frames
             self.told += fresh
             state = State(
-                rates=Rates(frames=self.frames), mirror=Mirror(clipped=clipped, flattened=flattened), fault=fault,
+                rates=Rates(frames=self.frames), fault=fault,
+                mirror=Mirror(clipped=clipped, flattened=flattened),
                 procedure=None if run is None else Running(id=run, name="gains", arguments={}),
                 # No two residuals are quite the same.
                 loop=LoopState(closed=closed, residual_nm=residual * (1 + 1e-6 * self.told)),
@@ -96,6 +97,36 @@ def test_a_residual_that_grows(engine: Engine) -> None:
     verdict = engine.tell(3, residual=300)
     assert verdict is not None
     assert "grew to 300 nm, 6.0 times the usual 50 nm" in verdict.reason
+
+
+@pytest.mark.parametrize("every", [0.02, 0.2, 1.5])
+def test_a_residual_that_grows_is_noticed_however_often_the_state_is_told(every: float) -> None:
+    engine = Engine(every)
+    assert engine.tell(12, residual=50) is None
+    verdict = None
+    for residual in (90, 130, 170, 250, 330, 400, 400):
+        verdict = verdict or engine.tell(1.5, residual=residual)
+    assert verdict is not None
+    assert "times the usual 50 nm" in verdict.reason
+
+
+def test_states_told_out_of_turn_weigh_no_more(engine: Engine) -> None:
+    assert engine.tell(10, residual=50) is None
+    # As when somebody asks for many things in a moment in which the residual is high.
+    engine.every = 0.001
+    assert engine.tell(0.2, residual=300) is None
+    engine.every = 0.25
+    assert engine.tell(10, residual=50) is None
+
+
+def test_a_server_that_was_held_up_holds_it_against_nobody(engine: Engine) -> None:
+    """States wait for it meanwhile, each a fifth of a second after the one before."""
+    assert engine.tell(10) is None
+    engine.now += 5
+    engine.every = 0.001
+    assert engine.tell(0.005, frames=0, clipped=0.5) is None
+    engine.every = 0.25
+    assert engine.tell(10) is None
 
 
 def test_a_residual_before_the_loop_was_closed_does_not_count(engine: Engine) -> None:

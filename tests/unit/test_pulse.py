@@ -1,0 +1,51 @@
+"""What the engine's state says of the mirror, however often it is asked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from escape_hw.server.pulse import Pulse
+
+
+class Looked:
+    """A pulse on a mirror of ten actuators that takes 500 commands a second, and a clock."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+        self.dm = SimpleNamespace(is_open=True, clipped_count=0, sent_count=0, flattened_count=0)
+        bench: Any = SimpleNamespace(dm=self.dm)
+        publisher: Any = SimpleNamespace(command=np.full(10, 0.5))
+        nothing: Any = None
+        self.pulse = Pulse(
+            bench, nothing, publisher, nothing, Path(), lambda state: None, clock=lambda: self.now
+        )
+
+    def pass_by(self, seconds: float, every: float, clipped: int) -> float:
+        """So many seconds with so many actuators clipped; the share in the last state."""
+        share = 0.0
+        for _ in range(round(seconds / every)):
+            self.now += every
+            self.dm.sent_count += round(500 * every)
+            self.dm.clipped_count += clipped * round(500 * every)
+            share = self.pulse._mirror().clipped
+        return share
+
+
+@pytest.mark.parametrize("every", [0.02, 0.2, 0.5, 2.0])
+def test_the_share_of_clipped_actuators_is_that_of_the_last_second(every: float) -> None:
+    looked = Looked()
+    looked.pass_by(4, every, clipped=0)
+    share = looked.pass_by(max(every, 0.5), every, clipped=4)
+    assert share == pytest.approx(0.4 if every > 1 else 0.2, abs=0.05)
+    assert looked.pass_by(2, every, clipped=4) == pytest.approx(0.4)
+
+
+def test_it_tells_how_often_the_mirror_was_flattened() -> None:
+    looked = Looked()
+    looked.dm.flattened_count = 3
+    assert looked.pulse._mirror().flattened == 3
