@@ -66,6 +66,8 @@ def _show(one: Session, result: TrackResult, record: BenchRecord, document: dict
     if found:
         planted = Registration(**document["planted_end"]) if document["planted_end"] else None
         one.show(rich_table(parameters_table({"": found}, planted)))
+    if document["planted_note"]:
+        one.show(document["planted_note"])
     if result.optical_gain.size:
         value, sigma = result.optical_gain.mean(), result.optical_gain_sigma.mean()
         one.show(f"optical gain beside the first matrix: {value:.3f} ± {sigma:.3f}")

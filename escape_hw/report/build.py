@@ -232,6 +232,8 @@ def _track(run: RunContent) -> str:
         )
         parts.append(html.table(tables.Table(heads, lines), what))
     parts.append(html.notes([f"after {one['seconds']:.0f} s: {one['text']}" for one in alarms], "bad"))
+    note = run.document.get("planted_note")
+    parts.append(html.notes([note] if note else []))
     return html.section("Tracking", *parts)
 
 

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from escape_hw.api.procedure import Procedure
-from escape_hw.api.registration import PARAMETERS
+from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.tracking import TrackResult
+from escape_hw.bench import mode_of
 from escape_hw.runtime.matrix_task import MatrixTask
 from escape_hw.runtime.task import Kept, given, refuse_simulated
 
 if TYPE_CHECKING:
     from escape_hw.bench import Bench
+    from escape_hw.config.models import SystemConfig
+    from escape_hw.config.twin_drift import TwinDrift
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.records import BenchRecord
+
+#: Why a drifting twin's course stands nowhere.
+UNKNOWN = (
+    "the twin behind these drivers drifts by a clock of its own, so where its mirror sat is not known here"
+)
 
 
 class TrackTask(MatrixTask):
@@ -79,18 +91,18 @@ class TrackTask(MatrixTask):
         if result.latest is not None:
             keep_calibration(folder, record, "im", result.latest, {"im": self.product.path})
         track = track_document(result)
-        ended = self._planted(result, result.rows["seconds"][-1:]) if record.simulated else None
+        known = planted(self.config) if record.simulated else None
+        began, end = result.began_ns * 1e-9, result.rows["seconds"][-1:]
         document = finish(
             folder,
             {
                 **record.head("track"),
                 "title": f"Tracking {record.system}",
                 **track,
-                "planted_course": self._planted(result, track["track"]["seconds"])
-                if record.simulated
-                else None,
+                "planted_course": None if known is None else known.course(began, track["track"]["seconds"]),
                 # The truth where the track ends, beside its registration there.
-                "planted_end": None if ended is None else {k: at[0] for k, at in ended.items() if at},
+                "planted_end": None if known is None or not end else known.at(began + end[0]).to_dict(),
+                "planted_note": UNKNOWN if record.simulated and known is None else "",
                 "im": self.product.path.absolute(),
                 "criteria": [
                     {"text": "loop stable", "met": result.stable},
@@ -101,11 +113,42 @@ class TrackTask(MatrixTask):
         )
         return Kept(document, result.stable and not result.alarms)
 
-    def _planted(self, result: TrackResult, seconds: list[float]) -> dict[str, list[float]] | None:
-        """True registration of the twin at some moments of the track; for reports only."""
-        twin = self.config.twin
-        if twin is None:
-            return None
-        start = twin.registration.to_registration().to_array()
-        course = [start + twin.drift.way(result.began_ns * 1e-9 + t) for t in seconds]
-        return {name: [float(there[k]) for there in course] for k, name in enumerate(PARAMETERS)}
+
+@dataclass(frozen=True, slots=True)
+class Planted:
+    """Where a twin's mirror really sits; for reports only.
+
+    Parameters
+    ----------
+    start
+        At time zero of the twin's clock.
+    drift
+        How it moves on.
+    """
+
+    start: Registration
+    drift: TwinDrift
+
+    def at(self, seconds: float) -> Registration:
+        """At a time of the twin's clock."""
+        there = Registration.from_array(self.start.to_array() + self.drift.way(seconds))
+        return replace(there, anamorphosis_angle=self.start.anamorphosis_angle)
+
+    def course(self, began: float, seconds: Sequence[float]) -> dict[str, list[float]]:
+        """Every parameter, scalings along x and y, some seconds after a time of the twin's clock."""
+        there = np.array([self.at(began + t).along_axes[0].to_array() for t in seconds])
+        return {
+            name: column.tolist() for name, column in zip(PARAMETERS, there.reshape(-1, 5).T, strict=True)
+        }
+
+
+def planted(config: SystemConfig) -> Planted | None:
+    """Where the mirror of a simulated system sits; ``None`` where that cannot be known.
+
+    Behind real drivers the twin runs on a clock that no driver tells: frames have the computer's time.
+    Where nothing moves, no clock is needed.
+    """
+    drift = config.twin.drift
+    if drift.moves and mode_of(config.devices.wfs, config) != "sim":
+        return None
+    return Planted(config.twin.registration.to_registration(), drift)
