@@ -19,11 +19,9 @@ from escape_hw.calibration.covariance import FLOOR
 from escape_hw.calibration.derivatives import modal_matrix
 from escape_hw.calibration.linearisation import Problem
 from escape_hw.calibration.misfit import NormalEquations, Priors
+from escape_hw.calibration.noise_patterns import NoisePatterns
 from escape_hw.calibration.telemetry_sprint import independent_columns
 from escape_hw.calibration.weighted import WeightedMatrix
-
-#: Passes that find the level of the uncorrelated part of the noise.
-_PASSES = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +44,6 @@ def registration_bound(
     matrix: InteractionMatrix,
     gram: NDArray[np.float64],
     covariance: NDArray[np.float64],
-    rows: int,
     model: SyntheticModel,
     registration: Registration,
     priors: Priors,
@@ -62,8 +59,6 @@ def registration_bound(
     covariance
         Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``, or its diagonal ``(n_slopes,)``
         where more is not known.
-    rows
-        Degrees of freedom that the covariance rests on.
     model
         The synthetic model on the same grid.
     registration
@@ -79,41 +74,13 @@ def registration_bound(
     problem = Problem(WeightedMatrix.of(columns, np.arange(columns.n_modes)), model, priors)
     system = problem.linearise(problem.start(registration))
     if covariance.ndim == 2:
-        inverse = inverse_correlation(covariance / np.sqrt(np.outer(variance, variance)), rows)
-        whole = correlated_information(system, problem.precision, inverse)
+        noise = NoisePatterns.of(covariance, problem.weighted.weigh(model.zonal_matrix(registration)))
+        whole = correlated_information(system, problem.precision, noise.inverse())
         hybrid = np.linalg.inv(whole)
     else:
         whole, hybrid = system.inner, np.linalg.inv(system.information())
     exact = np.linalg.inv(whole[:6, :6])
     return Bound(np.sqrt(np.diag(exact)[1:6]), np.sqrt(np.diag(hybrid)[1:6] + np.square(FLOOR)))
-
-
-def inverse_correlation(correlation: NDArray[np.float64], rows: int) -> NDArray[np.float64]:
-    """Inverse of a correlation matrix that was measured on few rows.
-
-    The inverse of a sample covariance of ``p`` slopes from ``n`` rows is too large by ``n / (n - p)``, and no
-    shrinkage that leaves it invertible cures that. So the noise is taken for a few patterns that move many
-    slopes together, on top of uncorrelated noise (Johnstone 2001): eigenvalues within the Marchenko-Pastur
-    bulk, ``(1 + sqrt(p / n))^2`` and below, are scatter about one level, and those beyond it are put back by
-    what the sample raises them by, ``l -> l (1 + (p / n) / (l - 1))``.
-
-    Parameters
-    ----------
-    correlation
-        ``(p, p)`` with unit diagonal.
-    rows
-        Degrees of freedom ``n`` behind it.
-    """
-    values, patterns = np.linalg.eigh(correlation)
-    p, ratio, level = len(values), len(values) / rows, 1.0
-    for _ in range(_PASSES):
-        relative = values / level
-        beyond = relative > (1 + np.sqrt(ratio)) ** 2
-        half = (relative[beyond] + 1 - ratio) / 2
-        true = level * (half + np.sqrt(np.maximum(np.square(half) - relative[beyond], 0.0)))
-        level = max(float((p - true.sum()) / max(p - true.size, 1)), float(values.mean()) / p)
-    spikes = patterns[:, beyond]
-    return np.asarray(np.eye(p) / level + (spikes * (1 / true - 1 / level)) @ spikes.T)
 
 
 def correlated_information(

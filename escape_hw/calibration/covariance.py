@@ -11,7 +11,7 @@ from escape_hw.calibration.weighted import WeightedMatrix
 
 #: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
 #: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
-FLOOR = np.array([0.03, 0.03, 0.0, 0.045, 0.024])
+FLOOR = np.array([0.03, 0.03, 0.0, 0.045, 0.018])
 
 
 class Linearised(Protocol):
@@ -54,18 +54,32 @@ def _nearness(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.asarray(down[np.ix_(rows, rows)] * right[np.ix_(columns, columns)])
 
 
+def _expected(scores: NDArray[np.float64], correlation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance of summed scores ``(n, n)`` that a correlation of the slopes' noise makes."""
+    spread = np.matmul(correlation, scores).reshape(len(scores), -1)
+    return np.asarray(scores.reshape(len(scores), -1) @ spread.T)
+
+
+def _positive(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of a symmetric matrix with positive eigenvalues."""
+    values, directions = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray((directions * np.maximum(values, 0.0)) @ directions.T)
+
+
 def sandwich(
     weighted: WeightedMatrix, system: Linearised, noise: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
     """Sandwich covariance of the common parameters, in units of their own.
 
-    The middle is the scatter of the scores over the pupil as it is found, which includes what the
-    model still misses. Neighbouring sub-apertures err together, and what the model misses has its
-    own pattern over the pupil, so products of scores count with a weight that falls linearly with
-    the distance to zero at half the pupil (Bartlett's window, as in Newey & West 1987 over time).
-    Beyond that the noise's correlation fills in where it is known, and else the scatter of the
-    scores from mode to mode, which shows what moved all slopes together while one mode was
-    measured. What is common to the whole pupil no scatter can show; :data:`FLOOR` stands for it.
+    The middle is the covariance of the scores. What the noise makes of them is told by its own
+    covariance, where it is known: neighbouring sub-apertures err together. What the model misses has
+    its own pattern over the pupil and is in their scatter, so products of scores count with a weight that
+    falls linearly with the distance to zero at half the pupil (Bartlett's window, as in Newey & West 1987
+    over time), and only what they show beyond the noise is added: the scores of a solution sum to
+    nothing, so the window alone takes the noise for smaller than it is. Without a covariance the window is
+    all there is, and beyond it the scatter of the scores from mode to mode, which shows what moved all slopes
+    together while one mode was measured. What is common to the whole pupil no scatter can show; :data:`FLOOR`
+    stands for it.
 
     Parameters
     ----------
@@ -86,16 +100,10 @@ def sandwich(
         by_mode = each.sum(axis=1)
         meat += by_mode @ by_mode.T
     else:
-        # What is near is in the scatter already.
-        whole = (
-            (1 - np.tile(_nearness(valid), (2, 2)))
-            * noise
-            / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
-        )
-        spread = np.matmul(whole, scores).reshape(len(scores), -1)
-        # Only what adds to the errors counts: negative correlations are too uncertain to trade on.
-        shares, directions = np.linalg.eigh(scores.reshape(len(scores), -1) @ spread.T)
-        meat += (directions * np.maximum(shares, 0.0)) @ directions.T
+        correlation = noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
+        near = np.tile(_nearness(valid), (2, 2)) * correlation
+        # What the scatter shows beyond the noise is the model's.
+        meat = _expected(scores, correlation) + _positive(meat - _expected(scores, near))
     found = bread @ meat @ bread
     # Never better than the noise alone allows.
     scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))

@@ -46,8 +46,6 @@ MIN_ROWS = 12
 #: By how much more the scalings of short runs come out wrong alike on all plants, times the frames [%]: found
 #: over random plants on a twin with all imperfections, like the floor (docs/decisions).
 _SHORT = np.array([0.0, 0.0, 0.0, 0.8, 0.8])
-#: Whitened frames at which the measured correlation of the slopes' noise counts half.
-_CORRELATION_ROWS = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +61,7 @@ class TelemetryFit:
     whitener
         The filter over time, for frames with a full past.
     covariance
-        Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``, shrunk towards its diagonal;
+        Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``;
         ``None`` with more than :data:`~escape_hw.calibration.docrime.MOST_CORRELATED` slopes.
     rows
         Whitened frames that it rests on.
@@ -186,7 +184,7 @@ def telemetry_sprint(
         left = slopes if matrix is None else slopes - frames.seen(response.weights) @ matrix.T
         freedom = max(n - 1 - decided / slopes.shape[1], 1.0)
         variance = np.square(left).sum(axis=0) / freedom
-        covariance = _shrunk(left) if left.shape[1] <= MOST_CORRELATED else None
+        covariance = left.T @ left / n if left.shape[1] <= MOST_CORRELATED else None
         fit = yield from fit_steps(
             frames.columns(frame, response.weights, matrix, variance), model,
             solver=solver, loss=loss, start=start, learning_rate=learning_rate,
@@ -304,14 +302,6 @@ def _response(
     if known is not None and known.sigma.max() < measured.sigma.max() and not contradicts(measured, known):
         return known
     return measured
-
-
-def _shrunk(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariance of the slopes' noise: few frames tell its diagonal, many its correlations too."""
-    n = len(residuals)
-    covariance = residuals.T @ residuals / n
-    share = n / (n + _CORRELATION_ROWS)
-    return np.asarray(share * covariance + (1 - share) * np.diag(np.diag(covariance)))
 
 
 def fitted_whitener(

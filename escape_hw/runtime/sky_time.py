@@ -167,12 +167,11 @@ def _bounds(
     data = time_line(*record, before=solution.whitener.size + lags)
     pokes = filtered(data, solution.whitener, lags).driven(solution.response.weights).astype(float)
     noise = solution.variance if solution.covariance is None else solution.covariance
-    rows = len(pokes) - matrix.n_modes
     out = np.empty((2, len(frames), 5))
     for f, count in enumerate(frames):
         few = pokes[:count] - pokes[:count].mean(axis=0)
         bound = registration_bound(
-            matrix, few.T @ few, noise, rows, model, fit.estimate.registration, fit.learned().priors
+            matrix, few.T @ few, noise, model, fit.estimate.registration, fit.learned().priors
         )
         out[:, f] = bound.exact, bound.hybrid
     return out

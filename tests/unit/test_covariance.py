@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
 
-from escape_hw.calibration.covariance import _gathered, _nearness
+import numpy as np
+import pytest
+
+from escape_hw.calibration.covariance import FLOOR, _gathered, _nearness, sandwich
+from escape_hw.calibration.weighted import WeightedMatrix
 
 
 def test_sums_by_nearness_two_ways():
@@ -18,3 +22,48 @@ def test_nearness_falls_to_nothing_at_half_the_pupil():
     near = _nearness(np.ones((1, 11), bool))
     np.testing.assert_allclose(near[0], np.maximum(1 - np.arange(11) / 5.5, 0))
     assert np.linalg.eigvalsh(_nearness(np.ones((6, 8), bool))).min() > -1e-12
+
+
+@dataclass
+class Linear:
+    """A linear model of six parameters, fitted."""
+
+    derivatives: np.ndarray
+    residual: np.ndarray
+
+    def information(self):
+        flat = self.derivatives.reshape(6, -1)
+        return flat @ flat.T
+
+    def efficient(self):
+        return self.derivatives
+
+
+@pytest.mark.parametrize("missed", [0.0, 0.5])
+def test_stated_errors_are_those_of_fits_to_noise_that_neighbours_share(missed):
+    # Truth is zero; the estimator sees noise, and half the time a pattern that its model misses.
+    rng = np.random.default_rng(4)
+    valid, n_modes = np.ones((10, 10), bool), 12
+    places = np.argwhere(valid)
+    distance = np.linalg.norm(places[:, None] - places, axis=2)
+    noise = np.kron(np.eye(2), np.exp(-distance / 3.0))
+    root = np.linalg.cholesky(noise)
+    angle = places @ rng.normal(0, 0.6, (2, 12 * n_modes)) + rng.uniform(0, 6.3, 12 * n_modes)
+    derivatives = np.sin(angle).T.reshape(6, n_modes, 200).swapaxes(1, 2) * 3.0
+    flat = derivatives.reshape(6, -1)
+    weighted = WeightedMatrix(
+        np.zeros((200, n_modes)), np.ones(200), np.ones(n_modes), np.eye(n_modes), True, valid
+    )
+    errors, stated = [], []
+    for _ in range(300):
+        pattern = np.sin(np.tile(places, (2, 1)) @ rng.normal(0, 0.6, 2) + rng.uniform(0, 6.3))
+        data = root @ rng.standard_normal((200, n_modes))
+        data += missed * pattern[:, None] * rng.standard_normal(n_modes)
+        found = np.linalg.solve(flat @ flat.T, flat @ data.ravel())
+        left = data - np.tensordot(found, derivatives, 1)
+        errors.append(found)
+        stated.append(np.diag(sandwich(weighted, Linear(derivatives, left), noise)))
+    floor = np.concatenate([[0.0], np.square(FLOOR)])
+    ratio = (np.mean(stated, axis=0) - floor) / np.mean(np.square(errors), axis=0)
+    assert (ratio > 0.8).all(), ratio
+    assert (ratio < 1.6).all(), ratio
