@@ -14,12 +14,11 @@ done; plants that the file has already are not run again. Exits with 1 when a pl
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from plant_tables import Line, each_plant
 
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint import sprint
@@ -41,7 +40,7 @@ def far_plant(number: int, pitch: float) -> Registration:
     )
 
 
-def run_plant(system: str, number: int) -> dict[str, Any]:
+def run_plant(system: str, number: int) -> Line:
     """Measure one plant and look for it."""
     config = twins_of(system)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
@@ -55,7 +54,7 @@ def run_plant(system: str, number: int) -> dict[str, Any]:
     right = bool((np.abs(error) <= limits).all())
     outcome = ("recovered" if right else "wrong") if found.converged else "flagged"
     return {
-        "plant": number, "outcome": outcome, "planted": plant.to_array().tolist(), "error": error.tolist(),
+        "outcome": outcome, "planted": plant.to_array().tolist(), "error": error.tolist(),
         "steps": len(found.iterations), "warnings": list(found.warnings),
     }  # fmt: skip
 
@@ -70,20 +69,13 @@ def main() -> int:
     parser.add_argument("--plants", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     target = options.out / f"capture-{options.system}.jsonl"
-    known = target.read_text().splitlines() if target.exists() else []
-    rows = {row["plant"]: row for row in map(json.loads, known)}
-    for number in range(options.first, options.first + options.plants):
-        if number in rows:
-            continue
-        rows[number] = run_plant(options.system, number)
-        with target.open("a") as lines:
-            lines.write(json.dumps(rows[number]) + "\n")
-        print(f"{number}: {rows[number]['outcome']} after {rows[number]['steps']} steps", flush=True)
-    counts = {
-        key: sum(r["outcome"] == key for r in rows.values()) for key in ("recovered", "flagged", "wrong")
-    }
+    rows = each_plant(
+        target, {"system": options.system}, range(options.first, options.first + options.plants),
+        lambda number: run_plant(options.system, number),
+        lambda row: f"{row['outcome']} after {row['steps']} steps",
+    )  # fmt: skip
+    counts = {key: sum(row["outcome"] == key for row in rows) for key in ("recovered", "flagged", "wrong")}
     print(f"{counts}; {target}")
     return 0 if not counts["wrong"] and counts["recovered"] >= 0.95 * len(rows) else 1
 

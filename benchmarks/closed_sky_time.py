@@ -40,7 +40,7 @@ def measured(options: argparse.Namespace, number: int) -> Line:
         if estimate is None:
             raise CalibrationError(f"plant {number}: no registration from calibration {k}")
         errors[k], sigmas[k] = estimate.registration.to_array() - plant.to_array(), estimate.sigma
-    return {"frames": options.frames, "errors": plain(errors), "sigmas": plain(sigmas)}
+    return {"errors": plain(errors), "sigmas": plain(sigmas)}
 
 
 def main() -> None:
@@ -55,10 +55,10 @@ def main() -> None:
     parser.add_argument("--poke", type=float, default=0.002)
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     target = options.out / "closed-sky-time.jsonl"
     numbers = range(options.first, options.first + options.plants)
-    lines = each_plant(target, numbers, lambda number: measured(options, number))
+    asked = {"system": options.system, "frames": options.frames, "poke": options.poke}
+    lines = each_plant(target, asked, numbers, lambda number: measured(options, number))
     errors, sigmas = (np.stack([array(line[name]) for line in lines]) for name in ("errors", "sigmas"))
     for k, label in enumerate([f"{CLOSING} open", *options.frames]):
         within = (np.abs(errors[:, k]) <= GOAL).all(axis=1).sum()

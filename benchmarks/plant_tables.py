@@ -14,26 +14,46 @@ from numpy.typing import NDArray
 Line = dict[str, Any]
 
 
-def each_plant(target: Path, numbers: Iterable[int], measure: Callable[[int], Line]) -> list[Line]:
+def each_plant(
+    target: Path,
+    asked: Line,
+    numbers: Iterable[int],
+    measure: Callable[[int], Line],
+    told: Callable[[Line], str] = lambda line: "done",
+) -> list[Line]:
     """The lines of some plants, measured unless the file has them already, a line as soon as it is done.
 
     Parameters
     ----------
     target
         File with one JSON object per line.
+    asked
+        What was asked for, such as frames and settings; kept in every line.
     numbers
         The plants.
     measure
         Gives the line of a plant.
+    told
+        What to print of a new line.
+
+    Raises
+    ------
+    SystemExit
+        The file has plants that were asked for otherwise, which do not belong into the same table.
     """
-    known = map(json.loads, target.read_text().splitlines()) if target.exists() else ()
+    asked = json.loads(json.dumps(asked))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    known = [*map(json.loads, target.read_text().splitlines())] if target.exists() else []
+    if any(line["asked"] != asked for line in known):
+        raise SystemExit(f"{target} has plants that were asked for otherwise; choose another --out")
     lines = {line["plant"]: line for line in known}
     for number in numbers:
-        if number not in lines:
-            lines[number] = {"plant": number, **measure(number)}
-            with target.open("a") as file:
-                file.write(json.dumps(lines[number]) + "\n")
-            print(f"plant {number}", flush=True)
+        if number in lines:
+            continue
+        lines[number] = {"plant": number, "asked": asked, **measure(number)}
+        with target.open("a") as file:
+            file.write(json.dumps(lines[number]) + "\n")
+        print(f"plant {number}: {told(lines[number])}", flush=True)
     return [lines[number] for number in sorted(lines)]
 
 

@@ -14,11 +14,10 @@ the rms error of the images' mean place in pixels. A plant takes about half a mi
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from plant_tables import Line, each_plant
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.config.sensor_models import PyramidSection
@@ -26,7 +25,7 @@ from escape_hw.runtime.sky_time import plant_overrides, random_plant, twins_of
 from escape_hw.runtime.system import System
 
 
-def run_plant(system: str, number: int, frames: int, overrides: list[str]) -> dict[str, Any]:
+def run_plant(system: str, number: int, frames: int, overrides: list[str]) -> Line:
     """Calibrate one plant, and compare with what was planted."""
     plant = random_plant(number)
     config = twins_of(system, [*overrides, *plant_overrides(plant)], seed=number + 1)
@@ -36,7 +35,7 @@ def run_plant(system: str, number: int, frames: int, overrides: list[str]) -> di
     if estimate is None:
         raise RuntimeError("the run ended before a registration was found")
     row = {
-        "plant": number, "converged": estimate.converged, "warnings": list(estimate.warnings),
+        "converged": estimate.converged, "warnings": list(estimate.warnings),
         "error": (estimate.registration.to_array() - plant.to_array()).tolist(),
         "sigma": estimate.sigma.tolist(), "gain": estimate.gain.value,
     }  # fmt: skip
@@ -54,10 +53,12 @@ def dirt(share: float) -> list[str]:
     return [f"twin.contamination.{name}={value}" for name, value in zip(names, (share, *uneven), strict=True)]
 
 
-def tell(rows: list[dict[str, Any]]) -> None:
+def tell(rows: list[Line]) -> None:
     """Print what the plants that converged say."""
     good = [row for row in rows if row["converged"]]
-    print(f"{len(rows)} plants, {len(good)} converged; of these:")
+    print(f"{len(rows)} plants, {len(good)} converged" + ("; of these:" if good else ""))
+    if not good:
+        return
     errors, sigmas = (np.array([row[key] for row in good]) for key in ("error", "sigma"))
     told = {
         "rms": np.sqrt(np.mean(np.square(errors), axis=0)),
@@ -85,18 +86,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
     overrides = options.overrides + ([] if options.soiled is None else dirt(options.soiled))
-    options.out.mkdir(parents=True, exist_ok=True)
-    target = options.out / f"plants-{options.system}-{options.name}.jsonl"
-    known = target.read_text().splitlines() if target.exists() else []
-    rows = {row["plant"]: row for row in map(json.loads, known)}
-    for number in range(options.first, options.first + options.plants):
-        if number in rows:
-            continue
-        rows[number] = run_plant(options.system, number, options.frames, overrides)
-        with target.open("a") as lines:
-            lines.write(json.dumps(rows[number]) + "\n")
-        print(number, np.round(rows[number]["error"], 3).tolist(), flush=True)
-    tell([*rows.values()])
+    rows = each_plant(
+        options.out / f"plants-{options.system}-{options.name}.jsonl",
+        {"system": options.system, "frames": options.frames, "set": overrides},
+        range(options.first, options.first + options.plants),
+        lambda number: run_plant(options.system, number, options.frames, overrides),
+        lambda row: str(np.round(row["error"], 3).tolist()),
+    )
+    tell(rows)
 
 
 if __name__ == "__main__":

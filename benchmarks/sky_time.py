@@ -29,7 +29,7 @@ _KEPT = ("errors", "sigmas", "exact", "hybrid")
 def measured(options: argparse.Namespace, number: int) -> Line:
     """The line of a plant."""
     found = run_plant(options.system, number, options.frames, estimators=options.estimators)
-    return {"frames": options.frames, **{name: plain(getattr(found, name)) for name in _KEPT}}
+    return {name: plain(getattr(found, name)) for name in _KEPT}
 
 
 def tell(plants: list[PlantErrors], frames: list[int]) -> None:
@@ -57,13 +57,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
     options.frames.sort()
-    options.out.mkdir(parents=True, exist_ok=True)
     name = "sky-time" if options.system == "razor-shwfs" else f"sky-time-{options.system}"
     target = options.out / f"{name}.jsonl"
     numbers = range(options.first, options.first + options.plants)
-    lines = each_plant(target, numbers, lambda number: measured(options, number))
-    if any(line["frames"] != options.frames for line in lines):
-        parser.error(f"{target} has plants of other numbers of frames; choose another folder")
+    asked = {"system": options.system, "frames": options.frames, "estimators": options.estimators}
+    lines = each_plant(target, asked, numbers, lambda number: measured(options, number))
     plants = [PlantErrors(*(array(line[kept]) for kept in _KEPT)) for line in lines]
     curves = summary(plants, options.frames, goal_of(options.system))
     (options.out / f"{name}.json").write_text(json.dumps(curves, indent=1) + "\n")
