@@ -86,6 +86,16 @@ class DoubtfulModel(Protocol):
 
 
 @runtime_checkable
+class UnevenModel(Protocol):
+    """A model whose slopes may answer more at the rim of the pupil than it says, or less."""
+
+    @property
+    def gain_trend(self) -> float:
+        """Prior scatter of a trend: relative change of a slope's gain from the centre to the rim, or 0."""
+        ...
+
+
+@runtime_checkable
 class MovablePupil(Protocol):
     """A model that knows what its matrices become when the pupil stands elsewhere on the sensor."""
 

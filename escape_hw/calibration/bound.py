@@ -71,6 +71,9 @@ def registration_bound(
     gain = float(np.vdot(unit, matrix.data) / np.vdot(unit, unit))
     truth = replace(matrix, data=(gain * unit).astype(np.float32))
     columns = independent_columns(truth, gram, variance)
+    if covariance.ndim == 2:
+        # What the slopes' noise has in common is counted as such.
+        priors = replace(priors, shared=1.0)
     problem = Problem(WeightedMatrix.of(columns, np.arange(columns.n_modes)), model, priors)
     system = problem.linearise(problem.start(registration))
     if covariance.ndim == 2:
@@ -121,12 +124,18 @@ def correlated_information(
     line_line = member.T @ (metric * (sampled @ sampled.T)) @ member
     slope_line = (metric * (model @ sampled.T)) @ member
     acting = (zonal.T @ seen_zonal) * (twice @ twice.T)
+    slope_slope = metric * (model @ model.T)
+    # A trend is a sum of slope gains.
+    trends, line_trend = system.trends, slope_line.T @ system.trends
+    common_trend, slope_trend = by_slope @ trends, slope_slope @ trends
+    trend_acting = trends.T @ slope_acting
     whole = np.block(
         [
-            [seen_common.reshape(k, -1) @ flat.T, by_line @ member, common_acting, by_slope],
-            [(by_line @ member).T, line_line, member.T @ line_acting, slope_line.T],
-            [common_acting.T, (member.T @ line_acting).T, acting, slope_acting.T],
-            [by_slope.T, slope_line, slope_acting, metric * (model @ model.T)],
+            [seen_common.reshape(k, -1) @ flat.T, by_line @ member, common_trend, common_acting, by_slope],
+            [(by_line @ member).T, line_line, line_trend, member.T @ line_acting, slope_line.T],
+            [common_trend.T, line_trend.T, trends.T @ slope_trend, trend_acting, slope_trend.T],
+            [common_acting.T, (member.T @ line_acting).T, trend_acting.T, acting, slope_acting.T],
+            [by_slope.T, slope_line, slope_trend, slope_acting, slope_slope],
         ]
     )
     whole[np.diag_indices(len(whole))] += precision

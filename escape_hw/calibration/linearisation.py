@@ -15,6 +15,7 @@ from escape_hw.calibration.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.evidence import believed
 from escape_hw.calibration.extra_unknowns import ExtraUnknown, FoundExtra
 from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
+from escape_hw.calibration.slope_trends import slope_trends
 from escape_hw.calibration.weighted import WeightedMatrix
 
 #: Places of the common parameters among the unknowns; the registration has places 1 to 5.
@@ -49,6 +50,7 @@ class State:
     shape: float
     variant: NDArray[np.float64]
     sampling: NDArray[np.float64]
+    trend: NDArray[np.float64]
     actuator_gain: NDArray[np.float64]
     actuator_width: NDArray[np.float64]
     slope_gain: NDArray[np.float64]
@@ -56,10 +58,8 @@ class State:
     def offset(self, mean_width: float, mean_variant: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance from the priors' means, in the order of the unknowns."""
         head = np.concatenate([[0.0], np.zeros(5), [self.width - mean_width, self.shape]])
-        variant = self.variant - mean_variant
-        return np.concatenate(
-            [head, variant, self.sampling, self.actuator_gain, self.actuator_width, self.slope_gain]
-        )
+        many = self.sampling, self.trend, self.actuator_gain, self.actuator_width, self.slope_gain
+        return np.concatenate([head, self.variant - mean_variant, *many])
 
 
 @dataclass(slots=True, eq=False)
@@ -109,13 +109,15 @@ class Problem:
         # x slopes share what their column does to them, y slopes what their row does.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
+        self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate(
             [
                 np.zeros(6),
                 [priors.width**-2, priors.shape**-2],
                 scatters**-2,
                 np.full(self.n_lines, priors.sampling**-2),
-                np.full(model.n_act, priors.actuator_gain**-2),
+                np.ones(self.trends.shape[1]),
+                np.full(model.n_act, priors.shared * priors.actuator_gain**-2),
                 np.full(model.n_act, priors.actuator_width**-2),
                 np.full(weighted.data.shape[0], priors.slope_gain**-2),
             ]
@@ -134,6 +136,7 @@ class Problem:
             0.0,
             self._means[1].copy(),
             np.zeros(self.n_lines),
+            np.zeros(self.trends.shape[1]),
             zeros,
             zeros.copy(),
             np.zeros(n_slopes),
@@ -208,7 +211,7 @@ class Problem:
         """Model and derivatives about a state."""
         z = self._shapes(state)
         moved, by_width, by_shape, variants, shaped = z.moved, z.by_width, z.by_shape, z.variants, z.shaped
-        rows, acting = (1 + state.slope_gain)[:, None], 1 + state.actuator_gain
+        rows, acting = self._slope_gains(state)[:, None], 1 + state.actuator_gain
         acted = acting[:, None] * self.modes
 
         def modal(z: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -231,7 +234,12 @@ class Problem:
             self.offset(state),
             sampled,
             self.lines,
+            self.trends,
         )
+
+    def _slope_gains(self, state: State) -> NDArray[np.float64]:
+        """Gain of every slope beside the common one ``(n_slopes,)``."""
+        return np.asarray(1 + state.slope_gain + self.trends @ state.trend)
 
     def zonal(self, state: State) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)`` at a state, random effects included."""
@@ -239,7 +247,7 @@ class Problem:
         half = len(z.shaped) // 2
         sampled = np.concatenate([z.moved[0, :half], z.moved[1, half:]])
         whole = z.shaped + state.sampling[self.lines, None] * sampled
-        scale = state.gain * (1 + state.slope_gain) * self.weighted.by_slope
+        scale = state.gain * self._slope_gains(state) * self.weighted.by_slope
         return np.asarray(scale[:, None] * whole * (1 + state.actuator_gain))
 
     def learned(self, state: State, system: NormalEquations) -> Learned:
@@ -255,14 +263,17 @@ class Problem:
             Solution, and the problem about it.
         """
         variance = system.posterior_variance()
-        head = SHAPE + 1 + self.n_variants
-        counts = (self.n_lines, self.model.n_act, self.model.n_act, self.weighted.data.shape[0])
-        parts = np.split(variance[head:], np.cumsum(counts)[:-1])
+        head, n_act = SHAPE + 1 + self.n_variants, self.model.n_act
+        counts = (self.n_lines, self.trends.shape[1], n_act, n_act, self.weighted.data.shape[0])
+        lines, _, gains, widths, slopes = np.split(variance[head:], np.cumsum(counts)[:-1])
         scatter, usual = {}, Priors()
+        parts = lines, self.priors.shared * gains, widths, slopes
         for name, part in zip(_EFFECTS, parts, strict=True):
             least = _LEAST_SCATTER * getattr(usual, name)
             found = float(np.mean(np.square(getattr(state, name)) + part))
             scatter[name] = max(float(np.sqrt(found)), least)
+        if self.trends.shape[1]:
+            scatter["shared"] = system.shared_noise()
         decided = float(np.sum(1 - variance * self.precision))
         return Learned(replace(self.priors, **scatter), decided)
 
@@ -295,8 +306,8 @@ class Problem:
     def move(self, state: State, step: NDArray[np.floating]) -> State:
         """The state after a step, in the order of the unknowns."""
         n_act = self.model.n_act
-        v, n = self.n_variants, self.n_variants + self.n_lines
-        variant, sampling, gains, widths, slopes = np.split(step[8:], [v, n, n + n_act, n + 2 * n_act])
+        counts = self.n_variants, self.n_lines, self.trends.shape[1], n_act, n_act
+        variant, sampling, trend, gains, widths, slopes = np.split(step[8:], np.cumsum(counts))
         # What gain and shares make together is linear in their product: there the step is exact.
         gain = state.gain + step[GAIN]
         kept = state.gain / gain if gain > _LEAST_KEPT * state.gain else 1.0
@@ -307,6 +318,7 @@ class Problem:
             float(np.clip(state.shape + kept * step[SHAPE], -0.5, 0.5)),
             state.variant + kept * variant,
             state.sampling + sampling,
+            state.trend + trend,
             state.actuator_gain + gains,
             state.actuator_width + widths,
             state.slope_gain + slopes,

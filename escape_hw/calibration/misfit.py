@@ -34,6 +34,9 @@ class Priors:
     extras
         Mean and scatter of each extra unknown, in its own prior scatters; zero and one, where none are
         given because no earlier fit has told them.
+    shared
+        Variance of the noise in what an actuator moves, over that of as many slopes with noise of their own:
+        the fit takes noise for independent, so priors of the actuators' gains count by so much more.
     """
 
     actuator_gain: float = 0.1
@@ -44,6 +47,7 @@ class Priors:
     sampling: float = 0.5
     mean_width: float = 0.0
     extras: tuple[tuple[float, float], ...] = ()
+    shared: float = 1.0
 
 
 @dataclass(slots=True, eq=False)
@@ -51,7 +55,8 @@ class NormalEquations:
     """Gauss-Newton system of one linearisation, in units of the data's standard errors.
 
     The unknowns are, in order: the common parameters (gain, five of the registration, width, shape,
-    shares of the model's variants), sampling positions, actuator gains, actuator widths, slope gains.
+    shares of the model's variants), sampling positions, trends of the slope gains, actuator gains,
+    actuator widths, slope gains.
     A slope's gain touches no other slope, so its block is diagonal and is eliminated first.
 
     Parameters
@@ -66,7 +71,7 @@ class NormalEquations:
         ``inner`` with the slope gains eliminated.
     right
         Right-hand side of the whole system.
-    common, sampled, slopes_gain, slopes_width, modes, model, residual, lines
+    common, sampled, slopes_gain, slopes_width, modes, model, residual, lines, trends
         As handed to :func:`normal_equations`.
     """
 
@@ -83,6 +88,7 @@ class NormalEquations:
     model: NDArray[np.float64]
     residual: NDArray[np.float64]
     lines: NDArray[np.intp]
+    trends: NDArray[np.float64]
 
     @property
     def n_common(self) -> int:
@@ -137,19 +143,30 @@ class NormalEquations:
         -------
         ndarray, ``(n_common, n_slopes, n_modes)``
         """
-        k, n_act = self.n_common, len(self.modes)
+        k, n_act, n_trends = self.n_common, len(self.modes), self.trends.shape[1]
         whole = self.whole
         inner = np.linalg.solve(whole[k:, k:], whole[k:, :k])
         by_slope = (self.across[:, :k] - self.across[:, k:] @ inner) / self.diagonal[:, None]
-        n_lines = len(inner) - 2 * n_act
+        n_lines = len(inner) - n_trends - 2 * n_act
+        ends = np.cumsum([n_lines, n_trends, n_act])
         out = np.empty_like(self.common)
         for p in range(k):
-            by_line, by_gain, by_width = np.split(inner[:, p], [n_lines, n_lines + n_act])
+            by_line, by_trend, by_gain, by_width = np.split(inner[:, p], ends)
             acting = (self.slopes_gain * by_gain + self.slopes_width * by_width) @ self.modes
-            out[p] = self.common[p] - acting - by_slope[:, p, None] * self.model
+            out[p] = self.common[p] - acting - (by_slope[:, p] + self.trends @ by_trend)[:, None] * self.model
             if n_lines:
                 out[p] -= by_line[self.lines, None] * self.sampled
         return out
+
+    def shared_noise(self) -> float:
+        """See :attr:`Priors.shared`; told by what is left, the model's misfit included, and at least 1.
+
+        The noise of neighbouring slopes is alike where the air is, so it does not average out over the slopes
+        that one actuator moves. Columns have independent noise, so they tell how little it does.
+        """
+        seen = float(np.square(self.slopes_gain.T @ self.residual).sum())
+        alone = float(np.square(self.slopes_gain).sum()) * self.residual.shape[1]
+        return float(max(seen / max(alone, 1e-300), 1.0))
 
 
 def normal_equations(
@@ -163,6 +180,7 @@ def normal_equations(
     offset: NDArray[np.float64],
     sampled: NDArray[np.float64] | None = None,
     lines: NDArray[np.intp] | None = None,
+    trends: NDArray[np.float64] | None = None,
 ) -> NormalEquations:
     """Assemble the system; no array of the size of all derivatives is ever formed.
 
@@ -184,7 +202,11 @@ def normal_equations(
     sampled, lines
         Weighted derivatives of each slope by where it samples ``(n_slopes, n_modes)``, and the number
         of the line of sub-apertures ``(n_slopes,)`` that it shares the unknown with; none by default.
+    trends
+        What trends add to the gain of each slope ``(n_slopes, n_trends)``; none by default.
     """
+    if trends is None:
+        trends = np.zeros((len(model), 0))
     if sampled is None or lines is None:
         sampled, lines = np.zeros_like(model), np.zeros(len(model), np.intp)
         member = np.zeros((len(model), 0))
@@ -200,35 +222,40 @@ def normal_equations(
     sampled_modes = sampled @ modes.T
     line_acting = member.T @ np.concatenate([sampled_modes * z for z in zonal], axis=1)
     line = np.diag(np.square(sampled).sum(axis=1) @ member)
+    model_modes, residual_modes = model @ modes.T, residual @ modes.T
+    by_common = np.einsum("sm,psm->sp", model, common)
+    by_line = member * (model * sampled).sum(axis=1)[:, None]
+    by_acting = np.concatenate([model_modes * z for z in zonal], axis=1)
+    power, score = np.square(model).sum(axis=1), np.einsum("sm,sm->s", model, residual)
+    # A trend is a sum of slope gains, and so are its products with everything else.
+    by_trend = trends * power[:, None]
+    across = np.concatenate([by_common, by_line, by_trend, by_acting], axis=1)
+    trend = trends.T @ across
+    common_trend, line_trend, trend_trend, trend_acting = np.split(
+        trend, np.cumsum([k, member.shape[1], trends.shape[1]]), axis=1
+    )
     inner = np.block(
         [
-            [flat @ flat.T, common_line, common_acting],
-            [common_line.T, line, line_acting],
-            [common_acting.T, line_acting.T, acting],
+            [flat @ flat.T, common_line, common_trend.T, common_acting],
+            [common_line.T, line, line_trend.T, line_acting],
+            [common_trend, line_trend, trend_trend, trend_acting],
+            [common_acting.T, line_acting.T, trend_acting.T, acting],
         ]
-    )
-    model_modes, residual_modes = model @ modes.T, residual @ modes.T
-    across = np.concatenate(
-        [
-            np.einsum("sm,psm->sp", model, common),
-            member * (model * sampled).sum(axis=1)[:, None],
-            *(model_modes * z for z in zonal),
-        ],
-        axis=1,
     )
     right = np.concatenate(
         [
             flat @ residual.ravel(),
             (residual * sampled).sum(axis=1) @ member,
+            score @ trends,
             *(np.einsum("sa,sa->a", z, residual_modes) for z in zonal),
-            np.einsum("sm,sm->s", model, residual),
+            score,
         ]
     )
     n = len(inner)
     inner[np.diag_indices(n)] += precision[:n]
-    diagonal = np.square(model).sum(axis=1) + precision[n:]
+    diagonal = power + precision[n:]
     whole = inner - across.T @ (across / diagonal[:, None])
     return NormalEquations(
         inner, across, diagonal, whole, right - precision * offset,
-        common, sampled, slopes_gain, slopes_width, modes, model, residual, lines,
+        common, sampled, slopes_gain, slopes_width, modes, model, residual, lines, trends,
     )  # fmt: skip

@@ -42,6 +42,9 @@ _CALM = 0.5
 #: What scalings err by in common on a pyramid under turbulence and pokes, in % of the diameter: the mean
 #: over sixteen twins with the images at their true centres (docs/decisions/0018-pyramids-in-truth.md).
 _SCALING = 0.12
+#: Slopes at the rim may answer so much more or less than the model's (found: 0.2 to 0.3): pixels saturate
+#: when pokes gather the light, and what the pokes do at the rim is only nearly known.
+_TREND = 0.3
 #: Shapes of the mirror that are looked at under each state of the air.
 _SHAPES = 10
 #: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
@@ -144,6 +147,11 @@ class PyramidModel:
         shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
         scaling = _SCALING if self.turbulence or self._pokes else 0.0
         return np.asarray(np.hypot([shift, shift, 0.0, scaling, scaling], self._air_doubt()))
+
+    @property
+    def gain_trend(self) -> float:
+        """Scatter of trends of the slopes' gains, see :class:`UnevenModel`; a pyramid at rest has none."""
+        return _TREND if self.turbulence or self._pokes else 0.0
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""

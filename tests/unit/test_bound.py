@@ -13,7 +13,7 @@ from escape_hw.calibration.noise_patterns import NoisePatterns
 from escape_hw.config.load import load_system
 from escape_sim.model import make_model, nominal_grid
 
-N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES = 7, 10, 5, 4, 3
+N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES, N_TRENDS = 7, 10, 5, 4, 3, 2
 
 
 #: 12 x 12 lenslets and 37 actuators.
@@ -26,7 +26,7 @@ SMALL = (
 @pytest.fixture(scope="module")
 def case():
     rng = np.random.default_rng(0)
-    n = N_COMMON + N_LINES + 2 * N_ACT + N_SLOPES
+    n = N_COMMON + N_LINES + N_TRENDS + 2 * N_ACT + N_SLOPES
     return {
         "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
         "slopes_gain": rng.standard_normal((N_SLOPES, N_ACT)),
@@ -38,6 +38,7 @@ def case():
         "offset": np.zeros(n),
         "sampled": rng.standard_normal((N_SLOPES, N_MODES)),
         "lines": np.arange(N_SLOPES) % N_LINES,
+        "trends": rng.standard_normal((N_SLOPES, N_TRENDS)),
     }
 
 
@@ -45,6 +46,7 @@ def jacobian(c):
     """Derivatives of the matrix by every unknown ``(n_unknowns, n_slopes, n_modes)``."""
     rows = list(c["common"])
     rows += [np.where((c["lines"] == k)[:, None], c["sampled"], 0.0) for k in range(N_LINES)]
+    rows += [trend[:, None] * c["model"] for trend in c["trends"].T]
     rows += [
         np.outer(z[:, a], c["modes"][a]) for z in (c["slopes_gain"], c["slopes_width"]) for a in range(N_ACT)
     ]

@@ -10,9 +10,10 @@ from escape_hw.calibration.misfit import normal_equations
 N_COMMON, N_SLOPES, N_ACT, N_MODES = 7, 11, 6, 5
 
 
-@pytest.fixture(scope="module")
-def case():
-    rng = np.random.default_rng(0)
+@pytest.fixture(scope="module", params=(0, 2), ids=("even", "trends"))
+def case(request):
+    rng, n_trends = np.random.default_rng(0), request.param
+    n = N_COMMON + n_trends + 2 * N_ACT + N_SLOPES
     return {
         "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
         "slopes_gain": rng.standard_normal((N_SLOPES, N_ACT)),
@@ -20,14 +21,16 @@ def case():
         "modes": rng.standard_normal((N_ACT, N_MODES)),
         "model": rng.standard_normal((N_SLOPES, N_MODES)),
         "residual": rng.standard_normal((N_SLOPES, N_MODES)),
-        "precision": rng.uniform(0.5, 3, N_COMMON + 2 * N_ACT + N_SLOPES),
-        "offset": rng.standard_normal(N_COMMON + 2 * N_ACT + N_SLOPES),
+        "precision": rng.uniform(0.5, 3, n),
+        "offset": rng.standard_normal(n),
+        "trends": rng.standard_normal((N_SLOPES, n_trends)),
     }
 
 
 def jacobian(c):
     """Derivatives of the matrix by every unknown ``(n_slopes * n_modes, n_unknowns)``."""
     columns = list(c["common"])
+    columns += [trend[:, None] * c["model"] for trend in c["trends"].T]
     for zonal in (c["slopes_gain"], c["slopes_width"]):
         columns += [np.outer(zonal[:, a], c["modes"][a]) for a in range(N_ACT)]
     for s in range(N_SLOPES):
@@ -86,6 +89,9 @@ def test_without_priors_they_are_orthogonal_to_every_random_effect(case):
         for zonal in (vague["slopes_gain"], vague["slopes_width"]):
             effect = np.outer(zonal[:, a], vague["modes"][a])
             assert np.einsum("psm,sm->p", left, effect) == pytest.approx(np.zeros(N_COMMON), abs=1e-6)
+    for trend in vague["trends"].T:
+        effect = trend[:, None] * vague["model"]
+        assert np.einsum("psm,sm->p", left, effect) == pytest.approx(np.zeros(N_COMMON), abs=1e-6)
     assert np.einsum("psm,sm->ps", left, vague["model"]) == pytest.approx(
         np.zeros((N_COMMON, N_SLOPES)), abs=1e-6
     )
@@ -100,3 +106,22 @@ def test_information_on_the_common_parameters_is_that_of_the_efficient_derivativ
     left = system.efficient().reshape(k, -1)
     priors = imitation.T @ (case["precision"][k:, None] * imitation) + np.diag(case["precision"][:k])
     assert left @ left.T + priors == pytest.approx(reduced, abs=1e-9)
+
+
+@pytest.mark.parametrize(("together", "want"), [(0.0, 1.0), (1.0, 40.0), (0.5, 20.5)])
+def test_noise_that_slopes_share_does_not_average_out(together, want):
+    # Each actuator moves all of 40 slopes alike: shared noise has 40 times the variance in their sum.
+    rng, n_slopes, n_modes = np.random.default_rng(4), 40, 4000
+    common, own = rng.standard_normal((1, n_modes)), rng.standard_normal((n_slopes, n_modes))
+    alike = np.ones((n_slopes, N_ACT))
+    system = normal_equations(
+        rng.standard_normal((N_COMMON, n_slopes, n_modes)),
+        alike,
+        alike,
+        rng.standard_normal((N_ACT, n_modes)),
+        rng.standard_normal((n_slopes, n_modes)),
+        np.sqrt(together) * common + np.sqrt(1 - together) * own,
+        np.ones(N_COMMON + 2 * N_ACT + n_slopes),
+        np.zeros(N_COMMON + 2 * N_ACT + n_slopes),
+    )
+    assert system.shared_noise() == pytest.approx(want, rel=0.1)

@@ -1,0 +1,145 @@
+"""Slopes of a pyramid that answer more towards the rim than its model says, against planted truths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+from small_pyramid import configuration as small_pyramid
+from small_system import configuration as small_lenslets
+
+from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.procedure import run
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.slope_trends import slope_trends
+from escape_hw.calibration.sprint import SprintFit, fit_steps
+from escape_sim.model import make_model, nominal_grid
+from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+
+SEEDS = range(6)
+#: Noise of an element, relative to the rms of the matrix.
+NOISE = 0.3
+#: From the centre to the rim, along x and y of the x slopes, then of the y slopes: as on `razor-pywfs`.
+TREND = np.array([0.09, 0.29, 0.22, 0.07])
+
+
+class Even:
+    """The same model, sure that its slopes have no trend."""
+
+    gain_trend = 0.0
+
+    def __init__(self, model: PyramidModel) -> None:
+        self._model = model
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._model, name)
+
+
+@pytest.fixture(scope="module")
+def model() -> PyramidModel:
+    config = small_pyramid()
+    return PyramidModel(config, nominal_pupils(config), turbulence=5.0)
+
+
+def unit_trends(model: PyramidModel) -> NDArray[np.float64]:
+    """Slopes by trends of 1 from the centre to the rim."""
+    valid = nominal_pupils(small_pyramid()).valid
+    return slope_trends(model, valid) / model.gain_trend
+
+
+def measured(
+    model: PyramidModel, seed: int, trend: NDArray[np.float64], noise: float = NOISE
+) -> tuple[InteractionMatrix, Registration]:
+    """A matrix of unequal actuators and slopes, whose neighbours share their noise, and the truth."""
+    rng, valid = np.random.default_rng(seed), nominal_pupils(small_pyramid()).valid
+    truth = Registration(*(rng.uniform(-1, 1, 5) * [20, 20, 0.5, 1.5, 1.5]))
+    zonal = model.zonal_matrix(truth) * (1 + 0.05 * rng.standard_normal(model.n_act))
+    zonal *= (1 + 0.05 * rng.standard_normal(len(zonal)) + unit_trends(model) @ trend)[:, None]
+    white = rng.standard_normal((model.n_act, 2, *valid.shape))
+    smooth = ndimage.gaussian_filter(white, (0, 0, 1.5, 1.5))[:, :, valid].reshape(model.n_act, -1).T
+    sigma = noise * zonal.std()
+    data = zonal + sigma * smooth / smooth.std()
+    return InteractionMatrix(
+        data.astype(np.float32), np.full(zonal.shape, sigma, np.float32), np.eye(model.n_act), valid,
+        "razor-pywfs", "docrime", True,
+    ), truth  # fmt: skip
+
+
+def fitted(matrix: InteractionMatrix, model: object) -> SprintFit:
+    return run(fit_steps(matrix, model, learn=True))
+
+
+def error_of(fit: SprintFit, truth: Registration) -> NDArray[np.float64]:
+    return fit.estimate.registration.to_array() - truth.to_array()
+
+
+def test_a_planted_trend_is_found(model: PyramidModel) -> None:
+    pulls, shapes = [], []
+    terms = np.column_stack([np.ones(len(unit_trends(model))), unit_trends(model)])
+    for seed in SEEDS:
+        matrix, truth = measured(model, seed, TREND, noise=0.1)
+        fit = fitted(matrix, model)
+        assert fit.estimate.converged, fit.estimate.warnings
+        pulls.append(error_of(fit, truth) / fit.estimate.sigma)
+        nominal = model.zonal_matrix(truth)
+        answers = (fit.zonal() * nominal).sum(axis=1) / np.square(nominal).sum(axis=1)
+        told = np.linalg.lstsq(terms, answers)[0]
+        shapes.append(told[1:] / told[0])
+    assert np.mean(shapes, axis=0) == pytest.approx(TREND, abs=0.03)
+    assert np.mean(np.square(pulls)) < 2.0
+
+
+def test_a_trend_does_not_pass_for_a_scaling(model: PyramidModel) -> None:
+    # The same noise and the same mirror, with and without a trend.
+    def moved(one: object) -> NDArray[np.float64]:
+        found = []
+        for seed in SEEDS:
+            with_trend, none = (
+                error_of(fitted(matrix, one), truth)
+                for matrix, truth in (measured(model, seed, trend) for trend in (TREND, np.zeros(4)))
+            )
+            found.append(with_trend - none)
+        return np.asarray(np.mean(found, axis=0))
+
+    with_unknown, without = moved(model), moved(Even(model))
+    assert (without[3:] > 0.1).all()
+    assert (np.abs(with_unknown[3:]) < 0.03).all()
+
+
+def test_no_trend_is_found_where_there_is_none(model: PyramidModel) -> None:
+    found = []
+    for seed in SEEDS:
+        matrix, truth = measured(model, seed, np.zeros(4))
+        both = [fitted(matrix, one).estimate for one in (model, Even(model))]
+        found.append([(one.registration.to_array() - truth.to_array()) for one in both])
+        # What might be a trend makes a scaling a little less certain, no more.
+        assert (both[0].sigma[3:] < 1.5 * both[1].sigma[3:]).all()
+    rms = np.sqrt(np.mean(np.square(found), axis=0))
+    assert (rms[0][3:] < 1.3 * rms[1][3:] + 0.02).all()
+
+
+def test_only_a_pyramid_under_turbulence_or_pokes_has_trends(model: PyramidModel) -> None:
+    config = small_lenslets()
+    lenslets, grid = make_model(config, None), nominal_grid(config)
+    assert slope_trends(lenslets, grid.valid).shape == (grid.n_slopes, 0)
+    at_rest = PyramidModel(small_pyramid(), nominal_pupils(small_pyramid()))
+    assert at_rest.gain_trend == 0.0
+    assert unit_trends(model).mean(axis=0) == pytest.approx(np.zeros(4), abs=1e-12)
+
+
+def test_the_noise_that_lenslets_share_is_left_as_it_was() -> None:
+    config = small_lenslets()
+    lenslets, grid = make_model(config, None), nominal_grid(config)
+    zonal = lenslets.zonal_matrix(Registration(5.0, -3.0))
+    rng = np.random.default_rng(0)
+    # Noise that all slopes share, which a pyramid's fit would count.
+    sigma = 0.1 * zonal.std()
+    data = zonal + sigma * rng.standard_normal((1, lenslets.n_act))
+    matrix = InteractionMatrix(
+        data.astype(np.float32), np.full(zonal.shape, sigma, np.float32), np.eye(lenslets.n_act), grid.valid,
+        "razor-shwfs", "docrime", True,
+    )  # fmt: skip
+    learned = run(fit_steps(matrix, lenslets)).learned
+    assert learned is not None
+    assert learned().priors.shared == 1.0
