@@ -32,6 +32,8 @@ T = TypeVar("T")
 LARGEST = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
 #: A step is halved, so many times at most, as long as it makes squares grow by more than this factor.
 _HALVINGS, _WORSE = 6, 1.02
+#: Steps that go to and fro are shortened down to this share, beyond which it is hopeless.
+_LEAST_RATE = 0.125
 #: Solvers that take the columns for modes, and so need a matrix.
 BY_MODES: tuple[Solver, ...] = ("batches", "diagonal")
 
@@ -83,7 +85,7 @@ class Solution:
     ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``, ``learned`` what the data say about the
     scatter of the random effects, and ``departures`` those of the mirror, where there are any; each is
     worked out when asked for. ``scatter`` is what is to be added to the covariance of the registration
-    ``(5, 5)``; ``extras`` is what was fitted beside it.
+    ``(5, 5)``; ``extras`` is what was fitted beside it; ``left`` is the step from where it ended ``(5,)``.
     """
 
     system: Linearised
@@ -96,6 +98,7 @@ class Solution:
     learned: Callable[[], Learned] | None = None
     extras: tuple[FoundExtra, ...] = ()
     departures: Callable[[], MirrorDepartures] | None = None
+    left: NDArray[np.float64] | None = None
 
 
 def solve(
@@ -165,6 +168,7 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
     """Gauss-Newton on registration and random effects together."""
     state, settled = problem.start(start), False
     system = problem.linearise(state)
+    rate, before, step = descent.learning_rate, np.zeros(5), np.full(1, np.nan)
     for _ in range(descent.max_iterations):
         if descent.report.step():
             yield descent.progress()
@@ -179,13 +183,20 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
         if relative.max() < 1.0:
             settled = True
             break
+        if step[1:6] / LARGEST @ before < -0.5 * (before @ before):
+            # To and fro: what the model is not linear in sends each step back by as much as the last.
+            rate /= 2
+            if rate < _LEAST_RATE * descent.learning_rate:
+                break
+        before = step[1:6] / LARGEST
         damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / LARGEST)))
-        step = step * damping * descent.learning_rate
+        step = step * damping * rate
         state, system = _moved(problem, state, system, step)
     return Solution(
         system, state.alpha, state.gain, 1 + state.width, settled,
         lambda: problem.zonal(state), learned=lambda: problem.learned(state, system),
         extras=problem.extras_found(state), departures=lambda: problem.departures(state, system),
+        left=step[1:6],
     )  # fmt: skip
 
 

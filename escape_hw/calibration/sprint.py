@@ -51,6 +51,8 @@ P = ParamSpec("P")
 
 #: The common parameters, in their order; variants of the model come after them.
 _NAMES = ("gain", *PARAMETERS, "width", "pedestal")
+#: A step that is left does not matter below this share of the stated errors.
+_NO_MATTER = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,8 +289,13 @@ def _estimate(
         covariance[1:6, 1:6] += found.scatter
     doubt = model.registration_doubt if isinstance(model, DoubtfulModel) else np.zeros(5)
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(doubt)
+    sigma = np.sqrt(np.diag(covariance))
     warnings = []
-    if not found.settled:
+    # Where the model misses much, steps as small as noise would have them never come.
+    settled = found.settled or (
+        found.left is not None and bool((np.abs(found.left) < _NO_MATTER * sigma[1:6]).all())
+    )
+    if not settled:
         warnings.append(f"the steps did not shrink within {len(history)} iterations")
     explained, explicable = weighted.explained(residual), weighted.explicable
     if explained < EXPLAINED * explicable or np.vdot(weighted.data - residual, weighted.data) <= 0:
@@ -302,7 +309,6 @@ def _estimate(
             "the gain is negative: the mirror pulls where the model pushes; check its polarity, "
             "or whether the camera is turned by 180 degrees"
         )
-    sigma = np.sqrt(np.diag(covariance))
     worst = int(np.argmax(sigma[1:6] / LARGEST))
     if sigma[1 + worst] > LARGEST[worst]:
         warnings.append(f"the data do not constrain {PARAMETERS[worst]}; use more frames or more modes")
@@ -312,7 +318,7 @@ def _estimate(
         covariance[1:6, 1:6],
         Measured(found.gain, float(sigma[GAIN])),
         Measured(found.width, width),
-        found.settled and len(warnings) == 0,
+        len(warnings) == 0,
         history,
         float(np.mean(np.square(residual))),
         tuple(warnings),

@@ -1,0 +1,89 @@
+"""A descent whose steps overshoot comes to rest, and one that never does says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from escape_hw.api.procedure import run
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.misfit import Priors
+from escape_hw.calibration.solvers import Descent, _with_effects
+
+
+@dataclass
+class Place:
+    alpha: np.ndarray
+    gain: float = 1.0
+    width: float = 0.0
+
+
+@dataclass
+class System:
+    """Tells the way to zero, ``too_far`` times as long as it is."""
+
+    alpha: np.ndarray
+    too_far: float
+    residual: np.ndarray
+
+    def solve(self):
+        return np.concatenate([[0.0], -self.too_far * self.alpha])
+
+    def information(self):
+        return np.eye(6) * 1e12
+
+
+class Weighted:
+    def noise(self, residual):
+        return 1.0
+
+
+class Overshooting:
+    """What is left hardly depends on the registration, as where a model misses much more than noise."""
+
+    weighted, precision = Weighted(), np.zeros(6)
+
+    def __init__(self, too_far, at_least=0.0):
+        self.too_far, self.at_least, self.steps = too_far, at_least, 0
+
+    def start(self, registration):
+        return Place(registration.to_array())
+
+    def linearise(self, state):
+        self.steps += 1
+        # Never nearer than so, in either direction.
+        nearest = np.copysign(self.at_least, state.alpha)
+        alpha = np.where(np.abs(state.alpha) < self.at_least, nearest, state.alpha)
+        return System(alpha, self.too_far, np.full((4, 3), 100.0))
+
+    def move(self, state, step):
+        return replace(state, alpha=state.alpha + step[1:6])
+
+    def offset(self, state):
+        return np.zeros(6)
+
+    def extras_found(self, state):
+        return ()
+
+
+def descend(problem, most=40):
+    descent = Descent(None, None, np.arange(3), "effects", 1.0, most, Priors())
+    return run(_with_effects(problem, Registration(shift_x=1.0, shift_y=-0.5), descent))
+
+
+@pytest.mark.parametrize("too_far", [1.0, 1.7, 2.4, 5.0])
+def test_steps_that_overshoot_are_shortened_until_they_do_not(too_far):
+    found = descend(Overshooting(too_far))
+    assert found.settled
+    assert np.abs(found.alpha).max() < 0.01
+
+
+def test_a_descent_that_goes_to_and_fro_for_ever_is_given_up_with_what_is_left():
+    problem = Overshooting(30.0, at_least=0.05)
+    found = descend(problem)
+    assert not found.settled
+    assert problem.steps < 40
+    assert found.left is not None
+    assert np.abs(found.left[0]) == pytest.approx(30 * np.abs(found.alpha[0]).clip(0.05), rel=1e-6)
