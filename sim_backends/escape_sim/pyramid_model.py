@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 _OUTER_SCALE = 4.0
 #: Turbulence weaker than this many r0 across the pupil leaves the response what it is at rest.
 _CALM = 0.5
-#: What scalings err by in common on a pyramid under turbulence and pokes, in % of the diameter: the mean
-#: over sixteen twins with the images at their true centres (docs/decisions/0018-pyramids-in-truth.md).
-_SCALING = 0.12
+#: What scalings may err by in common on a pyramid under turbulence and pokes, in % of the diameter: what the
+#: mean over some twenty twins can hide (docs/decisions/0018-pyramids-in-truth.md, "Scalings that leaned").
+_SCALING = 0.05
 #: Slopes at the rim may answer so much more or less than the model's (found: 0.2 to 0.3): pixels saturate
 #: when pokes gather the light, and what the pokes do at the rim is only nearly known.
 _TREND = 0.3
