@@ -96,6 +96,16 @@ class UnevenModel(Protocol):
 
 
 @runtime_checkable
+class SelectiveModel(Protocol):
+    """A model that knows which sub-apertures it is no model of."""
+
+    @property
+    def slope_trust(self) -> NDArray[np.float64]:
+        """Weight of every slope's squares ``(n_slopes,)``, in (0, 1]."""
+        ...
+
+
+@runtime_checkable
 class MovablePupil(Protocol):
     """A model that knows what its matrices become when the pupil stands elsewhere on the sensor."""
 

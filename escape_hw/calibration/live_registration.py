@@ -26,6 +26,7 @@ from escape_hw.calibration.linearisation import GAIN, SHAPE, WIDTH, Problem, Sta
 from escape_hw.calibration.live_response import ResponseSums
 from escape_hw.calibration.misfit import NormalEquations, Priors
 from escape_hw.calibration.response import Filtered, filtered
+from escape_hw.calibration.robust import as_trusted
 from escape_hw.calibration.straight_line import Present, StraightLine
 from escape_hw.calibration.telemetry import Telemetry
 from escape_hw.calibration.telemetry_sprint import fitted_whitener
@@ -230,7 +231,7 @@ class LiveRegistration:
         state = self._state
         for _ in range(_FIRST_STEPS if state is None else 1):
             columns = self._sums.columns(self._frame, self._matrix)
-            weighted = WeightedMatrix.of(columns, np.arange(columns.n_modes))
+            weighted = as_trusted(WeightedMatrix.of(columns, np.arange(columns.n_modes)), self._model)
             problem = Problem(weighted, self._model, self._priors, self._bends, self._extras)
             state = state or problem.start(self._start)
             system = problem.linearise(state)

@@ -1,9 +1,12 @@
-"""Sub-apertures that do not fit in with the others: less weight for them (Huber 1964)."""
+"""Sub-apertures that do not fit in with the others, or that no model is of: less weight for them."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+from escape_hw.api.model import SelectiveModel, SyntheticModel
+from escape_hw.calibration.weighted import WeightedMatrix
 
 #: Residual of a sub-aperture, relative to the median one, up to which it counts in full.
 _USUAL = 1.5
@@ -11,10 +14,23 @@ _USUAL = 1.5
 ROUNDS = 3
 
 
+def as_trusted(weighted: WeightedMatrix, model: SyntheticModel) -> WeightedMatrix:
+    """A matrix with slopes that a model is no model of counting less.
+
+    Parameters
+    ----------
+    weighted
+        The measured matrix.
+    model
+        Says which (:class:`~escape_hw.api.model.SelectiveModel`); one that does not say is of all.
+    """
+    return weighted.trusting(model.slope_trust) if isinstance(model, SelectiveModel) else weighted
+
+
 def trust(residual: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weight of every slope's squares ``(n_slopes,)``, in (0, 1].
 
-    Huber's weights, for sub-apertures instead of elements: dirt, a broken lenslet or a wrong window spoil a
+    Huber's weights (1964), for sub-apertures instead of elements: dirt, a broken lenslet or a wrong window spoil a
     sub-aperture in all modes and in both slopes.
 
     Parameters

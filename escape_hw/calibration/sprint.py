@@ -31,7 +31,7 @@ from escape_hw.calibration.linearisation import GAIN, WIDTH, Learned
 from escape_hw.calibration.misfit import Priors
 from escape_hw.calibration.mode_choice import choose_modes
 from escape_hw.calibration.parity import parity_hint
-from escape_hw.calibration.robust import ROUNDS, trust
+from escape_hw.calibration.robust import ROUNDS, as_trusted, trust
 from escape_hw.calibration.solvers import LARGEST, Descent, Solution, solve
 from escape_hw.calibration.weighted import WeightedMatrix
 from escape_hw.config.models import (
@@ -175,7 +175,7 @@ def fit_steps(
         descent = Descent(
             matrix, model, columns, solver, learning_rate, max_iterations, priors or Priors(), extras
         )
-        weighted = WeightedMatrix.of(matrix, columns)
+        weighted = as_trusted(WeightedMatrix.of(matrix, columns), model)
         found = yield from solve(descent, weighted, begin.to_array(), reach)
         if learn and found.learned is not None:
             descent.priors = found.learned().priors

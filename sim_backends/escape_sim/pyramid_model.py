@@ -45,6 +45,10 @@ _SCALING = 0.05
 #: Slopes at the rim may answer so much more or less than the model's (found: 0.2 to 0.3): pixels saturate
 #: when pokes gather the light, and what the pokes do at the rim is only nearly known.
 _TREND = 0.3
+#: On a telescope pixels that get less of a bright one's light are dirt's, or the shadow's or the rim's ...
+_WELL_LIT = 0.85
+#: ... and their squares count by so much, unless more than half would.
+_LEAST_TRUST = 1e-3
 #: Shapes of the mirror that are looked at under each state of the air.
 _SHAPES = 10
 #: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
@@ -152,6 +156,18 @@ class PyramidModel:
     def gain_trend(self) -> float:
         """Scatter of trends of the slopes' gains, see :class:`UnevenModel`; a pyramid at rest has none."""
         return _TREND if self.turbulence or self._pokes else 0.0
+
+    @property
+    def slope_trust(self) -> NDArray[np.float64]:
+        """What pixels count, see :class:`SelectiveModel`: on a telescope those that are well lit.
+
+        Dirt stops a part of the light within a pixel, and its edges scatter; slopes there answer in
+        ways that random gains take for a scaling. A bench's beam is dim at the rim by design.
+        """
+        lit = self._pupils.flux[self._pupils.valid] >= _WELL_LIT
+        if not self._config.telescope.obscuration or 2 * lit.sum() < lit.size:
+            lit = np.ones_like(lit)
+        return np.tile(np.where(lit, 1.0, _LEAST_TRUST), 2)
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
