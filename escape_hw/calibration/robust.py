@@ -30,8 +30,8 @@ def as_trusted(weighted: WeightedMatrix, model: SyntheticModel) -> WeightedMatri
 def trust(residual: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weight of every slope's squares ``(n_slopes,)``, in (0, 1].
 
-    Huber's weights (1964), for sub-apertures instead of elements: dirt, a broken lenslet or a wrong window spoil a
-    sub-aperture in all modes and in both slopes.
+    Huber's weights (1964), for sub-apertures instead of elements: dirt, a broken lenslet or a wrong window
+    spoil one in all modes and in both slopes.
 
     Parameters
     ----------
