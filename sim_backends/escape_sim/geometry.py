@@ -108,36 +108,6 @@ def pupil_of_images(config: SystemConfig, pupils: PyramidPupils) -> PupilGeometr
 def lit_as_seen(pupil: PupilGeometry, pupils: PyramidPupils) -> PupilGeometry:
     """A pupil, brightened or dimmed by the light of its images relative to the design's."""
     n, p = pupil.n_sub, pupil.n_pix
-    share, beside = share_of_light(pupil, pupils)
-    at = (np.arange(n * p) + 0.5) / p - 0.5
-    x, y = beside.mean(axis=0)
-    at_samples = np.meshgrid(at - y, at - x, indexing="ij")
-    dimmed = ndimage.map_coordinates(share, at_samples, order=1, mode="nearest")
-    amplitude = pupil.amplitude * np.sqrt(np.maximum(dimmed, _DIMMEST))
-    return replace(pupil, amplitude=amplitude.astype(np.float32))
-
-
-def share_of_light(
-    pupil: PupilGeometry, pupils: PyramidPupils
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Light of a pyramid's images relative to the design's.
-
-    Parameters
-    ----------
-    pupil
-        The design's pupil.
-    pupils
-        The images.
-
-    Returns
-    -------
-    share : ndarray, ``(n, n)``
-        Of every pixel, 1 where the pupil is clean and evenly lit; where the design has too little light to
-        tell, the nearest pixel's.
-    beside : ndarray, ``(4, 2)``
-        How far the boxes lie beside the images, as (x, y) in pixels.
-    """
-    n, p = pupil.n_sub, pupil.n_pix
     design = ndimage.gaussian_filter(np.square(pupil.amplitude, dtype=float), SOFT * p)
     # Boxes lie a fraction of a pixel beside their images.
     beside = pupils.corners_px + (n - 1) / 2 - pupils.centres_px
@@ -147,7 +117,12 @@ def share_of_light(
     share = np.where(telling, pupils.flux / np.where(telling, expected, 1.0), 0.0)
     # Beyond the last pixel that tells, the nearest one does.
     share = share[tuple(ndimage.distance_transform_edt(~telling, return_indices=True)[1])]
-    return share / np.percentile(share, 95), beside
+    at = (np.arange(n * p) + 0.5) / p - 0.5
+    x, y = beside.mean(axis=0)
+    at_samples = np.meshgrid(at - y, at - x, indexing="ij")
+    dimmed = ndimage.map_coordinates(share / np.percentile(share, 95), at_samples, order=1, mode="nearest")
+    amplitude = pupil.amplitude * np.sqrt(np.maximum(dimmed, _DIMMEST))
+    return replace(pupil, amplitude=amplitude.astype(np.float32))
 
 
 def usual_samples(config: SystemConfig) -> int:

@@ -15,13 +15,7 @@ from escape_hw.calibration.basis import configured_basis
 from escape_hw.config.sensor_models import PyramidSection
 from escape_sim.air_scatter import air_scatter
 from escape_sim.fourier_filter import good_length
-from escape_sim.geometry import (
-    actuator_positions,
-    pitch_on_pupil,
-    pupil_geometry,
-    pupil_of_images,
-    share_of_light,
-)
+from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry, pupil_of_images
 from escape_sim.influence import InfluenceFunctions
 from escape_sim.mode_surfaces import (
     N_DERIVATIVES,
@@ -51,9 +45,9 @@ _SCALING = 0.05
 #: Slopes at the rim may answer so much more or less than the model's (found: 0.2 to 0.3): pixels saturate
 #: when pokes gather the light, and what the pokes do at the rim is only nearly known.
 _TREND = 0.3
-#: On a telescope pixels are soiled that get less of the design's light than this share of the median's ...
-_SOILED = 0.8
-#: ... and their squares count by so much.
+#: On a telescope pixels that get less of a bright one's light are dirt's, or the shadow's or the rim's ...
+_WELL_LIT = 0.85
+#: ... and their squares count by so much, unless more than half would.
 _LEAST_TRUST = 1e-3
 #: Shapes of the mirror that are looked at under each state of the air.
 _SHAPES = 10
@@ -165,17 +159,15 @@ class PyramidModel:
 
     @property
     def slope_trust(self) -> NDArray[np.float64]:
-        """Which pixels count, see :class:`SelectiveModel`: on a telescope those that are clean.
+        """What pixels count, see :class:`SelectiveModel`: on a telescope those that are well lit.
 
         Dirt stops a part of the light within a pixel, and its edges scatter; slopes there answer in
-        ways that random gains take for a scaling.
+        ways that random gains take for a scaling. A bench's beam is dim at the rim by design.
         """
-        valid = self._pupils.valid
-        clean = np.ones(int(valid.sum()), np.bool_)
-        if self._config.telescope.obscuration:
-            share = share_of_light(pupil_geometry(self._config), self._pupils)[0][valid]
-            clean = share >= _SOILED * np.median(share)
-        return np.tile(np.where(clean, 1.0, _LEAST_TRUST), 2)
+        lit = self._pupils.flux[self._pupils.valid] >= _WELL_LIT
+        if not self._config.telescope.obscuration or 2 * lit.sum() < lit.size:
+            lit = np.ones_like(lit)
+        return np.tile(np.where(lit, 1.0, _LEAST_TRUST), 2)
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""

@@ -71,20 +71,20 @@ def test_slopes_that_are_not_trusted_do_not_move_the_registration() -> None:
 
 
 @pytest.mark.parametrize(("system", "telescope"), [("maps-nir", True), ("razor-pywfs", False)])
-def test_only_a_telescopes_model_distrusts_soiled_pixels(system: str, telescope: bool) -> None:
+def test_only_a_telescopes_model_distrusts_dim_pixels(system: str, telescope: bool) -> None:
     config = load_system(system, overrides=["sensor.n_sub=24", "basis.n_modes=20"])
     pupils = nominal_pupils(config)
     arc = np.zeros(pupils.valid.shape, bool)
     arc[pupils.valid] = soiled(pupils)
-    model = PyramidModel(config, replace(pupils, flux=pupils.flux * np.where(arc, np.float32(0.4), 1)))
+    model = PyramidModel(config, replace(pupils, flux=np.where(arc, 0.4, 1.0).astype(np.float32)))
     trusted = model.slope_trust == 1.0
     expected = ~soiled(pupils) if telescope else np.ones(pupils.valid.sum(), bool)
     np.testing.assert_array_equal(trusted, np.tile(expected, 2))
     assert (model.slope_trust > 0).all()
 
 
-def test_an_evenly_dim_pupil_is_trusted_all_over() -> None:
+def test_a_pupil_that_is_dim_all_over_is_trusted_all_over() -> None:
     config = load_system("maps-nir", overrides=["sensor.n_sub=24", "basis.n_modes=20"])
     pupils = nominal_pupils(config)
-    model = PyramidModel(config, replace(pupils, flux=0.3 * pupils.flux))
-    assert (model.slope_trust == 1.0).all()
+    dim = np.where(np.random.default_rng(1).random(pupils.valid.shape) < 0.7, 0.5, 1.0)
+    assert (PyramidModel(config, replace(pupils, flux=dim.astype(np.float32))).slope_trust == 1.0).all()
