@@ -13,6 +13,8 @@ from escape_sim.pyramid import PyramidOptics
 
 #: Rms path of a shape in waves: small enough for differences to be derivatives.
 _STEP = 0.01
+#: Share of the whole scatter that the air's is taken for at least: few states tell a covariance badly.
+_LEAST = 0.1
 
 Jacobian = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
 
@@ -31,7 +33,8 @@ def air_scatter(
     what it still sees lies a little aside. A model knows the mean only. Its registration therefore
     errs by this much over the root of the number of states that a measurement averaged, however little
     noise there was. Told by frames: differences of two with the mirror's shape up and down. Pokes are
-    new in every frame, so what they do to a state of the air is averaged.
+    new in every frame and average out as noise does, which the fit's own errors count. So each state is
+    fitted twice, under the pokes of every other shape, and what the two have in common is the air's.
 
     Parameters
     ----------
@@ -59,10 +62,20 @@ def air_scatter(
             for state, path in zip(states, paths, strict=True)
         ]
         unit, derivatives = jacobian(commands)
-        terms = np.concatenate([unit[None], derivatives[:5]]).reshape(6, -1)
-        gain, *moved = np.linalg.lstsq(terms @ terms.T, terms @ np.stack(slopes, axis=1).ravel())[0]
-        found.append(np.array(moved) / gain)
-    variance = np.var(found, axis=0, ddof=1)
+        terms, seen = np.concatenate([unit[None], derivatives[:5]]), np.stack(slopes, axis=1)
+        found.append([_fit(terms[:, :, half::2], seen[:, half::2]) for half in range(2)])
+    both = np.array(found) - np.mean(found, axis=0)
+    freedom = len(both) - 1
+    common = np.prod(both, axis=1).sum(axis=0) / freedom
+    whole = np.square(both.mean(axis=1)).sum(axis=0) / freedom
     # Air and pupil have no preferred direction, and few states tell a variance badly.
-    variance[:2] = variance[:2].mean()
-    return np.asarray(np.sqrt(variance))
+    for variance in (common, whole):
+        variance[:2] = variance[:2].mean()
+    return np.asarray(np.sqrt(np.maximum(common, _LEAST * whole)))
+
+
+def _fit(terms: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Registration ``(5,)`` by matrix and derivatives ``(6, n_slopes, k)`` from slopes ``(n_slopes, k)``."""
+    flat = terms.reshape(6, -1)
+    gain, *moved = np.linalg.lstsq(flat @ flat.T, flat @ slopes.ravel())[0]
+    return np.asarray(np.array(moved) / gain)
