@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.departures import MirrorDepartures
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.model import SyntheticModel
+from escape_hw.api.model import SelectiveModel, SyntheticModel
 from escape_hw.api.procedure import Procedure, Progress, Reporter
 from escape_hw.api.registration import TO_PLAIN, Registration
 from escape_hw.api.results import SprintIteration
@@ -135,7 +135,8 @@ def solve(
         far = capture(descent.matrix, model, descent.columns, start, most, rate, frozen)
         light = yield from _watched(far, descent)
         start = light.alpha
-    elif descent.solver != "effects":
+    # From afar all slopes count, those that the model is none of, too.
+    if descent.solver != "effects" and (not reach or isinstance(model, SelectiveModel)):
         light = yield from _watched(LightProblem(weighted, model, rate, frozen).descend(start, most), descent)
     if descent.solver != "effects":
         return _of_light(light, model)
