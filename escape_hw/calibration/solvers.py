@@ -85,7 +85,8 @@ class Solution:
     ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``, ``learned`` what the data say about the
     scatter of the random effects, and ``departures`` those of the mirror, where there are any; each is
     worked out when asked for. ``scatter`` is what is to be added to the covariance of the registration
-    ``(5, 5)``; ``extras`` is what was fitted beside it; ``left`` is the whole step from where it ended ``(5,)``.
+    ``(5, 5)``; ``extras`` is what was fitted beside it; ``left`` is the whole step from where it
+    ended ``(5,)``.
     """
 
     system: Linearised
