@@ -96,19 +96,20 @@ def sandwich(
     # Slopes along x and along y of one sub-aperture stand in one place.
     by_place = each.sum(axis=2).reshape(len(each), 2, -1).sum(axis=1)
     meat = by_place @ _gathered(valid, by_place).T
+    power = weighted.noise(system.residual) ** 2
     if noise is None:
         by_mode = each.sum(axis=1)
         meat += by_mode @ by_mode.T
     else:
-        correlation = noise / np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
+        # A slope that never moved has no noise to share.
+        spread = np.where(np.diag(noise) > 0, np.sqrt(np.diag(noise)), np.inf)
+        correlation = power * noise / np.outer(spread, spread)
         near = np.tile(_nearness(valid), (2, 2)) * correlation
         # What the scatter shows beyond the noise is the model's.
         meat = _expected(scores, correlation) + _positive(meat - _expected(scores, near))
     found = bread @ meat @ bread
     # Never better than the noise alone allows.
-    scale = np.sqrt(np.maximum(np.diag(bread) / np.diag(found), 1.0))
+    scale = np.sqrt(np.maximum(power * np.diag(bread) / np.diag(found), 1.0))
     covariance = found * np.outer(scale, scale)
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(FLOOR)
-    if not weighted.measured:
-        covariance = covariance * np.mean(np.square(system.residual))
     return np.asarray(covariance)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.departures import MirrorDepartures
 from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.model import SyntheticModel
+from escape_hw.api.model import SelectiveModel, SyntheticModel
 from escape_hw.api.procedure import Procedure, Progress, Reporter
 from escape_hw.api.registration import TO_PLAIN, Registration
 from escape_hw.api.results import SprintIteration
@@ -85,7 +85,8 @@ class Solution:
     ``zonal`` gives the matrix that was found ``(n_slopes, n_act)``, ``learned`` what the data say about the
     scatter of the random effects, and ``departures`` those of the mirror, where there are any; each is
     worked out when asked for. ``scatter`` is what is to be added to the covariance of the registration
-    ``(5, 5)``; ``extras`` is what was fitted beside it; ``left`` is the step from where it ended ``(5,)``.
+    ``(5, 5)``; ``extras`` is what was fitted beside it; ``left`` is the whole step from where it
+    ended ``(5,)``.
     """
 
     system: Linearised
@@ -135,7 +136,8 @@ def solve(
         far = capture(descent.matrix, model, descent.columns, start, most, rate, frozen)
         light = yield from _watched(far, descent)
         start = light.alpha
-    elif descent.solver != "effects":
+    # From afar all slopes count, those that the model is none of, too.
+    if descent.solver != "effects" and (not reach or isinstance(model, SelectiveModel)):
         light = yield from _watched(LightProblem(weighted, model, rate, frozen).descend(start, most), descent)
     if descent.solver != "effects":
         return _of_light(light, model)
@@ -168,11 +170,12 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
     """Gauss-Newton on registration and random effects together."""
     state, settled = problem.start(start), False
     system = problem.linearise(state)
-    rate, before, step = descent.learning_rate, np.zeros(5), np.full(1, np.nan)
+    rate, before = descent.learning_rate, np.zeros(5)
     for _ in range(descent.max_iterations):
         if descent.report.step():
             yield descent.progress()
         step = system.solve()
+        left = step[1:6]
         if not np.isfinite(step).all():
             break
         spread = np.sqrt(np.abs(np.diag(np.linalg.inv(system.information()))))[1:6]
@@ -192,11 +195,14 @@ def _with_effects(problem: Problem, start: Registration, descent: Descent) -> Pr
         damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / LARGEST)))
         step = step * damping * rate
         state, system = _moved(problem, state, system, step)
+    else:
+        # The last step was a share of what was wanted then; this is what is wanted now.
+        left = system.solve()[1:6]
     return Solution(
         system, state.alpha, state.gain, 1 + state.width, settled,
         lambda: problem.zonal(state), learned=lambda: problem.learned(state, system),
         extras=problem.extras_found(state), departures=lambda: problem.departures(state, system),
-        left=step[1:6],
+        left=left,
     )  # fmt: skip
 
 

@@ -103,6 +103,14 @@ def test_informative_modes_beat_the_first_ones(bench):
         choose_modes(matrix, 6, "d-optimal")
 
 
+def test_a_descent_of_small_steps_that_was_cut_has_not_converged(bench):
+    matrix = measured(bench, noise=0.3)
+    cut = sprint(matrix, bench[0], learning_rate=0.01, reach=False, max_iterations=3)
+    assert not cut.converged
+    assert any("did not shrink" in warning for warning in cut.warnings)
+    assert sprint(matrix, bench[0]).converged
+
+
 @pytest.mark.parametrize("option", ["solver", "choice", "loss", "actuators"])
 def test_what_is_not_known_is_refused(bench, option):
     with pytest.raises(ValueError, match=rf"{option} is 'best'; it is one of"):

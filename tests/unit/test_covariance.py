@@ -67,3 +67,41 @@ def test_stated_errors_are_those_of_fits_to_noise_that_neighbours_share(missed):
     ratio = (np.mean(stated, axis=0) - floor) / np.mean(np.square(errors), axis=0)
     assert (ratio > 0.8).all(), ratio
     assert (ratio < 1.6).all(), ratio
+
+
+def fitted(seed):
+    """A fit of six parameters to noise with a pattern that the model misses; the noise's covariance."""
+    rng = np.random.default_rng(seed)
+    valid = np.ones((8, 8), bool)
+    places = np.tile(np.argwhere(valid), (2, 1))
+    noise = np.exp(-np.linalg.norm(places[:, None] - places, axis=2) / 3.0) + 0.1 * np.eye(128)
+    derivatives = rng.standard_normal((6, 128, 9))
+    data = rng.standard_normal((128, 9)) + np.sin(places @ [0.5, 0.3])[:, None] * rng.standard_normal(9)
+    flat = derivatives.reshape(6, -1)
+    left = data - np.tensordot(np.linalg.solve(flat @ flat.T, flat @ data.ravel()), derivatives, 1)
+    return valid, Linear(derivatives, left / np.sqrt(np.mean(np.square(left)))), noise
+
+
+def weights(valid, measured):
+    n_slopes = 2 * int(valid.sum())
+    return WeightedMatrix(np.zeros((n_slopes, 9)), np.ones(n_slopes), np.ones(9), np.eye(9), measured, valid)
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_a_matrix_without_errors_of_its_own_is_stated_those_that_its_residual_tells(correlated):
+    valid, system, covariance = fitted(5)
+    noise = covariance if correlated else None
+    # In units of the matrix instead of its noise.
+    coarse = Linear(system.derivatives / 20, system.residual / 20)
+    np.testing.assert_allclose(
+        sandwich(weights(valid, False), coarse, noise), sandwich(weights(valid, True), system, noise)
+    )
+
+
+def test_a_slope_that_never_moved_leaves_the_stated_errors_what_they_are():
+    valid, system, noise = fitted(6)
+    dead = noise.copy()
+    dead[3], dead[:, 3] = 0.0, 0.0
+    system.derivatives[:, 3], system.residual[3] = 0.0, 0.0
+    with_dead, with_live = (sandwich(weights(valid, True), system, one) for one in (dead, noise))
+    np.testing.assert_allclose(with_dead, with_live)

@@ -68,8 +68,8 @@ class Overshooting:
         return ()
 
 
-def descend(problem, most=40):
-    descent = Descent(None, None, np.arange(3), "effects", 1.0, most, Priors())
+def descend(problem, most=40, learning_rate=1.0):
+    descent = Descent(None, None, np.arange(3), "effects", learning_rate, most, Priors())
     return run(_with_effects(problem, Registration(shift_x=1.0, shift_y=-0.5), descent))
 
 
@@ -87,3 +87,13 @@ def test_a_descent_that_goes_to_and_fro_for_ever_is_given_up_with_what_is_left()
     assert problem.steps < 40
     assert found.left is not None
     assert np.abs(found.left[0]) == pytest.approx(30 * np.abs(found.alpha[0]).clip(0.05), rel=1e-6)
+
+
+@pytest.mark.parametrize(("learning_rate", "most"), [(0.02, 3), (1.0, 0)])
+def test_what_is_left_of_a_descent_that_was_cut_is_the_whole_step_not_the_share_that_was_taken(
+    learning_rate, most
+):
+    found = descend(Overshooting(1.0), most, learning_rate)
+    assert not found.settled
+    assert found.left == pytest.approx(-found.alpha)
+    assert found.alpha[0] == pytest.approx((1 - learning_rate) ** most)
