@@ -119,8 +119,11 @@ class RingReader:
             if count == 0:
                 return None
             number = count - 1
-            if self._index(number) == after and self.written == count:
-                return None
+            if self._index(number) == after:
+                if self.written == count:
+                    return None
+                # One more was written meanwhile.
+                continue
             sample = self._copy(number)
             if sample is not None:
                 return sample
