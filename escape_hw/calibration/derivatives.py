@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.departures import PEDESTAL
 from escape_hw.api.model import DifferentiableModel, SyntheticModel
 from escape_hw.api.registration import Registration
 
@@ -69,6 +70,37 @@ def zonal_jacobian(
     if isinstance(model, DifferentiableModel):
         return model.zonal_jacobian(registration, width)
     return _differences(model.zonal_matrix, registration, width)
+
+
+def pedestal_jacobian(
+    model: SyntheticModel,
+    registration: Registration,
+    width: float = 1.0,
+    m2c: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes of the broad pedestal that influence functions may stand on, and their derivatives.
+
+    Parameters
+    ----------
+    model, registration
+        As for :func:`modal_matrix`.
+    width
+        Scale of the influence functions' own width; that of the pedestal is a multiple of it.
+    m2c
+        Modes ``(n_act, n_modes)``; single actuators by default.
+
+    Returns
+    -------
+    matrix : ndarray, ``(n_slopes, n_modes)``
+    derivatives : ndarray, ``(6, n_slopes, n_modes)``
+        By the five parameters of the registration, in their units, and by ``width``.
+    """
+    wide = PEDESTAL * width
+    if m2c is None:
+        broad, moved = zonal_jacobian(model, registration, wide)
+    else:
+        broad, moved = modal_jacobian(model, registration, m2c, wide)
+    return broad, np.concatenate([moved[:5], PEDESTAL * moved[5:]])
 
 
 def _differences(

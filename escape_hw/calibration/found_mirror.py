@@ -9,7 +9,7 @@ from escape_hw.api.departures import PEDESTAL
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate
-from escape_hw.calibration.derivatives import modal_jacobian, modal_matrix
+from escape_hw.calibration.derivatives import modal_jacobian, modal_matrix, pedestal_jacobian
 from escape_hw.calibration.extra_unknowns import unknowns_told
 
 
@@ -59,7 +59,10 @@ def found_jacobian(
     unit, derivatives = modal_jacobian(model, here, acted, width)
     open_to = np.zeros_like(unit)
     if apart is not None:
-        open_to = np.square(model.zonal_matrix(here, width)) @ np.square(apart.gain_sigma[:, None] * m2c)
+        share, single = apart.pedestal, model.zonal_matrix(here, width)
+        derivatives = derivatives + share * (pedestal_jacobian(model, here, width, acted)[1] - derivatives)
+        single = single + share * (model.zonal_matrix(here, width * PEDESTAL) - single)
+        open_to = np.square(single) @ np.square(apart.gain_sigma[:, None] * m2c)
     return _whole(unit, model, here, estimate, acted), derivatives, open_to
 
 
@@ -83,6 +86,8 @@ def _whole(
         unit = unit + share * (one.per_share(here, width, share) @ acted)
     if apart is None:
         return unit
-    unequal = modal_jacobian(model, here, apart.width[:, None] * acted, width)[1][5] * width
+    share, wider = apart.pedestal, apart.width[:, None] * acted
     broad = modal_matrix(model, here, acted, width * PEDESTAL) - modal_matrix(model, here, acted, width)
-    return np.asarray(unit + unequal + apart.pedestal * broad)
+    own = modal_jacobian(model, here, wider, width)[1][5]
+    unequal = own + share * (pedestal_jacobian(model, here, width, wider)[1][5] - own)
+    return np.asarray(unit + share * broad + width * unequal)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from escape_hw.api.departures import PEDESTAL, MirrorDepartures
 from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.derivatives import modal_matrix, zonal_jacobian
+from escape_hw.calibration.derivatives import modal_matrix, pedestal_jacobian, zonal_jacobian
 from escape_hw.calibration.evidence import believed
 from escape_hw.calibration.extra_unknowns import ExtraUnknown, FoundExtra
 from escape_hw.calibration.misfit import NormalEquations, Priors, normal_equations
@@ -24,6 +24,8 @@ GAIN, WIDTH, SHAPE = 0, 6, 7
 
 #: Shares of a variant below which its derivatives are taken for the model's own.
 _SMALL_SHARE = 0.25
+#: Share of the pedestal below which the whole is taken to move as the influence functions do without it.
+_SMALL_PEDESTAL = 0.05
 #: Share of the gain down to which a step may take it for shares to follow its product with them.
 _LEAST_KEPT = 0.05
 #: Random effects of which there are many of a kind, in the order of the unknowns ...
@@ -186,8 +188,12 @@ class Problem:
             changed, changes = (weigh(part) for part in zonal_jacobian(variant, here, w))
             variants.append(changed - zonal)
             moved = moved + share * (changes - base)
-        by_width = moved[5] * w
-        by_shape = weigh(self.model.zonal_matrix(here, w * PEDESTAL)) - zonal
+        if abs(state.shape) < _SMALL_PEDESTAL:
+            broad = weigh(self.model.zonal_matrix(here, w * PEDESTAL))
+        else:
+            broad, changes = (weigh(part) for part in pedestal_jacobian(self.model, here, w))
+            moved = moved + state.shape * (changes - base)
+        by_width, by_shape = moved[5] * w, broad - zonal
         variants += [weigh(change) for change in self._changes(state)]
         variants += [zonal @ bend for bend in self.bends]
         shaped = zonal + state.shape * by_shape + state.actuator_width * by_width
