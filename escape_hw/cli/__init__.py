@@ -5,22 +5,26 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from escape_hw.cli.output import Output
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``escape``; ends the process with the command's exit code."""
-    try:
-        from escape_hw.cli.app import run
+    with Output(document="--json" in (sys.argv[1:] if arguments is None else arguments)) as output:
+        try:
+            from escape_hw.cli.app import run
 
-        run(arguments)
-    except KeyboardInterrupt:
-        # Before a command has taken Ctrl-C over nothing is open.
-        sys.stderr.write("stopped before anything was opened\n")
-        _leave_at_once(130)
-    except SystemExit as ended:
-        # Only where the process is ours alone, and somebody has pressed Ctrl-C and waits.
-        if arguments is None and ended.code == 130:
+            run(arguments)
+        except KeyboardInterrupt:
+            # Before a command has taken Ctrl-C over nothing is open.
+            sys.stderr.write("stopped before anything was opened\n")
             _leave_at_once(130)
-        raise
+        except SystemExit as ended:
+            ended.code = output.verdict(ended.code)
+            # Only where the process is ours alone, and somebody has pressed Ctrl-C and waits.
+            if arguments is None and ended.code == 130:
+                _leave_at_once(130)
+            raise
 
 
 def _leave_at_once(code: int) -> None:

@@ -48,7 +48,7 @@ class Session:
         self.interrupts = Interrupts(self._tell_at_once)
         self.folder: RunFolder | None = None
         self._concerns: dict[str, Any] = {"system": None, "simulated": None, "seed": None}
-        self.was_opened = self._deaf = False
+        self.was_opened = False
         self.code = DONE
         self._document: Mapping[str, Any] | None = None
         self._began = time.monotonic()
@@ -75,13 +75,8 @@ class Session:
 
     def show(self, *what: RenderableType) -> None:
         """Results for people, on standard output; silent with ``--json``."""
-        if self.json or self._deaf:
-            return
-        try:
-            for item in what:
-                self.tables.print(item, highlight=False, markup=False, soft_wrap=isinstance(item, str))
-        except OSError as error:
-            self._nobody_reads(error)
+        for item in () if self.json else what:
+            self.tables.print(item, highlight=False, markup=False, soft_wrap=isinstance(item, str))
 
     def result(self, document: Mapping[str, Any], met: bool = True) -> None:
         """The command's document, printed at its end with ``--json``; ``met`` false: exit code 1."""
@@ -273,20 +268,8 @@ class Session:
 
         if self.json and self._document is not None:
             document, self._document = self._document, None
-            try:
-                self._stdout.write(dumps(document) + "\n")
-                self._stdout.flush()
-            except OSError as error:
-                self._nobody_reads(error)
-
-    def _nobody_reads(self, error: OSError) -> None:
-        """Standard output takes no more (a full disk, a closed pipe): tell once, and go on without it."""
-        self._deaf = True
-        self.code = self.code or FAILED
-        self.tell(f"error: standard output cannot be written ({error.strerror or error})")
-        with contextlib.suppress(OSError, ValueError):
-            # Or Python would try again at its end, and fail again.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stdout.fileno())
+            self._stdout.write(dumps(document) + "\n")
+            self._stdout.flush()
 
 
 @contextmanager

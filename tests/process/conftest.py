@@ -24,9 +24,10 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """One computing thread, and no file outside the tests' folders."""
+    """One computing thread, no file outside the tests' folders, and Python's buffers as usual."""
     data = str(tmp_path_factory.mktemp("data"))
-    return {**os.environ, "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "XDG_DATA_HOME": data}
+    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    return {**inherited, "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "XDG_DATA_HOME": data}
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,121 @@
+"""Standard output and standard error that end before the command does, with and without Python's buffers."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from running import ESCAPE
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices of Linux")
+
+#: Short commands with a table, with a document, and those that end before any command begins.
+COMMANDS = [("systems",), ("systems", "--json"), ("--help",)]
+#: What the message says of a full device, and of a pipe.
+NO_ROOM, NO_READER = "No space left on device", "Broken pipe"
+
+
+@pytest.fixture(scope="module", params=["buffered", "unbuffered"])
+def bare(request, tmp_path_factory) -> dict[str, str]:
+    """An environment with nothing in it that this test does not put there."""
+    home = tmp_path_factory.mktemp("home")
+    told = {"HOME": str(home), "PATH": os.defpath, "LANG": "C.UTF-8", "OPENBLAS_NUM_THREADS": "1"}
+    told["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    return told | ({"PYTHONUNBUFFERED": "1"} if request.param == "unbuffered" else {})
+
+
+def ended(words, environment, **streams) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(
+        [*ESCAPE, *map(str, words)], text=True, check=False, env=environment, timeout=60, **streams
+    )
+
+
+def without_reader() -> int:
+    """The end of a pipe that nobody reads."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    return writing
+
+
+def closing(descriptor: int):
+    """As ``>&-`` of a shell."""
+    return lambda: os.close(descriptor)
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_a_full_device_is_no_success(bare, words):
+    with open("/dev/full", "w") as full:
+        done = ended(words, bare, stdout=full, stderr=subprocess.PIPE)
+    assert done.returncode == 1
+    assert done.stderr == f"error: standard output cannot be written ({NO_ROOM})\n"
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_a_pipe_without_a_reader_is_no_success(bare, words):
+    nobody = without_reader()
+    done = ended(words, bare, stdout=nobody, stderr=subprocess.PIPE)
+    os.close(nobody)
+    assert done.returncode == 1
+    # A table that is cut off is nothing to talk about; a lost document is.
+    lost = "--json" in words
+    assert done.stderr == (f"error: standard output cannot be written ({NO_READER})\n" if lost else "")
+
+
+def test_the_first_lines_of_a_long_table(bare, im):
+    """As ``escape show FILE | head -1``, where the rest may have been written before the pipe was closed."""
+    with subprocess.Popen(
+        [*ESCAPE, "show", im], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=bare
+    ) as process:
+        process.stdout.readline()
+        process.stdout.close()
+        told = process.stderr.read()
+        assert process.wait(60) in (0, 1)
+    assert told == ""
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_a_command_without_standard_output(bare, words):
+    done = ended(words, bare, stderr=subprocess.PIPE, preexec_fn=closing(1))
+    assert done.returncode == 1
+    assert done.stderr == "error: standard output cannot be written (Bad file descriptor)\n"
+
+
+@pytest.mark.parametrize("words", COMMANDS[1:], ids=" ".join)
+@pytest.mark.parametrize("end", ["full", "pipe", "none"])
+def test_standard_error_changes_no_result(bare, words, end):
+    whole = ended(words, bare, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert (whole.returncode, whole.stderr) == (0, "")
+    assert whole.stdout
+    told = {"full": lambda: os.open("/dev/full", os.O_WRONLY), "pipe": without_reader}.get(end)
+    nobody = subprocess.DEVNULL if told is None else told()
+    streams = {"stdout": subprocess.PIPE, "stderr": nobody}
+    done = ended(words, bare, **streams, **({"preexec_fn": closing(2)} if told is None else {}))
+    if told is not None:
+        os.close(nobody)
+    assert (done.returncode, done.stdout) == (0, whole.stdout)
+
+
+@pytest.mark.parametrize("words", [("systms",), ("systems", "--jsn")], ids=" ".join)
+@pytest.mark.parametrize("end", ["full", "pipe"])
+def test_a_wrong_command_stays_one(bare, words, end):
+    nobody = without_reader() if end == "pipe" else os.open("/dev/full", os.O_WRONLY)
+    done = ended(words, bare, stdout=nobody, stderr=nobody)
+    os.close(nobody)
+    assert done.returncode == 2
+
+
+@pytest.mark.parametrize("bare", ["buffered"], indirect=True)
+@pytest.mark.parametrize("end", ["full", "pipe"])
+def test_a_run_whose_progress_nobody_reads_is_finished(bare, system, tmp_path, end):
+    """It takes long enough for many lines of progress."""
+    nobody = without_reader() if end == "pipe" else os.open("/dev/full", os.O_WRONLY)
+    words = ("calibrate", system, "--method", "docrime", "--frames", 300, "--out", tmp_path / "run")
+    done = ended(words, bare, stdout=subprocess.PIPE, stderr=nobody)
+    os.close(nobody)
+    assert done.returncode == 0
+    assert (tmp_path / "run" / "im.fits").is_file()
+    assert "Traceback" not in (tmp_path / "run" / "run.log").read_text()
+    assert done.stdout
