@@ -10,7 +10,7 @@ import typer.cli
 import typer.main
 
 from escape_hw.cli.app import app
-from escape_hw.config.schema import json_schema
+from escape_hw.config.templates import json_schema
 
 #: Where the pages go, inside the documentation's folder; made anew with every build.
 FOLDER = "reference/_generated"

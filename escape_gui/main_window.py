@@ -21,26 +21,23 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from escape_gui.actions import ACTIONS, MENUS
-from escape_gui.band import Band
-from escape_gui.dock import Dock
-from escape_gui.fault_bar import FaultBar
-from escape_gui.help_pages import page
-from escape_gui.key_map import key_map, keys_text
-from escape_gui.news import News
+from escape_gui.client.availability import RequestContext
+from escape_gui.client.session import ServerControl, Session
 from escape_gui.panels import PANELS
-from escape_gui.panels.panel import Context, Panel
-from escape_gui.replay.desk import ReplayDesk
-from escape_gui.saver import Saver
-from escape_gui.session import Control, Session
+from escape_gui.panels.base import Context, Panel
+from escape_gui.replay.opener import RecordingOpener
 from escape_gui.settings import Settings, save_settings
-from escape_gui.situation import Situation
 from escape_gui.theme import Theme
-from escape_gui.ticker import Ticker
-from escape_gui.widgets.overlay import Overlay
-from escape_gui.widgets.status_pill import Level
-from escape_gui.widgets.toasts import Toasts
-from escape_gui.workspaces import WORKSPACES, arrange, hide_stray_tabs, workspace
+from escape_gui.widgets.controls.overlay import Overlay
+from escape_gui.widgets.controls.status_indicator import Level
+from escape_gui.window.actions import ACTIONS, MENUS
+from escape_gui.window.dock import Dock
+from escape_gui.window.export import Exporter
+from escape_gui.window.header import FaultBanner, HeaderBar
+from escape_gui.window.help_pages import format_shortcuts, help_page, keyboard_table
+from escape_gui.window.notifications import NotificationBar, StateNotifier
+from escape_gui.window.update_timer import UpdateTimer
+from escape_gui.window.workspaces import WORKSPACES, arrange_docks, hide_orphan_tab_bars, workspace
 from escape_hw.errors import StorageError
 
 log = logging.getLogger(__name__)
@@ -67,14 +64,14 @@ class MainWindow(QMainWindow):
         self,
         session: Session,
         settings: Settings,
-        store: Path | None = None,
+        settings_path: Path | None = None,
         panels: Sequence[type[Panel]] = PANELS,
     ) -> None:
         super().__init__()
-        self._settings, self._store = settings, store
+        self._settings, self._store = settings, settings_path
         self.context = Context(Theme(settings.theme, settings.font_scale), session)
         self.context.theme.apply()
-        self.context.theme.changed.connect(self._fit_tabs)
+        self.context.theme.changed.connect(self._resize_tabs)
         self.setDockNestingEnabled(True)
         self.setDockOptions(
             QMainWindow.DockOption.AnimatedDocks
@@ -83,26 +80,32 @@ class MainWindow(QMainWindow):
         )
         self.setTabPosition(Qt.DockWidgetArea.AllDockWidgetAreas, QTabWidget.TabPosition.North)
         self.actions_by_name = self._make_actions()
-        self.band = Band(self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"])
-        self.fault_bar = FaultBar(self.context, self.actions_by_name["clear_fault"])
+        self.header = HeaderBar(
+            self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
+        )
+        self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
         self.tabs = self._make_tabs()
         self.panels = {kind.name: kind(self.context) for kind in panels}
         self.docks = {name: self._make_dock(panel) for name, panel in self.panels.items()}
-        self._make_top()
-        self._notes = {name: QLabel() for name in ("frozen", "busy", "saved", "recording", "disk")}
-        self.toasts = Toasts(self.context.theme)
-        self.statusBar().addWidget(self.toasts, 1)
-        for label in self._notes.values():
+        self._make_header()
+        self._status_labels = {name: QLabel() for name in ("frozen", "busy", "saved", "recording", "disk")}
+        self.notifications = NotificationBar(self.context.theme)
+        self.statusBar().addWidget(self.notifications, 1)
+        for label in self._status_labels.values():
             self.statusBar().addPermanentWidget(label)
         self.overlay = Overlay(self, self.context.theme)
-        self.news = News(self.toasts)
-        self.saver: Saver = Saver(self)
-        self.ticker = Ticker(session, self.panels.values(), self.refresh)
-        self.replay: ReplayDesk = ReplayDesk(
+        self.state_notifier = StateNotifier(self.notifications)
+        self.exporter: Exporter = Exporter(self)
+        self.update_timer = UpdateTimer(session, self.panels.values(), self.refresh)
+        self.replay: RecordingOpener = RecordingOpener(
             self, lambda: MainWindow(Session(), settings.model_copy(deep=True), None, panels)
         )
-        session.failed.connect(lambda what, why: self.toasts.tell(Level.BAD, f"Could not {what}", why))
-        session.waiting_changed.connect(lambda n: self.note("busy", f"{n} request(s) under way" if n else ""))
+        session.failed.connect(
+            lambda what, why: self.notifications.show_message(Level.ERROR, f"Could not {what}", why)
+        )
+        session.pending_changed.connect(
+            lambda n: self.set_status_text("busy", f"{n} request(s) under way" if n else "")
+        )
         self.workspace = workspace(settings.workspace)
         self._restore()
 
@@ -131,18 +134,18 @@ class MainWindow(QMainWindow):
         tabs.currentChanged.connect(lambda k: self.show_workspace(WORKSPACES[k].name))
         return tabs
 
-    def _fit_tabs(self) -> None:
+    def _resize_tabs(self) -> None:
         """Another look has wider or narrower words."""
         self.tabs.setMinimumWidth(self.tabs.sizeHint().width())
         self.tabs.updateGeometry()
 
     def _make_dock(self, panel: Panel) -> Dock:
         dock = Dock(panel, self.context.theme, self)
-        dock.save_wanted.connect(lambda name, kind: self.saver.panel(kind, self.panels[name]))
-        dock.help_wanted.connect(lambda name: self.show_panel_help(self.panels[name]))
+        dock.save_requested.connect(lambda name, kind: self.exporter.panel(kind, self.panels[name]))
+        dock.help_requested.connect(lambda name: self.show_panel_help(self.panels[name]))
         return dock
 
-    def _make_top(self) -> None:
+    def _make_header(self) -> None:
         bar = QMenuBar()
         for title in MENUS:
             menu = bar.addMenu(title)
@@ -159,7 +162,7 @@ class MainWindow(QMainWindow):
         column = QVBoxLayout(top)
         column.setContentsMargins(0, 0, 0, 0)
         column.setSpacing(0)
-        for widget in (bar, self.band, self.fault_bar):
+        for widget in (bar, self.header, self.fault_banner):
             column.addWidget(widget)
         self.setMenuWidget(top)
 
@@ -168,19 +171,19 @@ class MainWindow(QMainWindow):
         self.resize(1280, 800)
         if self._settings.geometry:
             self.restoreGeometry(_bytes(self._settings.geometry))
-        self._show_layout()
+        self._apply_layout()
         self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
         self.setFocus()
 
-    def _show_layout(self) -> None:
+    def _apply_layout(self) -> None:
         stored = self._settings.layouts.get(self.workspace.name)
         docks: dict[str, QDockWidget] = dict(self.docks)
         size = self.size()
         if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
-            arrange(self, docks, self.workspace)
+            arrange_docks(self, docks, self.workspace)
         # A layout of a larger window must not make this one larger.
         self.resize(size)
-        hide_stray_tabs(self, docks)
+        hide_orphan_tab_bars(self, docks)
         # Docks that were shown anew lie over everything.
         self.overlay.raise_()
 
@@ -188,17 +191,17 @@ class MainWindow(QMainWindow):
         """Change to another workspace, each as it was left."""
         if name == self.workspace.name:
             return
-        self._remember_layout()
+        self._store_layout()
         self.workspace = workspace(name)
-        self._show_layout()
+        self._apply_layout()
         self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
 
     def reset_layout(self) -> None:
         """Put this workspace's panels back in place."""
         self._settings.layouts.pop(self.workspace.name, None)
-        self._show_layout()
+        self._apply_layout()
 
-    def _remember_layout(self) -> None:
+    def _store_layout(self) -> None:
         self._settings.layouts[self.workspace.name] = _text(self.saveState(LAYOUT_VERSION))
 
     def focus_panel(self, step: int) -> None:
@@ -206,14 +209,14 @@ class MainWindow(QMainWindow):
         seen = [name for name, dock in self.docks.items() if not dock.visibleRegion().isEmpty()]
         if not seen:
             return
-        now = self.panel_in_focus()
+        now = self.focused_panel()
         k = seen.index(now.name) + step if now is not None and now.name in seen else 0
         panel = self.panels[seen[k % len(seen)]]
         panel.setFocus(Qt.FocusReason.TabFocusReason)
         if not panel.hasFocus():
             panel.focusNextChild()
 
-    def panel_in_focus(self) -> Panel | None:
+    def focused_panel(self) -> Panel | None:
         """The panel that has the focus."""
         widget = QApplication.focusWidget()
         while widget is not None and not isinstance(widget, Panel):
@@ -226,36 +229,36 @@ class MainWindow(QMainWindow):
         session = self.context.session
         source, live = session.source, session.live
         state = source.state
-        now = Situation(state, source.connected, live, session.may_write)
-        self.band.show_state(state, connected=now.connected, live=live, mine=now.may_write)
-        self.fault_bar.show_state(state)
+        now = RequestContext(state, source.connected, live, session.may_write)
+        self.header.show_state(state, connected=now.connected, live=live, mine=now.may_write)
+        self.fault_banner.show_state(state)
         for one in ACTIONS:
-            why = one.obstacle(now)
+            why = one.unavailable(now)
             action = self.actions_by_name[one.name]
             action.setEnabled(not why)
-            keys = f" ({keys_text(one.keys)})" if one.keys else ""
+            keys = f" ({format_shortcuts(one.keys)})" if one.keys else ""
             action.setToolTip(f"{one.tip}{keys}" if not why else f"{one.tip} Not now: {why}.")
         for dock in self.docks.values():
             dock.show_health()
-        self.news.look(state, connected=now.connected)
+        self.state_notifier.update(state, connected=now.connected)
         written = state.telemetry
-        self.note(
+        self.set_status_text(
             "recording",
             f"recording {written.written} frames, {written.dropped} dropped" if written.recording else "",
         )
-        self.note("disk", f"{state.disk.free_gb:.1f} GB free" if state.disk.folder else "")
+        self.set_status_text("disk", f"{state.disk.free_gb:.1f} GB free" if state.disk.folder else "")
         self.setWindowTitle(f"ESCAPE · {state.system}" if state.system else "ESCAPE")
 
-    def note(self, name: str, text: str) -> None:
+    def set_status_text(self, name: str, text: str) -> None:
         """Change a note in the status bar: frozen, busy, saved, recording, disk."""
-        self._notes[name].setText(text)
+        self._status_labels[name].setText(text)
 
     # ------------------------------------------------------------ what actions do
-    def ask(self, what: str, call: Callable[[Control], object], *, urgent: bool = False) -> None:
+    def ask(self, what: str, call: Callable[[ServerControl], object], *, urgent: bool = False) -> None:
         """Send a request whose answer nobody waits for."""
-        commands = self.context.session.commands
-        if commands is not None:
-            commands.ask(what, call, urgent=urgent)
+        requests = self.context.session.requests
+        if requests is not None:
+            requests.ask(what, call, urgent=urgent)
 
     def take_control(self) -> None:
         """Ask for the lease, from its holder if there is one."""
@@ -277,40 +280,40 @@ class MainWindow(QMainWindow):
 
     def toggle_theme(self) -> None:
         """The other palette."""
-        self.context.theme.use_shade("light" if self.context.theme.shade == "dark" else "dark")
+        self.context.theme.set_palette("light" if self.context.theme.palette_name == "dark" else "dark")
 
-    def step_letters(self, steps: int) -> None:
+    def step_font_scale(self, steps: int) -> None:
         """Larger or smaller letters; 0: the normal size."""
         self.context.theme.step_scale(steps)
 
     def toggle_freeze(self) -> None:
         """Hold the panels, or let them go on; band and safety buttons never freeze."""
-        self.ticker.frozen = not self.ticker.frozen
-        self.note("frozen", "Panels are frozen; X goes on" if self.ticker.frozen else "")
+        self.update_timer.frozen = not self.update_timer.frozen
+        self.set_status_text("frozen", "Panels are frozen; X goes on" if self.update_timer.frozen else "")
 
-    def toggle_key_map(self) -> None:
+    def toggle_keyboard_table(self) -> None:
         """Show the keys, or close them."""
         if self.overlay.isVisible():
             self.overlay.hide()
         else:
-            self.overlay.open("Keyboard", key_map())
+            self.overlay.open("Keyboard", keyboard_table())
 
     def show_panel_help(self, panel: Panel | None = None) -> None:
         """Show a panel's help page; without one, of the panel in focus."""
-        panel = panel or self.panel_in_focus()
+        panel = panel or self.focused_panel()
         if panel is None:
-            self.toggle_key_map()
+            self.toggle_keyboard_table()
         else:
-            self.overlay.open(panel.title, page(panel), markdown=True)
+            self.overlay.open(panel.title, help_page(panel), markdown=True)
 
     def closeEvent(self, event: QCloseEvent) -> None:
         """Remember the layout; the server goes on."""
-        self.ticker.stop()
+        self.update_timer.stop()
         self.replay.close()
-        self._remember_layout()
+        self._store_layout()
         theme, settings = self.context.theme, self._settings
         settings.geometry = _text(self.saveGeometry())
-        settings.theme, settings.font_scale = theme.shade, theme.scale
+        settings.theme, settings.font_scale = theme.palette_name, theme.scale
         settings.workspace = self.workspace.name
         if self._store is not None:
             try:

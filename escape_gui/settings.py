@@ -9,7 +9,7 @@ from typing import Any, Literal
 import platformdirs
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from escape_hw.config.outline import nearest
+from escape_hw.config.key_tree import closest_match
 from escape_hw.io.storage import write_atomic
 
 
@@ -50,14 +50,14 @@ def load_settings(path: Path) -> tuple[Settings, tuple[str, ...]]:
         return Settings(), (f"{path}: cannot be read ({error}); the window starts with its defaults",)
     if not isinstance(content, dict):
         return Settings(), (f"{path}: not a table of settings; the window starts with its defaults",)
-    return _sound_parts(path, content)
+    return _valid_settings(path, content)
 
 
-def _sound_parts(path: Path, content: dict[str, Any]) -> tuple[Settings, tuple[str, ...]]:
+def _valid_settings(path: Path, content: dict[str, Any]) -> tuple[Settings, tuple[str, ...]]:
     settings, warnings = Settings(), []
     for key, value in content.items():
         if key not in Settings.model_fields:
-            meant = nearest(key, Settings.model_fields)
+            meant = closest_match(key, Settings.model_fields)
             hint = f"; did you mean '{meant}'?" if meant else ""
             warnings.append(f"{path}: unknown setting '{key}' is ignored{hint}")
             continue

@@ -10,7 +10,7 @@ from PySide6.QtCore import QObject, Signal
 from PySide6.QtGui import QColor, QFont, QFontDatabase, QPalette
 from PySide6.QtWidgets import QApplication, QStyleFactory
 
-Shade = Literal["dark", "light"]
+PaletteName = Literal["dark", "light"]
 #: Font scales that Ctrl +/- steps through.
 SCALES = (0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)
 _POINTS = 9.5
@@ -19,7 +19,7 @@ _MONO = ("JetBrains Mono", "Noto Sans Mono", "DejaVu Sans Mono", "Liberation Mon
 
 
 @dataclass(frozen=True, slots=True)
-class Colours:
+class Palette:
     """One palette. Text colours keep a contrast of 4.5 : 1 on every surface they may stand on."""
 
     #: Surfaces from the back to the front: window, panel, plots and fields, buttons.
@@ -48,7 +48,7 @@ class Colours:
     series: tuple[str, ...]
 
 
-DARK = Colours(
+DARK = Palette(
     window="#131517",
     panel="#1a1d20",
     field="#0e1012",
@@ -69,7 +69,7 @@ DARK = Colours(
     on_stop="#ffffff",
     series=("#56b4e9", "#e69f00", "#2bbf94", "#e08fbb", "#f0e442", "#ff8f4d"),
 )
-LIGHT = Colours(
+LIGHT = Palette(
     window="#e9ebed",
     panel="#f6f7f8",
     field="#ffffff",
@@ -90,7 +90,7 @@ LIGHT = Colours(
     on_stop="#ffffff",
     series=("#0072b2", "#b85c00", "#00795a", "#a84a82", "#7a6f00", "#444c54"),
 )
-PALETTES: dict[Shade, Colours] = {"dark": DARK, "light": LIGHT}
+PALETTES: dict[PaletteName, Palette] = {"dark": DARK, "light": LIGHT}
 
 
 def contrast(one: str, other: str) -> float:
@@ -119,15 +119,15 @@ class Theme(QObject):
 
     changed = Signal()
 
-    def __init__(self, shade: Shade = "dark", scale: float = 1.0) -> None:
+    def __init__(self, palette_name: PaletteName = "dark", scale: float = 1.0) -> None:
         super().__init__()
-        self.shade: Shade = shade
+        self.palette_name: PaletteName = palette_name
         self.scale = min(max(scale, SCALES[0]), SCALES[-1])
 
     @property
-    def colours(self) -> Colours:
+    def colours(self) -> Palette:
         """The palette in force."""
-        return PALETTES[self.shade]
+        return PALETTES[self.palette_name]
 
     def colour(self, name: str) -> QColor:
         """A colour of the palette by its field name."""
@@ -138,10 +138,10 @@ class Theme(QObject):
         names = self.colours.series
         return QColor(names[number % len(names)])
 
-    def use_shade(self, shade: Shade) -> None:
+    def set_palette(self, palette_name: PaletteName) -> None:
         """Take the other palette."""
-        if shade != self.shade:
-            self.shade = shade
+        if palette_name != self.palette_name:
+            self.palette_name = palette_name
             self.apply()
 
     def step_scale(self, steps: int) -> None:
@@ -180,7 +180,7 @@ def _family(wanted: tuple[str, ...], mono: bool) -> str:
     return next((name for name in wanted if name in installed), QFontDatabase.systemFont(general).family())
 
 
-def qt_palette(colours: Colours) -> QPalette:
+def qt_palette(colours: Palette) -> QPalette:
     """The palette as Qt's Fusion style wants it."""
     role = QPalette.ColorRole
     roles = {
@@ -211,7 +211,7 @@ def qt_palette(colours: Colours) -> QPalette:
 
 def style_sheet(theme: Theme) -> str:
     """What the Fusion style leaves open: flat docks, a focus ring, tabs and buttons of one kind."""
-    names = {field.name: getattr(theme.colours, field.name) for field in fields(Colours)}
+    names = {field.name: getattr(theme.colours, field.name) for field in fields(Palette)}
     sheet = _SHEET
     for name in sorted(names, key=len, reverse=True):
         sheet = sheet.replace(f"@{name};", f"{names[name]};").replace(f"@{name} ", f"{names[name]} ")

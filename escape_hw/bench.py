@@ -10,19 +10,18 @@ from typing import TYPE_CHECKING, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.callbacks import Callbacks, guarded_callback
 from escape_hw.api.camera import Camera
+from escape_hw.api.concurrency import limit_to_one_thread
 from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror
-from escape_hw.api.model import SyntheticModel
 from escape_hw.api.modulator import TipTiltModulator
-from escape_hw.api.screen import PhaseScreen
+from escape_hw.api.phase_screen import PhaseScreen
 from escape_hw.api.sensor import SensorGeometry
-from escape_hw.api.taps import Taps, harmless
-from escape_hw.api.threads import hold_to_one_thread
-from escape_hw.config.device_models import DeviceConfig
-from escape_hw.config.factories import made
-from escape_hw.config.models import SystemConfig
-from escape_hw.config.registry import device_factory, model_factory
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.config.devices import DeviceConfig
+from escape_hw.config.registry import call_factory, device_factory, model_factory
+from escape_hw.config.system import SystemConfig
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ class Bench:
         self.modulator = modulator
         self.dark: NDArray[np.float32] | None = None
         self.flat: NDArray[np.float32] | None = None
-        self._taps = Taps()
+        self._callbacks = Callbacks()
         self._threads: threadpool_limits | None = None
         stream = zlib.crc32(b"escape_hw.bench")
         self.rng = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(stream,)))
@@ -106,27 +105,27 @@ class Bench:
         return f"<{type(self).__name__} {self.config.system.name}, {kind}, {state}>"
 
     @property
-    def taps(self) -> Taps:
+    def callbacks(self) -> Callbacks:
         """Who is told of frames, slopes and commands; nobody unless set.
 
         One that raises is dropped, and the log says so. Set them before anything runs: slopes and loops
         look for theirs when they are made.
         """
-        return self._taps
+        return self._callbacks
 
-    @taps.setter
-    def taps(self, taps: Taps) -> None:
-        self._taps = Taps(
-            harmless("frames", taps.frame),
-            harmless("science frames", taps.science),
-            harmless("slopes", taps.slopes),
-            harmless("commands", taps.command),
-            harmless("residuals", taps.residual),
-            harmless("geometries", taps.geometry),
+    @callbacks.setter
+    def callbacks(self, callbacks: Callbacks) -> None:
+        self._callbacks = Callbacks(
+            guarded_callback("frames", callbacks.frame),
+            guarded_callback("science frames", callbacks.science),
+            guarded_callback("slopes", callbacks.slopes),
+            guarded_callback("commands", callbacks.command),
+            guarded_callback("residuals", callbacks.residual),
+            guarded_callback("geometries", callbacks.geometry),
         )
-        self.wfs.tap, self.dm.tap = self._taps.frame, self._taps.command
+        self.wfs.callback, self.dm.callback = self._callbacks.frame, self._callbacks.command
         if self.science is not None:
-            self.science.tap = self._taps.science
+            self.science.callback = self._callbacks.science
 
     @property
     def devices(self) -> tuple[Device, ...]:
@@ -144,7 +143,7 @@ class Bench:
         """True when any device is a twin: by the configuration, or by its own word once open."""
         sections = self.config.devices
         chosen = {
-            mode_of(section, self.config)
+            resolve_mode(section, self.config)
             for section, device in (
                 (sections.dm, self.dm),
                 (sections.wfs, self.wfs),
@@ -154,9 +153,9 @@ class Bench:
             )
             if section is not None and device is not None
         }
-        speaking = (self.dm, self.wfs, self.science, self.screen, self.modulator)
-        told = [d.info.simulated for d in speaking if d is not None and d.is_open]
-        return "sim" in chosen or any(told)
+        opened_devices = (self.dm, self.wfs, self.science, self.screen, self.modulator)
+        reported_simulated = [d.info.simulated for d in opened_devices if d is not None and d.is_open]
+        return "sim" in chosen or any(reported_simulated)
 
     def open(self) -> Self:
         """Open every device; does nothing to those already open.
@@ -167,7 +166,7 @@ class Bench:
             A device cannot be reached; those opened before it are closed again.
         """
         if self._threads is None:
-            self._threads = hold_to_one_thread()
+            self._threads = limit_to_one_thread()
         try:
             for device in self.devices:
                 device.open()
@@ -260,7 +259,7 @@ def build_device(name: str, config: SystemConfig, kind: type[D]) -> D:
     return device
 
 
-def mode_of(section: DeviceConfig, config: SystemConfig) -> str:
+def resolve_mode(section: DeviceConfig, config: SystemConfig) -> str:
     """The mode of one device: its own, or else the system's."""
     return section.mode or config.system.mode
 
@@ -271,7 +270,7 @@ def _build(
     """Build one device, or ``None`` when the system has none in this mode."""
     if section is None:
         return None
-    twin = mode_of(section, config) == "sim"
+    twin = resolve_mode(section, config) == "sim"
     driver = section.sim_driver if twin else section.driver
     if not driver:
         return None
@@ -279,4 +278,4 @@ def _build(
         factory = device_factory(driver, hardware=not twin)
     except ConfigError as error:
         raise ConfigError(f"devices.{name}: {error}") from error
-    return made(f"devices.{name}: driver '{driver}'", kind, factory, name, config, shared)
+    return call_factory(f"devices.{name}: driver '{driver}'", kind, factory, name, config, shared)

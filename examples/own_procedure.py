@@ -9,7 +9,7 @@ Run it with: python examples/own_procedure.py
 import numpy as np
 
 import escape_hw
-from escape_hw.calibration.sensor_setup import modal_basis
+from escape_hw.calibration.acquisition.sensor_setup import build_modal_basis
 
 
 def linear_range(
@@ -33,7 +33,7 @@ def linear_range(
     """
     setup = yield from escape_hw.find_sensor(bench, frames=20)  # procedures can use procedures
     slopes_of = bench.slopes_of(setup.grid)
-    shape = modal_basis(bench)[:, mode]
+    shape = build_modal_basis(bench)[:, mode]
     report = escape_hw.Reporter("linear range", len(amplitudes), "amplitude")
     columns = []
     try:

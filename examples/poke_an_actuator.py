@@ -25,7 +25,7 @@ with escape_hw.open_system("razor-shwfs") as bench:
     command = bench.dm.shape  # a copy of what the mirror has now
     command[ACTUATOR] += PUSH
     report = bench.dm.send(command)  # every command passes the guard
-    print(f"sent; untouched by the guard: {report.guard.untouched}")
+    print(f"sent; untouched by the guard: {report.guard.is_unchanged}")
     after = look()
 
     # What the guard is for: far too much is made legal, nonsense is refused.

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from escape_hw.api.departures import MirrorDepartures
-from escape_hw.api.gains import ClosureStep, GainRound, GainsResult, OpticalGains
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.optical_gains import ClosureStep, GainRound, GainsResult, OpticalGains
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import (
+    ActuatorCorrections,
     CalibrationResult,
+    Estimate,
     LoopResult,
-    Measured,
     RegistrationEstimate,
     SprintIteration,
     StrehlEstimate,
@@ -90,13 +90,13 @@ def registration(scale: float = 1.0, seed: int = 3) -> RegistrationEstimate:
     return RegistrationEstimate(
         registration=Registration.from_array(goal),
         covariance=np.diag((scale * SIGMA) ** 2),
-        gain=Measured(0.982, 0.003),
-        width=Measured(1.031, 0.004),
+        gain=Estimate(0.982, 0.003),
+        width=Estimate(1.031, 0.004),
         converged=True,
         iterations=tuple(steps),
         chi2=1.04,
         warnings=("tangential_scaling is consistent with zero",),
-        departures=MirrorDepartures(
+        actuator_corrections=ActuatorCorrections(
             rng.normal(0, 0.05, 97), np.full(97, 0.004), rng.normal(0, 0.02, 97), pedestal=0.03
         ),
     )
@@ -167,7 +167,7 @@ def loop(
         stable=stable,
         residual_rms_nm=71.5,
         strehl=StrehlEstimate(
-            Measured(strehl, 0.012), Measured(strehl + 0.02, 0.015), Measured(strehl + 0.09, 0.008)
+            Estimate(strehl, 0.012), Estimate(strehl + 0.02, 0.015), Estimate(strehl + 0.09, 0.008)
         ),
         latency_us={"p50": 310.0, "p99": 480.0, "max": 900.0},
         psf=psf(strehl),
@@ -211,7 +211,7 @@ def optical_gains(level: float, n: int = 20) -> OpticalGains:
 
 def gains_result() -> GainsResult:
     """What a bootstrap of the optical gains returns."""
-    strehl = StrehlEstimate(*(Measured(0.3, 0.01) for _ in range(3)))
+    strehl = StrehlEstimate(*(Estimate(0.3, 0.01) for _ in range(3)))
     first = GainRound(optical_gains(0.7), 0.004, 800, 0.1, 0.03, 70.0, 0.25, True)
     last = GainRound(optical_gains(0.72), 0.0004, 9000, 0.02, 0.02, 60.0, 0.01, True, strehl)
     steps = (ClosureStep(1e-6, 0.4, 0.02, 300.0, True), ClosureStep(0.2, np.nan, np.nan, np.inf, False))

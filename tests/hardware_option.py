@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import pytest
 
-from escape_hw.config.device_models import DeviceConfig
-from escape_hw.config.load import load_system
+from escape_hw.config.devices import DeviceConfig
+from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 
 

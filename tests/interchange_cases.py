@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.io.interchange.pyrtc_read import Target
-from escape_hw.io.interchange.pyrtc_write import FrameFacts
+from escape_hw.io.interchange.pyrtc.calibration import FrameSettings, TargetSystem
 
 SHAPE = (400, 400)
-FACTS = FrameFacts(SHAPE, 12.0)
+FACTS = FrameSettings(SHAPE, 12.0)
 
 
 def lenslets(n: int = 24, n_modes: int = 94, seed: int = 3) -> CalibrationResult:
@@ -48,8 +47,8 @@ def pyramid(n: int = 16, seed: int = 4) -> CalibrationResult:
     return CalibrationResult(matrix, pupils, 100, 0, 1.0)
 
 
-def target(result: CalibrationResult, simulated: bool = False) -> Target:
-    return Target(result.matrix.system, result.grid.kind, result.grid.valid.shape[0], 97, simulated)
+def target(result: CalibrationResult, simulated: bool = False) -> TargetSystem:
+    return TargetSystem(result.matrix.system, result.grid.kind, result.grid.valid.shape[0], 97, simulated)
 
 
 def add_frame(settings: str, shape: tuple[int, int]) -> str:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from escape_hw.runtime.sweep.plan import EXPLORE, FINAL, Arm, Design, Slot
+from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot
 from escape_hw.runtime.sweep.run import Sweep, SweepRun
-from escape_hw.runtime.sweep.space import parse_parameter
-from escape_hw.runtime.sweep.store import Record
+from escape_hw.runtime.sweep.search_space import parse_parameter
+from escape_hw.runtime.sweep.study import LoopRecord
 
 SWEPT = Sweep(
     "",
-    (Arm("push-pull", False, __file__, ""), Arm("ESCAPE", False, __file__, "")),  # type: ignore[arg-type]
+    (MatrixVariant("push-pull", False, __file__, ""), MatrixVariant("ESCAPE", False, __file__, "")),  # type: ignore[arg-type]
     tuple(parse_parameter(text) for text in ("gain=0.1:1", "leak=0.01", "dropped_modes=0:9")),
     Design(80),
     400,
@@ -31,5 +31,5 @@ def made_up(difference: float) -> SweepRun:
                 ways = {way: {"value": merit, "sigma": 0.01} for way in ("peak", "otf", "encircled")}
                 outcome = {"strehl": ways, "stable": True, "diverged": False}
                 values = {"gain": gain, "leak": 0.01, "dropped_modes": 3}
-                records.append(Record(Slot(stage, arm, index), values, outcome, merit))
+                records.append(LoopRecord(Slot(stage, arm, index), values, outcome, merit))
     return SweepRun(records)

@@ -9,9 +9,9 @@ import numpy as np
 
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.io import documents
-from escape_hw.io.fits import save_matrix
-from escape_hw.io.gains import save_gains
-from escape_hw.io.psf import save_loop
+from escape_hw.io.fits.gains import save_gains
+from escape_hw.io.fits.loop import save_loop
+from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.io.run_folder import RunFolder
 
 N_SUB, N_MODES = 12, 20
@@ -32,7 +32,7 @@ def make_run(folder: Path) -> Path:
         run.add("gains", gains)
         run.add("loop", save_loop(run.file("loop.fits"), fake.loop(), "razor-shwfs", True, fake.ORIGIN))
         document = {
-            **documents.head("calibrate", "razor-shwfs", True, 1),
+            **documents.header_fields("calibrate", "razor-shwfs", True, 1),
             "title": "A run",
             **documents.calibration_document(calibration("escape")),
             "track": track(),

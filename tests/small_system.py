@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from escape_hw.config.load import load_system
-from escape_hw.config.models import SystemConfig
+from escape_hw.config.loader import load_system
+from escape_hw.config.system import SystemConfig
 
 #: 12 x 12 lenslets, 37 actuators, 30 modes, moderate turbulence; everything else as on the real bench.
 SMALL = (

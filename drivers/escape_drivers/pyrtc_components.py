@@ -34,7 +34,7 @@ from pyrtc.wavefront_sensor import WavefrontSensor
 from escape_hw.api.camera import Camera
 from escape_hw.api.mirror import DeformableMirror
 from escape_hw.bench import Bench, build_bench
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, FrameTimeout
 
 _KEYS = ("system", "set", "mode", "timeout_s")
@@ -65,7 +65,7 @@ def shared_bench(conf: dict[str, Any]) -> Bench:
         return _benches[key]
 
 
-def forget_benches() -> None:
+def clear_shared_benches() -> None:
     """Make new benches for the components that come; those in use go on with theirs."""
     with _lock:
         _benches.clear()

@@ -1,7 +1,8 @@
-"""The panels, one in a file, and the list of them."""
+"""The panels, one per module, and their list ``PANELS``."""
 
 from __future__ import annotations
 
+from escape_gui.panels.base import Panel
 from escape_gui.panels.camera import CameraPanel
 from escape_gui.panels.devices import DevicesPanel
 from escape_gui.panels.gains import GainsPanel
@@ -10,14 +11,13 @@ from escape_gui.panels.log import LogPanel
 from escape_gui.panels.loop import LoopPanel
 from escape_gui.panels.mirror import MirrorPanel
 from escape_gui.panels.modes import ModesPanel
-from escape_gui.panels.panel import Panel
 from escape_gui.panels.performance import PerformancePanel
 from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.panels.psf import PsfPanel
 from escape_gui.panels.sprint import SprintPanel
 
 #: All panels, in the order in which the View menu and F6 go through them. A panel is added here and
-#: in :data:`escape_gui.workspaces.WORKSPACES`.
+#: in :data:`escape_gui.window.workspaces.WORKSPACES`.
 PANELS: tuple[type[Panel], ...] = (
     DevicesPanel,
     CameraPanel,

@@ -7,9 +7,9 @@ from typing import ClassVar
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QFrame, QHBoxLayout, QLabel, QScrollArea, QVBoxLayout, QWidget
 
-from escape_gui.dock import LEVELS
-from escape_gui.panels.panel import Context, Panel
-from escape_gui.widgets.status_pill import Level, StatusPill
+from escape_gui.panels.base import Context, Panel
+from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
+from escape_gui.window.dock import HEALTH_LEVELS
 from escape_hw.remote.state import DeviceState, State
 
 #: What the keys in ``[devices]`` stand for.
@@ -21,7 +21,7 @@ ROLES = {
     "modulator": "Modulator",
 }
 #: A space at which no line is broken.
-_TOGETHER = "\u00a0"
+_NO_BREAK_SPACE = "\u00a0"
 #: Endings of the keys of facts, with the unit they mean and digits after the point.
 _UNITS = {
     "_c": ("°C", 1),
@@ -43,13 +43,13 @@ class DevicesPanel(Panel):
         "Every device of the system with its condition: ok, stale (silent for longer than its period), "
         "lost, fault, closed. What it says of itself stands below."
     )
-    empty: ClassVar[str] = (
+    placeholder: ClassVar[str] = (
         "No devices yet.\nStart a server with 'escape serve SYSTEM', or wait until it is ready."
     )
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self._rows: dict[str, _Row] = {}
+        self._rows: dict[str, _DeviceRow] = {}
         self._column = QVBoxLayout()
         self._column.setContentsMargins(0, 0, 0, 0)
         self._column.setSpacing(4)
@@ -63,17 +63,17 @@ class DevicesPanel(Panel):
         area.setAccessibleName("List of devices")
         self.body.addWidget(area)
 
-    def take_state(self, state: State) -> None:
+    def on_state(self, state: State) -> None:
         """Bring the rows up to date."""
         names = [device.name for device in state.devices]
         if names != list(self._rows):
             self.clear()
             for device in state.devices:
-                row = self._rows[device.name] = _Row(self.context)
+                row = self._rows[device.name] = _DeviceRow(self.context)
                 self._column.insertWidget(self._column.count() - 1, row)
         for device in state.devices:
             self._rows[device.name].show_device(device)
-        self.set_empty(not names)
+        self.show_placeholder(not names)
 
     def clear(self) -> None:
         """Remove the rows."""
@@ -84,11 +84,11 @@ class DevicesPanel(Panel):
         self._rows.clear()
 
 
-class _Row(QFrame):
+class _DeviceRow(QFrame):
     def __init__(self, context: Context) -> None:
         super().__init__()
         self._theme = context.theme
-        self._pill = StatusPill(context.theme, "closed")
+        self._pill = StatusIndicator(context.theme, "closed")
         self._name, self._model, self._facts = QLabel(), QLabel(), QLabel()
         self._model.setObjectName("caption")
         for label in (self._facts, self._model):
@@ -104,29 +104,31 @@ class _Row(QFrame):
         column.addLayout(head)
         column.addWidget(self._model)
         column.addWidget(self._facts)
-        context.theme.changed.connect(self._restyle)
-        self._restyle()
+        context.theme.changed.connect(self._apply_theme)
+        self._apply_theme()
 
     def show_device(self, device: DeviceState) -> None:
         """Bring the row up to date."""
         role = ROLES.get(device.name, device.name)
         self._name.setText(role)
-        self._pill.show_condition(LEVELS.get(device.health, Level.QUIET), device.health.value)
+        self._pill.set_status(HEALTH_LEVELS.get(device.health, Level.NEUTRAL), device.health.value)
         twin = "" if device.model.startswith("simulated") else "simulated" if device.simulated else "hardware"
         self._model.setText(
             " · ".join(part for part in (device.model or device.kind, device.serial, twin) if part)
         )
-        facts = "   ".join(fact(key, value).replace(" ", _TOGETHER) for key, value in device.facts.items())
+        facts = "   ".join(
+            format_fact(key, value).replace(" ", _NO_BREAK_SPACE) for key, value in device.facts.items()
+        )
         self._facts.setText("\n".join(line for line in (facts, device.message) if line))
         self._facts.setVisible(bool(facts or device.message))
         self.setAccessibleName(f"{role}: {device.health.value}. {device.message}")
 
-    def _restyle(self) -> None:
+    def _apply_theme(self) -> None:
         self._name.setFont(self._theme.font(bold=True))
         self._facts.setFont(self._theme.font(0.95, mono=True))
 
 
-def fact(key: str, value: float | str) -> str:
+def format_fact(key: str, value: float | str) -> str:
     """A fact in words: ``temperature_c: 31.24`` becomes ``temperature 31.2 °C``."""
     for ending, (unit, digits) in _UNITS.items():
         if key.endswith(ending) and not isinstance(value, str):

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QLabel
 
-from escape_gui.library import Shelf
-from escape_gui.panels.panel import Context, Panel, Shown
-from escape_gui.views.gain_curves import Curve, live_curve
-from escape_gui.widgets.curve_plot import MARKERS
-from escape_gui.widgets.gains_plot import GainsPlot
-from escape_hw.remote.source import Sample, Source
+from escape_gui.client.product_library import LoadedProducts
+from escape_gui.panels.base import Context, ExportArray, Panel
+from escape_gui.views.gain_curves import GainCurve, live_curve
+from escape_gui.widgets.plots.gains import GainsPlot
+from escape_gui.widgets.plots.plot import MARKERS
+from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import State
 from escape_hw.report.tables import METHOD_LABELS
 
@@ -30,7 +30,7 @@ class GainsPanel(Panel):
     )
     streams: ClassVar[tuple[str, ...]] = ("gains", "gains_sigma", "gains_smooth", "gains_rounds")
     rate_hz = 5.0
-    empty = (
+    placeholder = (
         "No optical gains yet.\n\nCalibrate first, then start Optical gains in the Procedure panel. "
         "Or open a product or a run folder (Ctrl+O)."
     )
@@ -39,9 +39,9 @@ class GainsPanel(Panel):
         super().__init__(context)
         self._live: dict[str, NDArray[Any]] = {}
         self._label = "as measured now"
-        self._shelf = Shelf()
+        self._loaded = LoadedProducts()
         self._running = self._dirty = False
-        self._curves: dict[str, Curve] = {}
+        self._curves: dict[str, GainCurve] = {}
         self.plot = GainsPlot(context.theme)
         self.rounds = QCheckBox("Rounds")
         self.rounds.setChecked(True)
@@ -56,35 +56,35 @@ class GainsPanel(Panel):
         self.body.addWidget(self.plot, 1)
         self.setFocusProxy(self.rounds)
 
-    def take_state(self, state: State) -> None:
+    def on_state(self, state: State) -> None:
         """Follow what the server holds."""
         self._running = state.procedure is not None
-        self.context.session.library.want(state.products)
+        self.context.session.library.request(state.products)
 
-    def take_sample(self, stream: str, sample: Sample) -> None:
+    def on_sample(self, stream: str, sample: Sample) -> None:
         """The gains are measured."""
         self._live[stream] = sample.data
         method = str(sample.meta.get("method", ""))
         self._label = METHOD_LABELS.get(method, method) or self._label
         self._dirty = True
 
-    def tick(self, source: Source) -> None:
+    def tick(self, source: DataSource) -> None:
         """Draw when anything is new."""
-        shelf = self.context.session.library.shelf
-        if shelf is not self._shelf:
-            self._shelf, self._dirty = shelf, True
+        loaded = self.context.session.library.loaded
+        if loaded is not self._loaded:
+            self._loaded, self._dirty = loaded, True
         if not self._dirty:
             return
         self._dirty = False
-        self._curves = self._find()
+        self._curves = self._collect_curves()
         if self._curves:
-            self.set_empty(False)
+            self.show_placeholder(False)
             self.plot.show_curves(self._curves)
-            self._fill_legend()
+            self._update_legend()
 
-    def _find(self) -> dict[str, Curve]:
+    def _collect_curves(self) -> dict[str, GainCurve]:
         """Curves by label, those of measured matrices first; a living one before its saved self."""
-        found = dict(self._shelf.gains)
+        found = dict(self._loaded.gains)
         gains = self._live.get("gains")
         if gains is not None and (self._running or self._label not in found):
             found[self._label] = live_curve(
@@ -92,14 +92,14 @@ class GainsPanel(Panel):
                 gains,
                 *(self._live.get(f"gains_{name}") for name in ("sigma", "smooth", "rounds")),
             )
-        return dict(sorted(found.items(), key=lambda item: item[1].middle))
+        return dict(sorted(found.items(), key=lambda item: item[1].median))
 
-    def _fill_legend(self) -> None:
+    def _update_legend(self) -> None:
         on, lines = self.plot.labels, []
         for k, (label, curve) in enumerate(self._curves.items()):
             side = f", {on[label]} axis" if len(set(on.values())) > 1 else ""
             rounds = f", {len(curve.rounds)} rounds" if len(curve.rounds) > 1 else ""
-            mean = f"median {curve.middle:.3f}" if np.isfinite(curve.middle) else "no smooth course yet"
+            mean = f"median {curve.median:.3f}" if np.isfinite(curve.median) else "no smooth course yet"
             colour = self.context.theme.series(k).name()
             sign = f"<span style='color:{colour}'>{MARKERS[k % len(MARKERS)][1]}</span>"
             lines.append(f"{sign} {label}: {mean}{side}{rounds}")
@@ -110,15 +110,15 @@ class GainsPanel(Panel):
         self._live.clear()
         self._curves = {}
 
-    def restyle(self) -> None:
+    def apply_theme(self) -> None:
         """The legend's signs have the curves' colours."""
-        self._fill_legend()
+        self._update_legend()
 
-    def shown(self) -> tuple[Shown, ...]:
+    def export_arrays(self) -> tuple[ExportArray, ...]:
         """A table for every curve."""
         heads = ("mode", "gain", "sigma", "smooth", "smooth_sigma")
         return tuple(
-            Shown(
+            ExportArray(
                 f"gains_{number}" if number else "gains",
                 np.column_stack([one.modes, one.value, one.sigma, one.trend, one.trend_sigma]),
                 columns=heads,

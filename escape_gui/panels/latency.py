@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtWidgets import QGridLayout, QHBoxLayout
 
-from escape_gui.panels.panel import Context, Panel, Shown
-from escape_gui.widgets.plot import Plot
-from escape_gui.widgets.readout import Readout
+from escape_gui.panels.base import Context, ExportArray, Panel
+from escape_gui.widgets.controls.readout import Readout
+from escape_gui.widgets.plots.plot import Plot
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
-from escape_hw.streams.histogram import MIDDLES, percentiles_of
+from escape_hw.streams.timing import MIDDLES, percentiles_of
 
 #: Percentiles between which the axis runs; the largest stands above as a number.
-_SHOWN = (0.0, 99.9)
+_SHOWN_PERCENTILES = (0.0, 99.9)
 
 
 class LatencyPanel(Panel):
@@ -31,7 +31,9 @@ class LatencyPanel(Panel):
     )
     streams: ClassVar[tuple[str, ...]] = ("latency_histogram",)
     rate_hz: ClassVar[float] = 2.0
-    empty: ClassVar[str] = "No frame has been timed yet.\nLatencies are counted while the loop is closed."
+    placeholder: ClassVar[str] = (
+        "No frame has been timed yet.\nLatencies are counted while the loop is closed."
+    )
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -61,13 +63,13 @@ class LatencyPanel(Panel):
             plots.addWidget(plot, 1)
         self._counts: NDArray[Any] | None = None
 
-    def take_state(self, state: State) -> None:
+    def on_state(self, state: State) -> None:
         """Numbers of the last second."""
         for name, readout in self.readouts.items():
             value = getattr(state.latency, name)
             readout.show_value(f"{value:.0f}" if np.isfinite(value) else "–")
 
-    def take_sample(self, stream: str, sample: Sample) -> None:
+    def on_sample(self, stream: str, sample: Sample) -> None:
         """Counts of all frames since the loop was closed."""
         self._counts = sample.data
         for plot, curve, counts in zip(self.plots, self._curves, sample.data, strict=True):
@@ -80,18 +82,18 @@ class LatencyPanel(Panel):
             edges = (middles[:-1] + middles[1:]) / 2
             # Half a frame stands for none on a logarithmic axis.
             curve.setData(edges, np.maximum(counts[first:last], 0.5))
-            few = percentiles_of(counts, _SHOWN) / 1e3
+            few = percentiles_of(counts, _SHOWN_PERCENTILES) / 1e3
             plot.setXRange(float(few[0]) * 0.95, float(few[1]) * 1.05)
 
     def clear(self) -> None:
         """Another loop."""
         self._counts = None
 
-    def shown(self) -> tuple[Shown, ...]:
+    def export_arrays(self) -> tuple[ExportArray, ...]:
         """Counts by bin."""
         if self._counts is None:
             return ()
         used = np.flatnonzero(self._counts.sum(axis=0))
         part = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0)
         table = np.column_stack([MIDDLES[part] / 1e3, self._counts[0, part], self._counts[1, part]])
-        return (Shown("latency", table, "", ("middle [us]", "latency [frames]", "spacing [frames]")),)
+        return (ExportArray("latency", table, "", ("middle [us]", "latency [frames]", "spacing [frames]")),)

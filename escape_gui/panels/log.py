@@ -9,12 +9,12 @@ from typing import ClassVar
 from PySide6.QtGui import QGuiApplication
 from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLineEdit, QPlainTextEdit, QPushButton
 
-from escape_gui.panels.panel import Context, Panel
-from escape_hw.remote.source import Source
+from escape_gui.panels.base import Context, Panel
+from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LogLine
 
 #: Lines kept; older ones are in the server's file.
-KEPT = 5000
+MAX_LINES = 5000
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 _COLOURS = {"WARNING": "warn", "ERROR": "bad", "CRITICAL": "bad", "DEBUG": "muted"}
 
@@ -35,19 +35,19 @@ class LogPanel(Panel):
         self.search.setPlaceholderText("Search")
         self.search.setClearButtonEnabled(True)
         self.search.setAccessibleName("Search the log")
-        self.search.textChanged.connect(self._show_again)
+        self.search.textChanged.connect(self._refilter)
         self.level = QComboBox()
         self.level.addItems([level.title() for level in LEVELS])
         self.level.setCurrentIndex(1)
         self.level.setAccessibleName("Least level")
         self.level.setToolTip("Show lines of this level and above")
-        self.level.currentIndexChanged.connect(self._show_again)
+        self.level.currentIndexChanged.connect(self._refilter)
         self.copy_button = QPushButton("Copy")
         self.copy_button.setToolTip("Copy the lines shown")
         self.copy_button.clicked.connect(self._copy)
         self.text = QPlainTextEdit()
         self.text.setReadOnly(True)
-        self.text.setMaximumBlockCount(KEPT)
+        self.text.setMaximumBlockCount(MAX_LINES)
         self.text.setAccessibleName("Lines of the log")
         self.text.setLineWrapMode(QPlainTextEdit.LineWrapMode.WidgetWidth)
         row = QHBoxLayout()
@@ -56,29 +56,29 @@ class LogPanel(Panel):
         row.addWidget(self.copy_button)
         self.body.addLayout(row)
         self.body.addWidget(self.text, 1)
-        self._lines: deque[LogLine] = deque(maxlen=KEPT)
+        self._lines: deque[LogLine] = deque(maxlen=MAX_LINES)
         self._number = -1
-        self._following = True
-        self.text.verticalScrollBar().actionTriggered.connect(self._scrolled)
-        self.restyle()
+        self._follow_newest = True
+        self.text.verticalScrollBar().actionTriggered.connect(self._on_scroll)
+        self.apply_theme()
 
-    def tick(self, source: Source) -> None:
+    def tick(self, source: DataSource) -> None:
         """New lines, all at once."""
         new = source.log_after(self._number)
         if new:
             self._number = new[-1].number
             self._lines.extend(new)
-            self._append([line for line in new if self._wanted(line)])
-        if self._following:
+            self._append([line for line in new if self._matches(line)])
+        if self._follow_newest:
             bar = self.text.verticalScrollBar()
             bar.setValue(bar.maximum())
 
-    def _scrolled(self) -> None:
+    def _on_scroll(self) -> None:
         """Whoever scrolls back reads; at the end the newest lines are followed again."""
         bar = self.text.verticalScrollBar()
-        self._following = bar.sliderPosition() >= bar.maximum()
+        self._follow_newest = bar.sliderPosition() >= bar.maximum()
 
-    def _wanted(self, line: LogLine) -> bool:
+    def _matches(self, line: LogLine) -> bool:
         if line.level in LEVELS and LEVELS.index(line.level) < self.level.currentIndex():
             return False
         text = f"{line.text} {line.logger}".lower()
@@ -99,9 +99,9 @@ class LogPanel(Panel):
             f'<span style="color:{colour}">{level} {escape(line.text)}</span>'
         )
 
-    def _show_again(self) -> None:
+    def _refilter(self) -> None:
         self.text.clear()
-        self._append([line for line in self._lines if self._wanted(line)])
+        self._append([line for line in self._lines if self._matches(line)])
 
     def _copy(self) -> None:
         QGuiApplication.clipboard().setText(self.text.toPlainText())
@@ -112,7 +112,7 @@ class LogPanel(Panel):
         self._number = -1
         self.text.clear()
 
-    def restyle(self) -> None:
+    def apply_theme(self) -> None:
         """Lines stand in columns and carry the theme's colours."""
         self.text.setFont(self.context.theme.font(0.9, mono=True))
-        self._show_again()
+        self._refilter()

@@ -15,13 +15,13 @@ from PySide6.QtWidgets import (
     QSpinBox,
 )
 
-from escape_gui.loop_form import FIELDS, LoopEdit
-from escape_gui.panels.panel import Context, Panel
-from escape_gui.situation import Situation, is_measured, to_write
-from escape_gui.widgets.hold_button import HoldButton
-from escape_gui.widgets.status_pill import Level, StatusPill
-from escape_hw.config.models import GAIN_MOST
-from escape_hw.remote.source import Source
+from escape_gui.client.availability import RequestContext, is_measured, reason_no_write
+from escape_gui.panels.base import Context, Panel
+from escape_gui.views.loop_form import FIELDS, LoopSettingsEdit
+from escape_gui.widgets.controls.hold_button import HoldButton
+from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
+from escape_hw.config.system import MAX_GAIN
+from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LoopState, Phase, State
 
 _TIPS = {
@@ -33,7 +33,9 @@ _TIPS = {
 
 
 #: What stands here while no server was heard of, and in a recording.
-NOBODY = "There is no loop to close here: only a server has one.\nStart it with 'escape serve SYSTEM'."
+NO_SERVER_TEXT = (
+    "There is no loop to close here: only a server has one.\nStart it with 'escape serve SYSTEM'."
+)
 
 
 class LoopPanel(Panel):
@@ -46,19 +48,19 @@ class LoopPanel(Panel):
         "that, and a closed loop changes without a bump. Hold the button to close the loop. Open loop is "
         "always at the top."
     )
-    empty: ClassVar[str] = (
+    placeholder: ClassVar[str] = (
         "The engine is not ready.\nIt opens the devices first; see the log if it takes long."
     )
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         theme = context.theme
-        self.pill = StatusPill(theme, "closed")
+        self.loop_indicator = StatusIndicator(theme, "closed")
         self.modes = QLabel()
         self.modes.setObjectName("caption")
         self.matrix = QComboBox()
-        self.gain = _spin(0.0, GAIN_MOST, 0.05, 4)
-        self.leak = _spin(0.0, 1.0, 0.005, 4)
+        self.gain = _spin_box(0.0, MAX_GAIN, 0.05, 4)
+        self.leak = _spin_box(0.0, 1.0, 0.005, 4)
         self.dropped_modes = QSpinBox()
         self.dropped_modes.setRange(0, 10000)
         self.editors = {
@@ -67,22 +69,22 @@ class LoopPanel(Panel):
         self.current = {name: QLabel("–") for name in FIELDS}
         self.check_button = QPushButton("Check")
         self.apply_button = QPushButton("Apply")
-        self.reset_button = QPushButton("As it is")
-        self.reset_button.setToolTip("Take the current values into the form again")
+        self.revert_button = QPushButton("As it is")
+        self.revert_button.setToolTip("Take the current values into the form again")
         self.message = QLabel()
         self.message.setWordWrap(True)
         self.close_button = HoldButton("close the loop", theme)
         self._loop = LoopState()
         self._matrices: list[str] = []
-        self._edited = False
-        self._checked: LoopEdit | None = None
-        self._lay_out()
-        self._connect()
-        self.restyle()
+        self._is_edited = False
+        self._checked_edit: LoopSettingsEdit | None = None
+        self._build_layout()
+        self._connect_signals()
+        self.apply_theme()
 
-    def _lay_out(self) -> None:
+    def _build_layout(self) -> None:
         head = QHBoxLayout()
-        head.addWidget(self.pill)
+        head.addWidget(self.loop_indicator)
         head.addWidget(self.modes)
         head.addStretch()
         form = QGridLayout()
@@ -105,7 +107,7 @@ class LoopPanel(Panel):
         form.setColumnStretch(2, 1)
         form.setColumnStretch(3, 1)
         buttons = QHBoxLayout()
-        for button in (self.check_button, self.apply_button, self.reset_button):
+        for button in (self.check_button, self.apply_button, self.revert_button):
             buttons.addWidget(button)
         buttons.addStretch()
         self.body.addLayout(head)
@@ -115,22 +117,24 @@ class LoopPanel(Panel):
         self.body.addStretch()
         self.body.addWidget(self.close_button)
 
-    def _connect(self) -> None:
-        self.matrix.activated.connect(self._edit)
+    def _connect_signals(self) -> None:
+        self.matrix.activated.connect(self._on_edit)
         for spin in (self.gain, self.leak, self.dropped_modes):
-            spin.valueChanged.connect(self._edit)
+            spin.valueChanged.connect(self._on_edit)
         self.check_button.clicked.connect(self.check)
         self.apply_button.clicked.connect(self.apply)
-        self.reset_button.clicked.connect(self._take_current)
-        self.close_button.held.connect(self.close_loop)
+        self.revert_button.clicked.connect(self._revert)
+        self.close_button.confirmed.connect(self.close_loop)
 
     # ------------------------------------------------------------ news
-    def take_state(self, state: State) -> None:
+    def on_state(self, state: State) -> None:
         """Current values; the form follows them until it is edited."""
         self._loop = loop = state.loop
-        self.set_empty(state.phase in (Phase.STARTING, Phase.STOPPED), None if is_measured(state) else NOBODY)
-        self.pill.show_condition(
-            Level.ACTIVE if loop.closed else Level.QUIET, "closed" if loop.closed else "open"
+        self.show_placeholder(
+            state.phase in (Phase.STARTING, Phase.STOPPED), None if is_measured(state) else NO_SERVER_TEXT
+        )
+        self.loop_indicator.set_status(
+            Level.ACTIVE if loop.closed else Level.NEUTRAL, "closed" if loop.closed else "open"
         )
         self.modes.setText(f"{loop.modes} modes controlled" if loop.modes else "")
         values = {
@@ -141,30 +145,32 @@ class LoopPanel(Panel):
             self.current[name].setText(text)
         matrices = [product.name for product in state.products if product.kind == "matrix"]
         if matrices != self._matrices:
-            self._offer(matrices, {product.name: product.summary for product in state.products})
-        if not self._edited:
-            self._take_current()
+            self._set_matrix_choices(matrices, {product.name: product.summary for product in state.products})
+        if not self._is_edited:
+            self._revert()
 
-    def _offer(self, matrices: list[str], summaries: dict[str, str]) -> None:
+    def _set_matrix_choices(self, matrices: list[str], summaries: dict[str, str]) -> None:
         wanted = self.matrix.currentText()
         self._matrices = matrices
         self.matrix.clear()
         self.matrix.addItems(matrices)
         for k, name in enumerate(matrices):
             self.matrix.setItemData(k, summaries[name], Qt.ItemDataRole.ToolTipRole)
-        if self._edited and wanted in matrices:
+        if self._is_edited and wanted in matrices:
             self.matrix.setCurrentText(wanted)
         else:
             # The newest is what one has just calibrated for.
             self.matrix.setCurrentIndex(len(matrices) - 1)
 
-    def tick(self, source: Source) -> None:
+    def tick(self, source: DataSource) -> None:
         """Buttons are possible or say why not."""
         session = self.context.session
-        now = Situation(source.state, source.connected, session.live, session.may_write)
-        why = to_write(now)
-        _allow(
-            self.apply_button, why or ("" if self._checked else "press Check first"), "Change the loop now"
+        now = RequestContext(source.state, source.connected, session.live, session.may_write)
+        why = reason_no_write(now)
+        _set_enabled(
+            self.apply_button,
+            why or ("" if self._checked_edit else "press Check first"),
+            "Change the loop now",
         )
         if self._loop.closed:
             reason = "it is closed"
@@ -174,22 +180,22 @@ class LoopPanel(Panel):
             reason = f"{source.state.procedure.name} runs"
         else:
             reason = ""
-        _allow(self.close_button, why or reason, "Close the loop with the values of the right column")
+        _set_enabled(self.close_button, why or reason, "Close the loop with the values of the right column")
 
     # ------------------------------------------------------------ edit, check, apply
     @property
-    def edit(self) -> LoopEdit:
+    def edit(self) -> LoopSettingsEdit:
         """What stands in the form."""
-        return LoopEdit(
+        return LoopSettingsEdit(
             self.matrix.currentText(), round(self.gain.value(), 6), round(self.leak.value(), 6),
             self.dropped_modes.value(),
         )  # fmt: skip
 
-    def _edit(self) -> None:
-        self._edited, self._checked = True, None
+    def _on_edit(self) -> None:
+        self._is_edited, self._checked_edit = True, None
         self.message.setText("Edited; press Check.")
 
-    def _take_current(self) -> None:
+    def _revert(self) -> None:
         loop = self._loop
         for widget in self.editors.values():
             widget.blockSignals(True)
@@ -200,37 +206,41 @@ class LoopPanel(Panel):
         self.dropped_modes.setValue(loop.dropped_modes)
         for widget in self.editors.values():
             widget.blockSignals(False)
-        self._edited, self._checked = False, None
+        self._is_edited, self._checked_edit = False, None
         self.message.setText("")
 
     def check(self) -> None:
         """Say what would change, or what is wrong."""
         edit = self.edit
-        problems = edit.problems(self._loop)
-        self._checked = None if problems or not edit.changed(self._loop) else edit
-        self.message.setText("\n".join(problems) if problems else f"Apply: {edit.in_words(self._loop)}")
+        validation_errors = edit.validation_errors(self._loop)
+        self._checked_edit = None if validation_errors or not edit.changed(self._loop) else edit
+        self.message.setText(
+            "\n".join(validation_errors)
+            if validation_errors
+            else f"Apply: {edit.describe_changes(self._loop)}"
+        )
 
     def apply(self) -> None:
         """Change what was checked."""
-        commands, edit = self.context.session.commands, self._checked
-        if commands is None or edit is None:
+        requests, edit = self.context.session.requests, self._checked_edit
+        if requests is None or edit is None:
             return
         changed = edit.changed(self._loop)
         self.message.setText("Applying…")
-        commands.ask(
+        requests.ask(
             "change the loop", lambda server: server.set_loop(**changed), self._applied, self._refused
         )
 
     def close_loop(self) -> None:
         """Close the loop with what stands in the form."""
-        commands, edit = self.context.session.commands, self.edit
-        if commands is None:
+        requests, edit = self.context.session.requests, self.edit
+        if requests is None:
             return
-        if problems := edit.problems(self._loop):
-            self.message.setText("\n".join(problems))
+        if validation_errors := edit.validation_errors(self._loop):
+            self.message.setText("\n".join(validation_errors))
             return
         self.message.setText("Closing the loop…")
-        commands.ask(
+        requests.ask(
             "close the loop",
             lambda server: server.close_loop(edit.matrix, edit.gain or None, edit.leak, edit.dropped_modes),
             self._applied,
@@ -238,19 +248,19 @@ class LoopPanel(Panel):
         )
 
     def _applied(self, _: object) -> None:
-        self._edited, self._checked = False, None
+        self._is_edited, self._checked_edit = False, None
         self.message.setText("Done.")
 
     def _refused(self, reason: str) -> None:
-        self._checked = None
+        self._checked_edit = None
         self.message.setText(reason)
 
     def clear(self) -> None:
         """Another source: nothing is edited."""
-        self._edited, self._checked = False, None
+        self._is_edited, self._checked_edit = False, None
         self.message.setText("")
 
-    def restyle(self) -> None:
+    def apply_theme(self) -> None:
         """Numbers stand in columns."""
         mono = self.context.theme.font(mono=True)
         for label in self.current.values():
@@ -262,7 +272,7 @@ class LoopPanel(Panel):
                 editor.setFont(mono)
 
 
-def _spin(low: float, high: float, step: float, digits: int) -> QDoubleSpinBox:
+def _spin_box(low: float, high: float, step: float, digits: int) -> QDoubleSpinBox:
     spin = QDoubleSpinBox()
     spin.setRange(low, high)
     spin.setSingleStep(step)
@@ -271,6 +281,6 @@ def _spin(low: float, high: float, step: float, digits: int) -> QDoubleSpinBox:
     return spin
 
 
-def _allow(button: QPushButton, why_not: str, tip: str) -> None:
+def _set_enabled(button: QPushButton, why_not: str, tip: str) -> None:
     button.setEnabled(not why_not)
     button.setToolTip(tip if not why_not else f"Not now: {why_not}.")

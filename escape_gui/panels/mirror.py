@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtWidgets import QGridLayout, QHBoxLayout, QLabel
 
-from escape_gui.maps import ActuatorMap
-from escape_gui.panels.panel import Context, Panel, Shown
-from escape_gui.situation import UNKNOWN, is_measured
-from escape_gui.widgets.choice import Choice
-from escape_gui.widgets.picture import SIGNED, Picture
-from escape_gui.widgets.picture_bar import PictureBar
-from escape_gui.widgets.readout import Readout
-from escape_hw.remote.source import Sample, Source
+from escape_gui.client.availability import UNKNOWN_VALUE, is_measured
+from escape_gui.panels.base import Context, ExportArray, Panel
+from escape_gui.views.images import ActuatorImage
+from escape_gui.widgets.controls.readout import Readout
+from escape_gui.widgets.controls.segmented_button import SegmentedButton
+from escape_gui.widgets.images.image_viewer import DIVERGING_MAPS, ImageToolbar, ImageViewer
+from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Geometry, State
 
 COMMAND, MEASURED = "command", "measured"
@@ -34,20 +33,22 @@ class MirrorPanel(Panel):
     streams: ClassVar[tuple[str, ...]] = ("commands", "measured_positions")
     rate_hz: ClassVar[float] = 20.0
     stale_after_s: ClassVar[float | None] = None
-    empty: ClassVar[str] = (
+    placeholder: ClassVar[str] = (
         "The mirror is flat and nothing was sent yet.\nStart a calibration, or close the loop."
     )
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         theme = context.theme
-        self.choice = Choice(
+        self.choice = SegmentedButton(
             "View of the mirror",
             (COMMAND, MEASURED),
             ("What the actuators were told", "Where they say they are (adaptive secondaries only)"),
         )
-        self.choice.chosen.connect(lambda _: self._show())
-        self.picture = Picture(theme, "Map of the actuators", SIGNED, symmetric=True, unit="stroke")
+        self.choice.chosen.connect(lambda _: self._update_image())
+        self.picture = ImageViewer(
+            theme, "Map of the actuators", DIVERGING_MAPS, symmetric=True, unit="stroke"
+        )
         self.picture.floor = 1e-6
         self.scale = QLabel()
         self.scale.setObjectName("caption")
@@ -68,24 +69,24 @@ class MirrorPanel(Panel):
         numbers.setColumnStretch(2, 1)
         self.body.addLayout(head)
         self.body.addWidget(self.picture, 1)
-        self.body.addWidget(PictureBar(theme, self.picture, logarithmic=False))
+        self.body.addWidget(ImageToolbar(theme, self.picture, logarithmic=False))
         self.body.addLayout(numbers)
         self._values: dict[str, NDArray[Any]] = {}
         self._geometry = Geometry()
-        self._map = ActuatorMap(self._geometry)
-        self._offer_measured()
-        self.restyle()
+        self._map = ActuatorImage(self._geometry)
+        self._update_measured_button()
+        self.apply_theme()
 
-    def tick(self, source: Source) -> None:
+    def tick(self, source: DataSource) -> None:
         """Places come with the geometry."""
         geometry = source.geometry()
         if geometry is not self._geometry:
             self._geometry = geometry
-            self._map = ActuatorMap(geometry)
+            self._map = ActuatorImage(geometry)
             self.picture.clear()
-            self._show()
+            self._update_image()
 
-    def take_state(self, state: State) -> None:
+    def on_state(self, state: State) -> None:
         """Numbers that the server takes over every frame."""
         mirror = state.mirror
         values = {
@@ -94,19 +95,19 @@ class MirrorPanel(Panel):
             "clipped": f"{100 * mirror.clipped:.2f}",
         }
         for name, text in values.items():
-            self.readouts[name].show_value(text if is_measured(state) else UNKNOWN)
+            self.readouts[name].show_value(text if is_measured(state) else UNKNOWN_VALUE)
 
-    def take_sample(self, stream: str, sample: Sample) -> None:
+    def on_sample(self, stream: str, sample: Sample) -> None:
         """Another command, or where the actuators are."""
         key = COMMAND if stream == "commands" else MEASURED
         new = key not in self._values
         self._values[key] = sample.data
         if new:
-            self._offer_measured()
+            self._update_measured_button()
         if key == self.choice.word:
-            self._show()
+            self._update_image()
 
-    def _show(self) -> None:
+    def _update_image(self) -> None:
         values = self._values.get(self.choice.word)
         if values is None or values.size != self._map.n_act:
             return
@@ -118,7 +119,7 @@ class MirrorPanel(Panel):
         high = self.picture.levels[1]
         self.scale.setText(f"±{high:.3g} {self.picture.unit}")
 
-    def _offer_measured(self) -> None:
+    def _update_measured_button(self) -> None:
         button = self.choice.buttons[MEASURED]
         button.setEnabled(MEASURED in self._values)
         button.setVisible(MEASURED in self._values)
@@ -127,16 +128,16 @@ class MirrorPanel(Panel):
         """Another source has another mirror."""
         self._values.clear()
         self._geometry = Geometry()
-        self._map = ActuatorMap(self._geometry)
+        self._map = ActuatorImage(self._geometry)
         self.choice.choose(COMMAND)
-        self._offer_measured()
+        self._update_measured_button()
         self.picture.clear()
 
-    def restyle(self) -> None:
+    def apply_theme(self) -> None:
         """Numbers stand in columns."""
         self.scale.setFont(self.context.theme.font(0.9, mono=True))
 
-    def shown(self) -> tuple[Shown, ...]:
+    def export_arrays(self) -> tuple[ExportArray, ...]:
         """Command and positions as last seen."""
         units = {COMMAND: "stroke", MEASURED: "m"}
-        return tuple(Shown(key, np.asarray(data), units[key]) for key, data in self._values.items())
+        return tuple(ExportArray(key, np.asarray(data), units[key]) for key, data in self._values.items())

@@ -19,26 +19,26 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from escape_gui.library import Shelf
-from escape_gui.panels.panel import Context, Panel, Shown
+from escape_gui.client.product_library import LoadedProducts
+from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.mode_detail import tiles
 from escape_gui.views.mode_mosaic import LIMIT
-from escape_gui.widgets.colour_scale import SIGNED, ColourScale
-from escape_gui.widgets.map_tiles import MapTiles
-from escape_gui.widgets.mode_mosaic import ModeMosaic, Spot
-from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.remote.source import Sample, Source
+from escape_gui.widgets.images.colour_scale import DIVERGING, ColourScale
+from escape_gui.widgets.images.map_tiles import MapTiles
+from escape_gui.widgets.images.mode_mosaic import ModeMosaic, MosaicPixel
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import State
 from escape_hw.report.tables import METHOD_LABELS
 
 #: How the matrix that is being measured is called in the list.
-LIVE = "as measured now"
+LIVE_LABEL = "as measured now"
 #: What stands below the maps until something else is to be said.
-_HOW = "Pairs: x slopes, y slopes. Click a mode for every matrix."
+_USAGE_TEXT = "Pairs: x slopes, y slopes. Click a mode for every matrix."
 #: Matrices that the detail has room for.
-_MOST = 4
+_MAX_MATRICES = 4
 #: Shares of mosaic and detail, and the width from which on they stand beside each other.
-_SHARES, _WIDE = (550, 450), 900
+_SPLITTER_SIZES, _SIDE_BY_SIDE_WIDTH = (550, 450), 900
 
 
 class ModesPanel(Panel):
@@ -52,7 +52,7 @@ class ModesPanel(Panel):
     )
     streams: ClassVar[tuple[str, ...]] = ("valid", "matrix", "matrix_sigma")
     rate_hz = 4.0
-    empty = (
+    placeholder = (
         "No interaction matrix yet.\n\nStart DO-CRIME or ESCAPE in the Procedure panel, "
         "or open a FITS product or a run folder (Ctrl+O)."
     )
@@ -62,40 +62,45 @@ class ModesPanel(Panel):
         self._valid: NDArray[np.bool_] = np.zeros((0, 0), bool)
         self._live: dict[str, NDArray[np.float32]] = {}
         self._method = ""
-        self._shelf = Shelf()
+        self._loaded = LoadedProducts()
         self._dirty = self._running = False
-        self._chosen_by_hand = False
+        self._user_selected = False
         self._make_controls()
         self._make_maps()
 
     # ------------------------------------------------------------ building
     def _make_controls(self) -> None:
-        self.which = QComboBox()
-        self.which.setAccessibleName("Matrix shown")
-        self.which.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
-        self.which.activated.connect(self._choose_matrix)
+        self.matrix_selector = QComboBox()
+        self.matrix_selector.setAccessibleName("Matrix shown")
+        self.matrix_selector.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
+        self.matrix_selector.activated.connect(self._choose_matrix)
         self.fade = QCheckBox("Fade noise")
         self.fade.setChecked(True)
         self.fade.setToolTip("Draw a mode as pale as it is uncertain, by SNR² / (1 + SNR²).")
         self.fade.toggled.connect(self._redraw)
-        self._back, self._on = QPushButton("‹"), QPushButton("›")
-        for button, step, words in ((self._back, -1, "Page before"), (self._on, 1, "Next page")):
+        self._previous_button, self._next_button = QPushButton("‹"), QPushButton("›")
+        for button, step, words in (
+            (self._previous_button, -1, "Page before"),
+            (self._next_button, 1, "Next page"),
+        ):
             button.setToolTip(f"{words} (Page {'Up' if step < 0 else 'Down'})")
             button.setAccessibleName(words)
-            button.clicked.connect(lambda _=False, step=step: self.mosaic.turn_to(self.mosaic.page[0] + step))
-        self._pages = QLabel()
+            button.clicked.connect(
+                lambda _=False, step=step: self.mosaic.show_page(self.mosaic.page[0] + step)
+            )
+        self._page_label = QLabel()
         row = QHBoxLayout()
-        row.addWidget(self.which)
+        row.addWidget(self.matrix_selector)
         row.addWidget(self.fade)
         row.addStretch()
-        for widget in (self._back, self._pages, self._on):
+        for widget in (self._previous_button, self._page_label, self._next_button):
             row.addWidget(widget)
         self.body.addLayout(row)
 
     def _make_maps(self) -> None:
         theme = self.context.theme
         self.mosaic = ModeMosaic(theme)
-        self._scale = ColourScale(theme, SIGNED)
+        self._scale = ColourScale(theme, DIVERGING)
         self._scale.set_range(-LIMIT, LIMIT, "slope / rms slope of the mode")
         self.detail = MapTiles(theme)
         self.detail.hide()
@@ -107,31 +112,31 @@ class ModesPanel(Panel):
         self.splitter = QSplitter(Qt.Orientation.Vertical)
         self.splitter.addWidget(maps)
         self.splitter.addWidget(self.detail)
-        self.splitter.setSizes([_SHARES[0], _SHARES[1]])
+        self.splitter.setSizes([_SPLITTER_SIZES[0], _SPLITTER_SIZES[1]])
         self.splitter.setChildrenCollapsible(False)
         self.body.addWidget(self.splitter, 1)
-        self._words = QLabel(_HOW)
-        self._words.setFont(theme.font(mono=True))
+        self._status_label = QLabel(_USAGE_TEXT)
+        self._status_label.setFont(theme.font(mono=True))
         # It must not make the panel wider than its neighbours allow.
-        self._words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
-        self._words.setWordWrap(True)
+        self._status_label.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
+        self._status_label.setWordWrap(True)
         # Two lines always, so that the maps do not change their size under the pointer.
-        self._words.setFixedHeight(2 * self._words.fontMetrics().lineSpacing())
-        self.body.addWidget(self._words)
+        self._status_label.setFixedHeight(2 * self._status_label.fontMetrics().lineSpacing())
+        self.body.addWidget(self._status_label)
         self.setFocusProxy(self.mosaic)
-        self.mosaic.hovered.connect(self._say)
+        self.mosaic.hovered.connect(self._show_hover)
         self.mosaic.chosen.connect(self._show_detail)
-        self.mosaic.paged.connect(self._say_page)
+        self.mosaic.page_changed.connect(self._show_page)
 
     # ------------------------------------------------------------ data
-    def take_state(self, state: State) -> None:
+    def on_state(self, state: State) -> None:
         """Follow what the server holds; once a measurement has ended, its product stands for it."""
         running = state.procedure is not None
         self._dirty |= running != self._running
         self._running = running
-        self.context.session.library.want(state.products)
+        self.context.session.library.request(state.products)
 
-    def take_sample(self, stream: str, sample: Sample) -> None:
+    def on_sample(self, stream: str, sample: Sample) -> None:
         """The matrix grows."""
         self._dirty = True
         if stream == "valid":
@@ -141,29 +146,29 @@ class ModesPanel(Panel):
         method = str(sample.meta.get("method") or sample.meta.get("stage", ""))
         self._method = METHOD_LABELS.get(method, method) or self._method
         if self._running and stream == "matrix":
-            self._chosen_by_hand = False
+            self._user_selected = False
 
-    def tick(self, source: Source) -> None:
+    def tick(self, source: DataSource) -> None:
         """Draw when anything is new."""
-        shelf = self.context.session.library.shelf
-        if shelf is not self._shelf:
-            self._shelf, self._dirty = shelf, True
+        loaded = self.context.session.library.loaded
+        if loaded is not self._loaded:
+            self._loaded, self._dirty = loaded, True
         if not self._dirty:
             return
         self._dirty = False
-        self._fill_list()
+        self._update_selector()
         if self.matrices:
-            self.set_empty(False)
+            self.show_placeholder(False)
             self._redraw()
 
     @property
     def matrices(self) -> dict[str, InteractionMatrix]:
         """All at hand by label; the one being measured first, while it is none of the others."""
-        found = dict(self._shelf.matrices)
+        found = dict(self._loaded.matrices)
         live = self._live_matrix()
         if live is None or (found and not self._running):
             return found
-        return {LIVE: live, **found}
+        return {LIVE_LABEL: live, **found}
 
     def _live_matrix(self) -> InteractionMatrix | None:
         data = self._live.get("matrix")
@@ -175,27 +180,29 @@ class ModesPanel(Panel):
         unused = np.zeros((0, data.shape[1]))
         return InteractionMatrix(data, sigma, unused, self._valid, "", self._method, True, slope_unit="1")
 
-    def _fill_list(self) -> None:
+    def _update_selector(self) -> None:
         names = list(self.matrices)
-        if names == [self.which.itemData(k) for k in range(self.which.count())]:
+        if names == [self.matrix_selector.itemData(k) for k in range(self.matrix_selector.count())]:
             return
-        now = self.which.currentData()
-        self.which.clear()
+        now = self.matrix_selector.currentData()
+        self.matrix_selector.clear()
         for name in names:
-            self.which.addItem(f"{self._method}, {LIVE}" if name == LIVE and self._method else name, name)
+            self.matrix_selector.addItem(
+                f"{self._method}, {LIVE_LABEL}" if name == LIVE_LABEL and self._method else name, name
+            )
         # What is being measured comes to the front, then the newest; what somebody chose stays.
-        wanted = LIVE if LIVE in names and self._running else (names[-1] if names else None)
-        if self._chosen_by_hand and now in names:
+        wanted = LIVE_LABEL if LIVE_LABEL in names and self._running else (names[-1] if names else None)
+        if self._user_selected and now in names:
             wanted = now
-        self.which.setCurrentIndex(max(0, self.which.findData(wanted)))
+        self.matrix_selector.setCurrentIndex(max(0, self.matrix_selector.findData(wanted)))
 
     # ------------------------------------------------------------ showing
     def _choose_matrix(self) -> None:
-        self._chosen_by_hand = True
+        self._user_selected = True
         self._redraw()
 
     def _redraw(self) -> None:
-        matrix = self.matrices.get(str(self.which.currentData()))
+        matrix = self.matrices.get(str(self.matrix_selector.currentData()))
         if matrix is None:
             return
         self.mosaic.show_matrix(matrix.valid, matrix.data, matrix.sigma, self.fade.isChecked())
@@ -206,32 +213,34 @@ class ModesPanel(Panel):
         if mode < 0:
             return
         found = self.matrices
-        chosen = str(self.which.currentData())
-        others = [name for name in found if name != chosen][: _MOST - 1]
+        chosen = str(self.matrix_selector.currentData())
+        others = [name for name in found if name != chosen][: _MAX_MATRICES - 1]
         self.detail.show_tiles(
             tiles({name: found[name] for name in found if name in (*others, chosen)}, mode)
         )
         self.detail.show()
-        self._words.setText(self._about(mode))
+        self._status_label.setText(self._describe_mode(mode))
 
-    def _about(self, mode: int) -> str:
+    def _describe_mode(self, mode: int) -> str:
         rms, snr = self.mosaic.statistics(mode)
         stated = f"SNR {snr:.3g}" if np.isfinite(snr) else "no error stated"
         return f"mode {mode + 1}  rms slope {rms:.3g}  {stated}"
 
-    def _say(self, spot: Spot | None) -> None:
+    def _show_hover(self, spot: MosaicPixel | None) -> None:
         if spot is None:
-            self._words.setText(self._about(self.mosaic.mode) if self.mosaic.mode >= 0 else _HOW)
+            self._status_label.setText(
+                self._describe_mode(self.mosaic.mode) if self.mosaic.mode >= 0 else _USAGE_TEXT
+            )
             return
         place = f"{spot.part} {spot.value:+.3g} at ({spot.column + 1}, {spot.row + 1})"
-        self._words.setText(f"{self._about(spot.mode)}  {place}")
+        self._status_label.setText(f"{self._describe_mode(spot.mode)}  {place}")
 
-    def _say_page(self, page: int, pages: int) -> None:
-        self._pages.setText(f"page {page + 1} of {pages}")
-        for widget in (self._back, self._pages, self._on):
+    def _show_page(self, page: int, pages: int) -> None:
+        self._page_label.setText(f"page {page + 1} of {pages}")
+        for widget in (self._previous_button, self._page_label, self._next_button):
             widget.setVisible(pages > 1)
-        self._back.setEnabled(page > 0)
-        self._on.setEnabled(page + 1 < pages)
+        self._previous_button.setEnabled(page > 0)
+        self._next_button.setEnabled(page + 1 < pages)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Escape closes the detail."""
@@ -243,29 +252,29 @@ class ModesPanel(Panel):
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Beside each other where there is room, else below each other."""
         super().resizeEvent(event)
-        wide = self.width() >= self.context.theme.pixels(_WIDE)
+        wide = self.width() >= self.context.theme.pixels(_SIDE_BY_SIDE_WIDTH)
         way = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
         if self.splitter.orientation() != way:
             self.splitter.setOrientation(way)
-            self.splitter.setSizes([_SHARES[0], _SHARES[1]])
+            self.splitter.setSizes([_SPLITTER_SIZES[0], _SPLITTER_SIZES[1]])
 
     def clear(self) -> None:
         """Forget the matrix of another source."""
         self._live.clear()
-        self._chosen_by_hand = False
-        self.which.clear()
+        self._user_selected = False
+        self.matrix_selector.clear()
         self.detail.hide()
 
-    def restyle(self) -> None:
+    def apply_theme(self) -> None:
         """Numbers keep their own letters."""
-        self._words.setFont(self.context.theme.font(mono=True))
+        self._status_label.setFont(self.context.theme.font(mono=True))
 
-    def shown(self) -> tuple[Shown, ...]:
+    def export_arrays(self) -> tuple[ExportArray, ...]:
         """The matrix in the mosaic, and its errors."""
-        matrix = self.matrices.get(str(self.which.currentData()))
+        matrix = self.matrices.get(str(self.matrix_selector.currentData()))
         if matrix is None:
             return ()
         return (
-            Shown("matrix", matrix.data, matrix.slope_unit),
-            Shown("sigma", matrix.sigma, matrix.slope_unit),
+            ExportArray("matrix", matrix.data, matrix.slope_unit),
+            ExportArray("sigma", matrix.sigma, matrix.slope_unit),
         )

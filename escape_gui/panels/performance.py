@@ -8,14 +8,14 @@ from typing import ClassVar
 import numpy as np
 from PySide6.QtWidgets import QHBoxLayout, QLabel
 
-from escape_gui.panels.panel import Context, Panel, Shown
+from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.panels.psf import NO_MODEL, NO_MODEL_TIP
-from escape_gui.widgets.readout import Readout
-from escape_gui.widgets.strip_chart import History, StripChart
-from escape_hw.remote.source import Source
+from escape_gui.widgets.controls.readout import Readout
+from escape_gui.widgets.plots.strip_chart import StripChart, TimeSeriesBuffer
+from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import State
 
-_KEPT = 4096
+_BUFFER_SIZE = 4096
 #: Seconds between two states from which on there is a gap in the curves.
 _GAP_S = 2.0
 
@@ -31,7 +31,7 @@ class PerformancePanel(Panel):
         "hidden, the loop was open, or there is no model image."
     )
     rate_hz: ClassVar[float] = 10.0
-    empty: ClassVar[str] = (
+    placeholder: ClassVar[str] = (
         "The loop has not been closed yet.\nCalibrate first, then choose a matrix under Loop and close it."
     )
 
@@ -50,44 +50,44 @@ class PerformancePanel(Panel):
         row.setSpacing(24)
         for readout in self.readouts.values():
             row.addWidget(readout)
-        self.missing = QLabel(NO_MODEL)
-        self.missing.setObjectName("caption")
-        self.missing.setToolTip(NO_MODEL_TIP)
-        self.missing.hide()
-        row.addWidget(self.missing)
+        self.model_missing_label = QLabel(NO_MODEL)
+        self.model_missing_label.setObjectName("caption")
+        self.model_missing_label.setToolTip(NO_MODEL_TIP)
+        self.model_missing_label.hide()
+        row.addWidget(self.model_missing_label)
         row.addStretch()
         self.body.addLayout(row)
         self.body.addWidget(self.strehl, 1)
         self.body.addWidget(self.residual, 1)
-        self._history = {"strehl": History(_KEPT), "residual": History(_KEPT)}
-        self._last = time.monotonic()
+        self._history = {"strehl": TimeSeriesBuffer(_BUFFER_SIZE), "residual": TimeSeriesBuffer(_BUFFER_SIZE)}
+        self._last_state_s = time.monotonic()
 
-    def take_state(self, state: State) -> None:
+    def on_state(self, state: State) -> None:
         """Another point of each curve."""
         loop, now = state.loop, time.monotonic()
         if loop.closed:
-            self.set_empty(False)
-        if self.is_empty:
+            self.show_placeholder(False)
+        if self.shows_placeholder:
             return
         strehl = np.nan if loop.strehl is None or not loop.closed else 100 * loop.strehl
         # None was measured yet in the moment of closing.
         residual = loop.residual_nm if loop.closed and loop.residual_nm > 0 else np.nan
-        if now - self._last > _GAP_S:
+        if now - self._last_state_s > _GAP_S:
             # Nobody looked meanwhile: no line leads across.
             for history in self._history.values():
                 history.add(now, np.nan)
-        self._last = now
+        self._last_state_s = now
         self._history["strehl"].add(now, strehl)
         self._history["residual"].add(now, residual)
         sigma = "" if loop.strehl_sigma is None else f" ± {100 * loop.strehl_sigma:.1f}"
         self.readouts["strehl"].show_value("–" if np.isnan(strehl) else f"{strehl:.1f}{sigma}")
         modelled = any(stream.name == "model_psf" for stream in state.streams)
-        self.missing.setVisible(loop.closed and bool(np.isnan(strehl)) and not modelled)
+        self.model_missing_label.setVisible(loop.closed and bool(np.isnan(strehl)) and not modelled)
         self.readouts["residual"].show_value("–" if np.isnan(residual) else f"{residual:.1f}")
 
-    def tick(self, source: Source) -> None:
+    def tick(self, source: DataSource) -> None:
         """The charts move on even when nothing comes."""
-        if self.is_empty:
+        if self.shows_placeholder:
             return
         now = time.monotonic()
         self.strehl.show_history(self._history["strehl"], now)
@@ -98,11 +98,11 @@ class PerformancePanel(Panel):
         for history in self._history.values():
             history.clear()
 
-    def shown(self) -> tuple[Shown, ...]:
+    def export_arrays(self) -> tuple[ExportArray, ...]:
         """One table of both curves; seconds before now."""
-        if self.is_empty:
+        if self.shows_placeholder:
             return ()
         times, strehl = self._history["strehl"].arrays
         _, residual = self._history["residual"].arrays
         table = np.stack([times - time.monotonic(), strehl, residual], axis=1)
-        return (Shown("performance", table, "", ("time [s]", "strehl [%]", "residual [nm rms]")),)
+        return (ExportArray("performance", table, "", ("time [s]", "strehl [%]", "residual [nm rms]")),)

@@ -21,20 +21,26 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from escape_gui.panels.panel import Context, Panel
-from escape_gui.situation import Situation, to_abort, to_ask, to_pause, to_write
-from escape_gui.views import procedure_form as words
+from escape_gui.client.availability import (
+    RequestContext,
+    reason_no_abort,
+    reason_no_pause,
+    reason_no_request,
+    reason_no_write,
+)
+from escape_gui.panels.base import Context, Panel
+from escape_gui.views import procedure_form as form_text
 from escape_gui.views.mode_mosaic import ModeStatistics
-from escape_gui.widgets.argument_form import ArgumentForm
-from escape_hw.remote.source import Sample, Source
-from escape_hw.remote.state import Arguments, Ended, Plan, ProcedureEntry, State
+from escape_gui.widgets.controls.argument_form import ArgumentForm
+from escape_hw.remote.source import DataSource, Sample
+from escape_hw.remote.state import Arguments, FinishedRun, ProcedureEntry, ProcedurePlan, State
 
 #: Wait so long after the last edit before the server is asked what the procedure would do.
-_SETTLED_MS = 400
+_PLAN_DELAY_MS = 400
 #: What stands in the form of a recording.
-NOTHING = "This is a recording: it can be looked at, nothing can be started. Its result stands below."
+RECORDING_TEXT = "This is a recording: it can be looked at, nothing can be started. Its result stands below."
 
-NOBODY = "No server has answered. Start one with 'escape serve SYSTEM', or open a recording (File)."
+NO_SERVER_TEXT = "No server has answered. Start one with 'escape serve SYSTEM', or open a recording (File)."
 
 
 class ProcedurePanel(Panel):
@@ -52,11 +58,11 @@ class ProcedurePanel(Panel):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self._entries: dict[str, ProcedureEntry] = {}
-        self._plan: Plan | None = None
+        self._plan: ProcedurePlan | None = None
         self._plan_level = "muted"
-        self._checking: Arguments | None = None
+        self._checked_arguments: Arguments | None = None
         self._state = State()
-        self._ended: Ended | None = None
+        self._ended: FinishedRun | None = None
         self._documents: dict[str, Mapping[str, Any]] = {}
         self._matrix: dict[str, NDArray[Any]] = {}
         self._make_form()
@@ -64,22 +70,22 @@ class ProcedurePanel(Panel):
         self._make_result()
         self._timer = QTimer(self)
         self._timer.setSingleShot(True)
-        self._timer.setInterval(_SETTLED_MS)
+        self._timer.setInterval(_PLAN_DELAY_MS)
         self._timer.timeout.connect(self.ask_plan)
         self.setFocusProxy(self.choice)
-        self.restyle()
+        self.apply_theme()
 
     # ------------------------------------------------------------ building
     def _make_form(self) -> None:
         self.choice = QComboBox()
         self.choice.setAccessibleName("Procedure")
-        self.choice.currentIndexChanged.connect(self._choose)
-        self._about = _words()
+        self.choice.currentIndexChanged.connect(self._on_procedure_selected)
+        self._description = _text_label()
         self.form = ArgumentForm(self.context.theme)
-        self.form.edited.connect(self._edit)
-        self.plan = _words()
+        self.form.edited.connect(self._on_edit)
+        self.plan = _text_label()
         self.plan.setAccessibleName("Plan")
-        for widget, stretch in ((self.choice, 0), (self._about, 0), (self.form, 100), (self.plan, 0)):
+        for widget, stretch in ((self.choice, 0), (self._description, 0), (self.form, 100), (self.plan, 0)):
             self.body.addWidget(widget, stretch)
 
     def _make_buttons(self) -> None:
@@ -98,7 +104,7 @@ class ProcedurePanel(Panel):
         self.bar = QProgressBar()
         self.bar.setTextVisible(False)
         self.bar.setFixedHeight(8)
-        self.progress, self._metrics = _words(), _words()
+        self.progress, self._metrics = _text_label(), _text_label()
         for widget in (self.progress, self.bar, self._metrics):
             self.body.addWidget(widget)
 
@@ -106,7 +112,7 @@ class ProcedurePanel(Panel):
         self._result = QWidget()
         grid = QGridLayout(self._result)
         grid.setContentsMargins(0, 0, 0, 0)
-        self.outcome, self.numbers = _words(), _words()
+        self.outcome, self.numbers = _text_label(), _text_label()
         self.report, self.folder = QPushButton("Open report"), QPushButton("Open folder")
         self.report.clicked.connect(lambda: self._open(self._product("report")))
         self.folder.clicked.connect(lambda: self._open(self._ended.folder if self._ended else ""))
@@ -116,32 +122,34 @@ class ProcedurePanel(Panel):
         grid.addWidget(self.folder, 2, 1)
         grid.setColumnStretch(2, 1)
         grid.setRowStretch(3, 1)
-        self._outcome = QScrollArea()
-        self._outcome.setWidgetResizable(True)
-        self._outcome.setFrameShape(QFrame.Shape.NoFrame)
-        self._outcome.setWidget(self._result)
-        self.body.addWidget(self._outcome, 100)
+        self._result_area = QScrollArea()
+        self._result_area.setWidgetResizable(True)
+        self._result_area.setFrameShape(QFrame.Shape.NoFrame)
+        self._result_area.setWidget(self._result)
+        self.body.addWidget(self._result_area, 100)
         self.body.addStretch(1)
-        self._outcome.hide()
+        self._result_area.hide()
 
     # ------------------------------------------------------------ data
-    def tick(self, source: Source) -> None:
+    def tick(self, source: DataSource) -> None:
         """Once the server says what it offers, make the list."""
         if not self._entries and source.connected and (found := source.procedures()):
             self._entries = {one.name: one for one in found}
             for one in found:
                 self.choice.addItem(one.title, one.name)
-            self._choose()
+            self._on_procedure_selected()
         self.form.setVisible(bool(self._entries))
         if not self._entries:
-            replay = source.connected and self.context.session.commands is None
-            _put(self._about, NOTHING if replay else "" if source.connected else NOBODY)
+            replay = source.connected and self.context.session.requests is None
+            _set_text(
+                self._description, RECORDING_TEXT if replay else "" if source.connected else NO_SERVER_TEXT
+            )
         self._enable()
 
-    def take_state(self, state: State) -> None:
+    def on_state(self, state: State) -> None:
         """Progress, products to choose from, and how the last one ended."""
         self._state = state
-        self.form.offer_matrices(words.matrices(state.products))
+        self.form.set_matrix_choices(form_text.matrices(state.products))
         running = state.procedure
         if running is None:
             self._matrix.clear()
@@ -149,34 +157,34 @@ class ProcedurePanel(Panel):
         self.bar.setVisible(running is not None)
         self.bar.setRange(0, 1000 if running is None or running.total else 0)
         self.bar.setValue(round(1000 * min(1.0, share)))
-        _put(self.progress, "" if running is None else words.progress_line(running))
-        _put(self._metrics, "" if running is None else self._watched(running.metrics))
+        _set_text(self.progress, "" if running is None else form_text.progress_line(running))
+        _set_text(self._metrics, "" if running is None else self._metrics_text(running.metrics))
         self.pause.setText("Go on" if running is not None and running.paused else "Pause")
         # While something runs, what came of the last one only takes its room.
-        self._outcome.setVisible(self._ended is not None and running is None)
+        self._result_area.setVisible(self._ended is not None and running is None)
         if state.last is not None and (self._ended is None or state.last.id != self._ended.id):
             self._show_ended(state.last)
 
-    def take_sample(self, stream: str, sample: Sample) -> None:
+    def on_sample(self, stream: str, sample: Sample) -> None:
         """The matrix that is being measured tells which mode is known worst."""
         self._matrix[stream] = sample.data
 
-    def _watched(self, metrics: Mapping[str, float]) -> str:
+    def _metrics_text(self, metrics: Mapping[str, float]) -> str:
         data, worst = self._matrix.get("matrix"), ""
         if data is not None:
-            worst = words.worst_mode(ModeStatistics.of(data, self._matrix.get("matrix_sigma")).snr)
-        return " · ".join(one for one in (worst, words.metrics_line(metrics)) if one)
+            worst = form_text.worst_mode(ModeStatistics.of(data, self._matrix.get("matrix_sigma")).snr)
+        return " · ".join(one for one in (worst, form_text.metrics_line(metrics)) if one)
 
-    def _show_ended(self, ended: Ended) -> None:
+    def _show_ended(self, ended: FinishedRun) -> None:
         before = self._documents.get(ended.name)
         self._ended = ended
         if ended.document:
             self._documents[ended.name] = ended.document
-        _put(self.outcome, words.ended_line(ended))
-        _put(self.numbers, "\n".join(words.comparison_lines(ended.document, before)))
+        _set_text(self.outcome, form_text.result_line(ended))
+        _set_text(self.numbers, "\n".join(form_text.comparison_lines(ended.document, before)))
         self.report.setVisible(bool(self._product("report")))
         self.folder.setVisible(bool(ended.folder))
-        self._outcome.show()
+        self._result_area.show()
 
     def _product(self, name: str) -> str:
         return self._ended.products.get(name, "") if self._ended is not None else ""
@@ -187,7 +195,7 @@ class ProcedurePanel(Panel):
         self._documents.clear()
         self._matrix.clear()
         self.choice.clear()
-        self._outcome.hide()
+        self._result_area.hide()
 
     # ------------------------------------------------------------ form
     @property
@@ -195,93 +203,93 @@ class ProcedurePanel(Panel):
         """Name of the chosen procedure."""
         return str(self.choice.currentData() or "")
 
-    def _choose(self) -> None:
+    def _on_procedure_selected(self) -> None:
         entry = self._entries.get(self.chosen)
-        _put(self._about, entry.help if entry else "")
-        self.form.show_parameters(entry.parameters if entry else (), words.matrices(self._state.products))
-        self._edit()
+        _set_text(self._description, entry.help if entry else "")
+        self.form.show_parameters(entry.parameters if entry else (), form_text.matrices(self._state.products))
+        self._on_edit()
 
-    def _edit(self) -> None:
+    def _on_edit(self) -> None:
         self._plan = None
-        self._say_plan("")
+        self._show_plan("")
         self._enable()
-        if self.chosen and self.context.session.commands is not None:
+        if self.chosen and self.context.session.requests is not None:
             self._timer.start()
 
-    def _say_plan(self, text: str, level: str = "muted") -> None:
-        _put(self.plan, text)
+    def _show_plan(self, text: str, level: str = "muted") -> None:
+        _set_text(self.plan, text)
         self._plan_level = level
-        self._colour_plan()
+        self._apply_plan_colour()
 
-    def _colour_plan(self) -> None:
+    def _apply_plan_colour(self) -> None:
         self.plan.setStyleSheet(f"color: {self.context.theme.colour(self._plan_level).name()};")
 
     # ------------------------------------------------------------ requests
     def ask_plan(self) -> None:
         """Ask what the procedure would do; nothing moves."""
-        commands, name = self.context.session.commands, self.chosen
-        if commands is None or not name:
+        requests, name = self.context.session.requests, self.chosen
+        if requests is None or not name:
             return
         try:
             arguments = self.form.arguments()
         except ValueError as error:
-            self._say_plan(f"⚠ {error}", "bad")
+            self._show_plan(f"⚠ {error}", "bad")
             return
-        self._checking = arguments
-        commands.ask(
+        self._checked_arguments = arguments
+        requests.ask(
             "check the arguments",
             lambda server: server.check(name, arguments),
-            lambda plan: self._take_plan(name, arguments, plan),
-            lambda why: self._say_plan(f"⚠ {why}", "bad"),
+            lambda plan: self._on_plan(name, arguments, plan),
+            lambda why: self._show_plan(f"⚠ {why}", "bad"),
             quiet=True,
         )
 
-    def _take_plan(self, name: str, arguments: Arguments, plan: Plan) -> None:
-        if name != self.chosen or arguments is not self._checking:
+    def _on_plan(self, name: str, arguments: Arguments, plan: ProcedurePlan) -> None:
+        if name != self.chosen or arguments is not self._checked_arguments:
             return
         self._plan = plan
         warnings = [f"⚠ {one}" for one in plan.warnings]
-        self._say_plan("\n".join([*words.plan_lines(plan), *warnings]), "warn" if warnings else "text")
+        self._show_plan("\n".join([*form_text.plan_lines(plan), *warnings]), "warn" if warnings else "text")
         self._enable()
 
     def ask_start(self) -> None:
         """Start what was planned."""
-        commands, name, arguments = self.context.session.commands, self.chosen, self._checking
-        if commands is not None and self._plan is not None and arguments is not None:
+        requests, name, arguments = self.context.session.requests, self.chosen, self._checked_arguments
+        if requests is not None and self._plan is not None and arguments is not None:
             self.start.setEnabled(False)
-            commands.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
+            requests.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
 
     def ask_pause(self) -> None:
         """Halt, or go on."""
-        commands, running = self.context.session.commands, self._state.procedure
-        if commands is not None and running is not None:
+        requests, running = self.context.session.requests, self._state.procedure
+        if requests is not None and running is not None:
             paused = running.paused
-            commands.ask(
+            requests.ask(
                 "go on" if paused else "pause", lambda server: server.resume() if paused else server.pause()
             )
 
     def ask_abort(self) -> None:
         """Stop; what was measured is kept."""
-        commands = self.context.session.commands
-        if commands is not None:
-            commands.ask("abort the procedure", lambda server: server.abort(), urgent=True)
+        requests = self.context.session.requests
+        if requests is not None:
+            requests.ask("abort the procedure", lambda server: server.abort(), urgent=True)
 
     def _enable(self) -> None:
         """Buttons that are of no use now say why."""
         session = self.context.session
         source = session.source
-        now = Situation(source.state, source.connected, session.live, session.may_write)
+        now = RequestContext(source.state, source.connected, session.live, session.may_write)
         busy = "a procedure runs" if now.state.procedure is not None else ""
         unplanned = "" if self._plan is not None else "the arguments are not checked yet"
         for button, tip, why in (
-            (self.check, "Ask what it would do; nothing moves.", to_ask(now)),
-            (self.start, "Start it.", to_write(now) or busy or unplanned),
-            (self.pause, "Halt between two steps, or go on.", to_pause(now)),
-            (self.abort, "Stop; what was measured is kept.", to_abort(now)),
+            (self.check, "Ask what it would do; nothing moves.", reason_no_request(now)),
+            (self.start, "Start it.", reason_no_write(now) or busy or unplanned),
+            (self.pause, "Halt between two steps, or go on.", reason_no_pause(now)),
+            (self.abort, "Stop; what was measured is kept.", reason_no_abort(now)),
         ):
             button.setEnabled(not why)
             button.setToolTip(tip if not why else f"{tip} Not now: {why}.")
-        writable = not to_ask(now)
+        writable = not reason_no_request(now)
         self.form.setEnabled(writable)
         self.choice.setEnabled(writable and self.choice.count() > 0)
 
@@ -292,31 +300,31 @@ class ProcedurePanel(Panel):
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Words wrap anew."""
         super().resizeEvent(event)
-        for label in (self._about, self.plan, self.progress, self._metrics):
-            _fit(label)
+        for label in (self._description, self.plan, self.progress, self._metrics):
+            _fit_height(label)
 
-    def restyle(self) -> None:
+    def apply_theme(self) -> None:
         """Numbers in letters that do not jitter."""
         theme = self.context.theme
         for label in (self.progress, self._metrics, self.numbers):
             label.setFont(theme.font(0.95, mono=True))
-        self._about.setStyleSheet(f"color: {theme.colour('muted').name()};")
-        self._colour_plan()
+        self._description.setStyleSheet(f"color: {theme.colour('muted').name()};")
+        self._apply_plan_colour()
 
 
-def _put(label: QLabel, text: str) -> None:
+def _set_text(label: QLabel, text: str) -> None:
     """Words that take no room while there are none."""
     label.setText(text)
     label.setVisible(bool(text))
-    _fit(label)
+    _fit_height(label)
 
 
-def _fit(label: QLabel) -> None:
+def _fit_height(label: QLabel) -> None:
     """Lines that wrap ask for their height only where somebody gives it to them."""
     label.setMinimumHeight(max(0, label.heightForWidth(label.width())) if label.text() else 0)
 
 
-def _words() -> QLabel:
+def _text_label() -> QLabel:
     """A line of words that wraps and can be copied."""
     label = QLabel()
     label.setWordWrap(True)

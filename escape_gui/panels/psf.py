@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QVBoxLayout
 
-from escape_gui.panels.panel import Context, Panel, Shown
-from escape_gui.radial import RadialProfile
-from escape_gui.widgets.picture import Picture
-from escape_gui.widgets.picture_bar import PictureBar
-from escape_gui.widgets.plot import Plot
+from escape_gui.panels.base import Context, ExportArray, Panel
+from escape_gui.views.images import RadialProfile
+from escape_gui.widgets.images.image_viewer import ImageToolbar, ImageViewer
+from escape_gui.widgets.plots.plot import Plot
 from escape_hw.remote.source import Sample
 
 #: The lowest value of the profiles, relative to the peak of the model.
@@ -36,7 +35,7 @@ class PsfPanel(Panel):
     )
     streams: ClassVar[tuple[str, ...]] = ("psf", "model_psf")
     rate_hz: ClassVar[float] = 10.0
-    empty: ClassVar[str] = (
+    placeholder: ClassVar[str] = (
         "No image yet.\nThe science camera is read while the loop is closed, or it does not exist here."
     )
 
@@ -44,15 +43,15 @@ class PsfPanel(Panel):
         super().__init__(context)
         theme = context.theme
         self.pictures = {
-            "psf": Picture(theme, "Image of the science camera", unit="counts"),
-            "model_psf": Picture(theme, "Model of a perfect image"),
+            "psf": ImageViewer(theme, "Image of the science camera", unit="counts"),
+            "model_psf": ImageViewer(theme, "Model of a perfect image"),
         }
         self.captions: dict[str, QLabel] = {}
         pair = QHBoxLayout()
         pair.setSpacing(8)
         for key, caption in CAPTIONS.items():
             self.pictures[key].logarithmic = True
-            self.pictures[key].use_map(1)
+            self.pictures[key].set_colour_map(1)
             column = QVBoxLayout()
             column.setSpacing(2)
             label = QLabel(caption)
@@ -72,17 +71,17 @@ class PsfPanel(Panel):
         }
         self.plot.setMinimumHeight(120)
         self.body.addLayout(pair, 3)
-        self.body.addWidget(PictureBar(theme, self.pictures["psf"]))
+        self.body.addWidget(ImageToolbar(theme, self.pictures["psf"]))
         self.body.addWidget(self.plot, 2)
         self._images: dict[str, NDArray[Any]] = {}
         self._profiles: dict[str, NDArray[np.float64]] = {}
         self._radial = RadialProfile((1, 1), (0, 0))
-        self._say_model()
+        self._update_model_caption()
 
-    def take_sample(self, stream: str, sample: Sample) -> None:
+    def on_sample(self, stream: str, sample: Sample) -> None:
         """Another image, or the model."""
         self._images[stream] = sample.data
-        self._say_model()
+        self._update_model_caption()
         self.pictures[stream].show_array(sample.data)
         self._profiles[stream] = self._profile(sample.data)
         model = self._profiles.get("model_psf")
@@ -94,7 +93,7 @@ class PsfPanel(Panel):
             relative = np.maximum(profile / reference[0], _FLOOR)
             self._curves[key].setData(np.arange(relative.size), relative)
 
-    def _say_model(self) -> None:
+    def _update_model_caption(self) -> None:
         label = self.captions["model_psf"]
         label.setText(CAPTIONS["model_psf"] if "model_psf" in self._images else NO_MODEL)
         label.setToolTip(NO_MODEL_TIP if "model_psf" not in self._images else "")
@@ -113,13 +112,15 @@ class PsfPanel(Panel):
         """Another source."""
         self._images.clear()
         self._profiles.clear()
-        self._say_model()
+        self._update_model_caption()
         for key, picture in self.pictures.items():
             picture.clear()
             self._curves[key].setData([], [])
 
-    def shown(self) -> tuple[Shown, ...]:
+    def export_arrays(self) -> tuple[ExportArray, ...]:
         """Both images and their profiles."""
-        images = [Shown(key, data, "count") for key, data in self._images.items()]
-        profiles = [Shown(f"{key}_profile", data, "share per pixel") for key, data in self._profiles.items()]
+        images = [ExportArray(key, data, "count") for key, data in self._images.items()]
+        profiles = [
+            ExportArray(f"{key}_profile", data, "share per pixel") for key, data in self._profiles.items()
+        ]
         return (*images, *profiles)

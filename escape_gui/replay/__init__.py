@@ -1,1 +1,1 @@
-"""Products and run folders, shown by the panels that show a living bench."""
+"""Recordings (products and run folders) shown by the panels of a live system."""

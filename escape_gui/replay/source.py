@@ -1,4 +1,4 @@
-"""A run folder or a product as a source for panels: all to be looked at, nothing to be commanded."""
+"""A run folder or product as a read-only source for panels, with its geometry."""
 
 from __future__ import annotations
 
@@ -9,32 +9,59 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from escape_gui.replay.geometry import geometry_of
-from escape_gui.replay.streams import Course, courses, main_calibration
+from escape_gui.replay.streams import RecordedStream, main_calibration, recorded_streams
 from escape_hw.errors import ConfigError
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
     Arguments,
-    Ended,
     Finish,
+    FinishedRun,
     Geometry,
     LogLine,
     LoopState,
     Phase,
-    Plan,
     ProcedureEntry,
-    Product,
+    ProcedurePlan,
+    ProductEntry,
     State,
     StreamEntry,
 )
+from escape_hw.server.engine.bench_status import outlines
 
 if TYPE_CHECKING:
     from escape_hw.report.content import RunContent
 
+
+def run_geometry(run: RunContent) -> Geometry:
+    """The geometry of a run's main calibration; empty parts where the run tells nothing of them."""
+    main = main_calibration(run)
+    layout, places = run.layout, run.places_m
+    seen: dict[str, object] = {}
+    if main is not None:
+        grid = main[1].grid
+        seen = {
+            "valid": _rows(grid.valid),
+            "outlines_px": outlines(grid),
+            "n_modes": main[1].matrix.n_modes,
+        }
+    return Geometry.model_validate(
+        {
+            **seen,
+            "layout": () if layout is None else _rows(layout),
+            "places_m": () if places is None else tuple((float(x), float(y)) for x, y in places),
+        }
+    )
+
+
+def _rows(mask: NDArray[np.bool_]) -> tuple[str, ...]:
+    return tuple("".join("1" if spot else "0" for spot in row) for row in mask)
+
+
 #: Why nothing can be commanded.
-REASON = "This is a recording: it can be looked at, nothing in it can be moved."
-_LINE = re.compile(r"(\S+ \S+) ([A-Z]+) (\S+): (.*)")
+READ_ONLY_REASON = "This is a recording: it can be looked at, nothing in it can be moved."
+_LOG_LINE = re.compile(r"(\S+ \S+) ([A-Z]+) (\S+): (.*)")
 
 
 class ReplaySource:
@@ -62,12 +89,12 @@ class ReplaySource:
 
         self.path = Path(path)
         self.run: RunContent = read_run(self.path) if self.path.is_dir() else read_product(self.path)
-        self._courses = courses(self.run)
+        self._streams = recorded_streams(self.run)
         self._position = 1.0
         self._serial = 1
         self._log = _log_lines(self.run.log_text)
         self._opened_ns = time.monotonic_ns()
-        self._state = self._describe()
+        self._state = self._make_state()
 
     @property
     def connected(self) -> bool:
@@ -82,17 +109,17 @@ class ReplaySource:
     @property
     def steps(self) -> int:
         """Steps of the longest course; 1 when nothing in it has one."""
-        return max((course.length for course in self._courses.values()), default=1)
+        return max((course.length for course in self._streams.values()), default=1)
 
     def seek(self, position: float) -> None:
         """Show the run as it was after this share of it."""
         self._position = min(1.0, max(0.0, position))
         self._serial += 1
-        self._state = self._describe()
+        self._state = self._make_state()
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
         """See :class:`~escape_hw.remote.source.Source`."""
-        course = self._courses.get(stream)
+        course = self._streams.get(stream)
         if course is None or self._serial <= after:
             return None
         data = course.at(_step(course, self._position))
@@ -105,7 +132,7 @@ class ReplaySource:
         """What the run says of itself, in the words of a server."""
         return self._state
 
-    def _describe(self) -> State:
+    def _make_state(self) -> State:
         run, document = self.run, self.run.document
         finish = Finish.ABORTED if run.partial() else Finish.DONE
         name = str(document.get("title") or document.get("command", ""))
@@ -118,7 +145,7 @@ class ReplaySource:
             seed=int(document.get("seed") or 0),
             phase=Phase.STOPPED,
             loop=_loop_state(run),
-            last=Ended(
+            last=FinishedRun(
                 id=0,
                 name=name,
                 finish=finish,
@@ -128,13 +155,13 @@ class ReplaySource:
             ),
             products=_products(run),
             streams=tuple(
-                StreamEntry(name=name, segment="", unit=STREAMS.get(name, "")) for name in self._courses
+                StreamEntry(name=name, segment="", unit=STREAMS.get(name, "")) for name in self._streams
             ),
         )
 
     def geometry(self) -> Geometry:
         """Where slopes and actuators stood."""
-        return geometry_of(self.run)
+        return run_geometry(self.run)
 
     def log_after(self, number: int) -> Sequence[LogLine]:
         """The run's own log."""
@@ -144,7 +171,7 @@ class ReplaySource:
         """Nothing can be started."""
         return ()
 
-    def check(self, procedure: str, arguments: Arguments) -> Plan:
+    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """Nothing can be started.
 
         Raises
@@ -152,10 +179,10 @@ class ReplaySource:
         ConfigError
             Always.
         """
-        raise ConfigError(REASON)
+        raise ConfigError(READ_ONLY_REASON)
 
 
-def _step(course: Course, position: float) -> int:
+def _step(course: RecordedStream, position: float) -> int:
     return max(1, min(course.length, int(np.ceil(position * course.length))))
 
 
@@ -177,21 +204,21 @@ def _loop_state(run: RunContent) -> LoopState:
     )
 
 
-def _products(run: RunContent) -> tuple[Product, ...]:
+def _products(run: RunContent) -> tuple[ProductEntry, ...]:
     """Every FITS product by name, the run's main matrix last."""
     main = main_calibration(run)
-    made = [
-        Product(name=name, kind=_kind(run, name), path=str(path))
+    products = [
+        ProductEntry(name=name, kind=_kind(run, name), path=str(path))
         for name, path in run.document["products"].items()
         if path.suffix == ".fits"
     ]
     last = None if main is None else run.names.get(main[0])
-    return tuple(sorted(made, key=lambda one: one.name == last))
+    return tuple(sorted(products, key=lambda one: one.name == last))
 
 
 def _kind(run: RunContent, name: str) -> str:
-    from escape_hw.io.fits import KIND_MATRIX
-    from escape_hw.io.gains import KIND_GAINS
+    from escape_hw.io.fits.gains import KIND_GAINS
+    from escape_hw.io.fits.matrix import KIND_MATRIX
 
     return {KIND_MATRIX: "matrix", KIND_GAINS: "gains"}.get(run.kinds.get(name, ""), "psf")
 
@@ -200,7 +227,7 @@ def _log_lines(text: str) -> tuple[LogLine, ...]:
     """Lines of ``run.log``; what follows a line without a head of its own belongs to it."""
     lines: list[dict[str, Any]] = []
     for raw in text.splitlines():
-        head = _LINE.fullmatch(raw)
+        head = _LOG_LINE.fullmatch(raw)
         if head is not None:
             at, level, logger, words = head.groups()
             lines.append({"at_utc": at.replace(",", "."), "level": level, "logger": logger, "text": words})

@@ -1,1 +1,1 @@
-"""What panels show, as arrays and words: no Qt in here."""
+"""Content of the panels as arrays and text; no Qt. Drawing is in ``widgets``."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.registration import PARAMETERS, TO_PLAIN
+from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
 
 #: Names of the parameters for people, in the order of ``PARAMETERS``.
 NAMES = ("Shift x", "Shift y", "Rotation", "Radial scaling", "Tangential scaling")
@@ -23,7 +23,7 @@ UNITS = tuple(next(unit for _, unit, members in GROUPS if k in members) for k in
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Course:
+class ConvergenceHistory:
     """SPRINT so far.
 
     Parameters
@@ -50,12 +50,12 @@ class Course:
         sigma: NDArray[np.floating] | None,
         step_norm: NDArray[np.floating] | None,
         converged: bool | None = None,
-    ) -> Course:
+    ) -> ConvergenceHistory:
         """From the streams ``registration``, ``registration_sigma`` and ``step_norm``."""
-        values = np.asarray(registration, float).reshape(-1, len(PARAMETERS)) / TO_PLAIN
+        values = np.asarray(registration, float).reshape(-1, len(PARAMETERS)) / TO_STREAM_UNITS
         errors = np.full(len(PARAMETERS), np.nan)
         if sigma is not None and np.size(sigma) == errors.size:
-            errors = np.asarray(sigma, float).ravel() / TO_PLAIN
+            errors = np.asarray(sigma, float).ravel() / TO_STREAM_UNITS
         norm = np.full(len(values), np.nan)
         if step_norm is not None:
             # Read at another moment, it may be one iteration ahead or behind.
@@ -74,9 +74,11 @@ class Course:
         largest = np.max(np.abs(self.values), axis=0, initial=0.0)
         return np.where(largest > 0, largest, 1.0)
 
-    def normalised(self) -> Course:
+    def normalised(self) -> ConvergenceHistory:
         """Every parameter divided by its largest size, so that one axis serves all (paper: SPRINT figure)."""
-        return Course(self.values / self.scale, self.sigma / self.scale, self.step_norm, self.converged)
+        return ConvergenceHistory(
+            self.values / self.scale, self.sigma / self.scale, self.step_norm, self.converged
+        )
 
     def headline(self) -> str:
         """Its state in a few words."""
@@ -88,7 +90,7 @@ class Course:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drift:
+class RegistrationDrift:
     """The registration over time.
 
     Parameters
@@ -110,7 +112,7 @@ class Drift:
     marks: tuple[tuple[float, str], ...] = ()
 
     @classmethod
-    def of(cls, track: NDArray[np.floating], marks: Sequence[tuple[float, str]] = ()) -> Drift:
+    def of(cls, track: NDArray[np.floating], marks: Sequence[tuple[float, str]] = ()) -> RegistrationDrift:
         """From the stream ``registration_track`` ``(n, 11)`` and marks at seconds."""
         table = np.asarray(track, float).reshape(-1, 11)
         seconds = table[:, 0]
@@ -118,8 +120,8 @@ class Drift:
         return cls(
             seconds / size,
             unit,
-            table[:, 1:6] / TO_PLAIN,
-            table[:, 6:11] / TO_PLAIN,
+            table[:, 1:6] / TO_STREAM_UNITS,
+            table[:, 6:11] / TO_STREAM_UNITS,
             tuple((at / size, what) for at, what in marks),
         )
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.gains import OpticalGains
+from escape_hw.api.optical_gains import OpticalGains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Curve:
+class GainCurve:
     """Gains of one matrix.
 
     Parameters
@@ -35,7 +35,7 @@ class Curve:
     rounds: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
     @classmethod
-    def of(cls, label: str, gains: OpticalGains, rounds: Sequence[NDArray[np.float64]] = ()) -> Curve:
+    def of(cls, label: str, gains: OpticalGains, rounds: Sequence[NDArray[np.float64]] = ()) -> GainCurve:
         """From a result; ``rounds`` are the gains after each round of its bootstrap."""
         measured = np.isfinite(gains.sigma)
         return cls(
@@ -53,7 +53,7 @@ class Curve:
         return np.arange(1, self.value.size + 1)
 
     @property
-    def middle(self) -> float:
+    def median(self) -> float:
         """Median of the smooth course; NaN when there is nothing yet."""
         known = self.trend[np.isfinite(self.trend)]
         return float(np.median(known)) if known.size else float("nan")
@@ -65,7 +65,7 @@ def live_curve(
     sigma: NDArray[np.floating] | None,
     smooth: NDArray[np.floating] | None,
     rounds: NDArray[np.floating] | None,
-) -> Curve:
+) -> GainCurve:
     """From the streams ``gains``, ``gains_sigma``, ``gains_smooth`` and ``gains_rounds``.
 
     They are read one after another, so one of another number of modes is left out.
@@ -73,24 +73,24 @@ def live_curve(
     value = np.asarray(gains, float).ravel()
     unknown = np.full(value.size, np.nan)
 
-    def fitting(data: NDArray[np.floating] | None) -> NDArray[np.float64]:
+    def matching(data: NDArray[np.floating] | None) -> NDArray[np.float64]:
         good = data is not None and np.size(data) == value.size
         return np.asarray(data, float).ravel() if good else unknown
 
-    errors = fitting(sigma)
+    errors = matching(sigma)
     errors = np.where(np.isfinite(errors), errors, np.nan)
-    course = np.zeros((0, value.size))
+    round_gains = np.zeros((0, value.size))
     if rounds is not None and np.ndim(rounds) == 2 and rounds.shape[1] == value.size:
-        course = np.asarray(rounds, float)
-    return Curve(label, value, errors, fitting(smooth), unknown, course)
+        round_gains = np.asarray(rounds, float)
+    return GainCurve(label, value, errors, matching(smooth), unknown, round_gains)
 
 
-def sides(curves: Mapping[str, Curve]) -> dict[str, str]:
+def axis_sides(curves: Mapping[str, GainCurve]) -> dict[str, str]:
     """Axis that each curve is read on, ``left`` or ``right``.
 
     Below 1, measured on a calmer beam than the loop's, left; above 1, measured in open loop, right
     (paper: optical gain vectors). All on the left when they lie on the same side.
     """
-    above = {label: curve.middle > 1 for label, curve in curves.items()}
+    above = {label: curve.median > 1 for label, curve in curves.items()}
     both = any(above.values()) and not all(above.values())
     return {label: "right" if both and high else "left" for label, high in above.items()}

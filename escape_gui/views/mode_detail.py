@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_gui.views.mode_mosaic import LIMIT
-from escape_hw.api.matrix import InteractionMatrix, snr_of
+from escape_hw.api.interaction_matrix import InteractionMatrix, snr_per_mode
 
 #: Ends that the scale of differences may take.
 _LIMITS = (0.1, 0.25, 0.5, 1.0, LIMIT)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tile:
+class MapTile:
     """A pair of maps, x and y beside each other.
 
     Parameters
@@ -40,7 +40,7 @@ class Tile:
     signed: bool
 
 
-def pair(valid: NDArray[np.bool_], slopes: NDArray[np.floating]) -> NDArray[np.float64]:
+def map_pair(valid: NDArray[np.bool_], slopes: NDArray[np.floating]) -> NDArray[np.float64]:
     """Maps of x and y with a column between them ``(rows, 2 * columns + 1)``, NaN outside the pupil."""
     rows, columns = valid.shape
     both = np.full((rows, 2 * columns + 1), np.nan)
@@ -51,8 +51,8 @@ def pair(valid: NDArray[np.bool_], slopes: NDArray[np.floating]) -> NDArray[np.f
 
 
 def tiles(
-    matrices: Mapping[str, InteractionMatrix], mode: int, beside: tuple[str, str] | None = None
-) -> list[Tile]:
+    matrices: Mapping[str, InteractionMatrix], mode: int, compared: tuple[str, str] | None = None
+) -> list[MapTile]:
     """Everything to be seen of one mode.
 
     Parameters
@@ -70,36 +70,36 @@ def tiles(
         One for each matrix, each divided by its own rms slope; the difference of two of them; standard
         error and signal-to-noise ratio of the last one that states errors.
     """
-    having = {label: one for label, one in matrices.items() if mode < one.n_modes}
-    found = [_signed(label, one, mode) for label, one in having.items()]
-    if beside is None and len(having) > 1:
-        labels = list(having)
-        beside = (labels[-1], labels[0])
-    if beside is not None and set(beside) <= set(having):
-        found += _difference(beside, having[beside[0]], having[beside[1]], mode)
-    stated = [(label, one) for label, one in having.items() if np.any(one.sigma[:, mode] > 0)]
-    if stated:
-        found += _errors(*stated[-1], mode)
+    available = {label: one for label, one in matrices.items() if mode < one.n_modes}
+    found = [_slope_tile(label, one, mode) for label, one in available.items()]
+    if compared is None and len(available) > 1:
+        labels = list(available)
+        compared = (labels[-1], labels[0])
+    if compared is not None and set(compared) <= set(available):
+        found += _difference_tile(compared, available[compared[0]], available[compared[1]], mode)
+    with_errors = [(label, one) for label, one in available.items() if np.any(one.sigma[:, mode] > 0)]
+    if with_errors:
+        found += _error_tiles(*with_errors[-1], mode)
     return found
 
 
-def _signed(label: str, matrix: InteractionMatrix, mode: int) -> Tile:
+def _slope_tile(label: str, matrix: InteractionMatrix, mode: int) -> MapTile:
     column = matrix.data[:, mode].astype(float)
     rms = _rms(column)
-    snr = float(snr_of(matrix.data[:, [mode]], matrix.sigma[:, [mode]])[0])
-    stated = f", SNR {snr:.3g}" if np.isfinite(snr) else ""
+    snr = float(snr_per_mode(matrix.data[:, [mode]], matrix.sigma[:, [mode]])[0])
+    with_errors = f", SNR {snr:.3g}" if np.isfinite(snr) else ""
     unit = "" if matrix.slope_unit == "1" else f" {matrix.slope_unit}"
-    note = f"rms {rms:.3g}{unit}{stated}"
-    return Tile(label, note, pair(matrix.valid, column / (rms or 1.0)), (-LIMIT, LIMIT), True)
+    note = f"rms {rms:.3g}{unit}{with_errors}"
+    return MapTile(label, note, map_pair(matrix.valid, column / (rms or 1.0)), (-LIMIT, LIMIT), True)
 
 
-def _difference(
+def _difference_tile(
     labels: Sequence[str], first: InteractionMatrix, second: InteractionMatrix, mode: int
-) -> list[Tile]:
+) -> list[MapTile]:
     """First less second, each divided by its rms over the sub-apertures that both have."""
     if first.valid.shape != second.valid.shape:
         return []
-    a, b = (pair(one.valid, one.data[:, mode]) for one in (first, second))
+    a, b = (map_pair(one.valid, one.data[:, mode]) for one in (first, second))
     both = np.isfinite(a) & np.isfinite(b)
     if not both.any():
         return []
@@ -107,11 +107,11 @@ def _difference(
     difference = np.where(both, a / rms_a - b / rms_b, np.nan)
     correlation = float(np.mean(a[both] * b[both])) / (rms_a * rms_b)
     note = f"correlation {correlation:.3f}, gain {rms_a / rms_b:.2f}"
-    limit = _enough(3 * _rms(difference[both]), _LIMITS)
-    return [Tile(f"{labels[0]} − {labels[1]}", note, difference, (-limit, limit), True)]
+    limit = _smallest_limit(3 * _rms(difference[both]), _LIMITS)
+    return [MapTile(f"{labels[0]} − {labels[1]}", note, difference, (-limit, limit), True)]
 
 
-def _errors(label: str, matrix: InteractionMatrix, mode: int) -> list[Tile]:
+def _error_tiles(label: str, matrix: InteractionMatrix, mode: int) -> list[MapTile]:
     """Standard errors, and the ratio of slope to error."""
     column, sigma = matrix.data[:, mode].astype(float), matrix.sigma[:, mode].astype(float)
     rms = _rms(column) or 1.0
@@ -121,24 +121,24 @@ def _errors(label: str, matrix: InteractionMatrix, mode: int) -> list[Tile]:
         ratio = np.abs(column) / sigma
     middle = float(np.nanmedian(ratio))
     return [
-        Tile(
+        MapTile(
             f"Error of {label}",
             f"1 σ, rms {_rms(sigma) / rms:.2g}",
-            pair(matrix.valid, relative),
+            map_pair(matrix.valid, relative),
             (0.0, _round_up(top)),
             False,
         ),
-        Tile(
+        MapTile(
             f"SNR of {label}",
             f"median {middle:.3g}",
-            pair(matrix.valid, ratio),
+            map_pair(matrix.valid, ratio),
             (0.0, _round_up(2 * middle)),
             False,
         ),
     ]
 
 
-def _enough(wanted: float, limits: tuple[float, ...]) -> float:
+def _smallest_limit(wanted: float, limits: tuple[float, ...]) -> float:
     """The least of the limits that is not below what is wanted, or the last."""
     return next((one for one in limits if one >= wanted), limits[-1])
 

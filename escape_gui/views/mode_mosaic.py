@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.matrix import snr_of
+from escape_hw.api.interaction_matrix import snr_per_mode
 
 #: Ends of the colour scale, in units of the mode's rms slope (as in the report's figure).
 LIMIT = 2.5
@@ -72,8 +72,8 @@ class MosaicLayout:
         return down * self.columns + right, "xy"[part], into_row, inside
 
 
-def fit(
-    shape: tuple[int, int], n_modes: int, size: tuple[float, float], least: float, head: float
+def fit_layout(
+    shape: tuple[int, int], n_modes: int, size: tuple[float, float], min_width: float, head: float
 ) -> MosaicLayout:
     """The layout that shows most modes in a window without making any smaller than wanted.
 
@@ -92,7 +92,7 @@ def fit(
     """
     width, height = size
     best = MosaicLayout(shape, 1, 1)
-    for columns in range(1, max(1, min(n_modes, int(width // least))) + 1):
+    for columns in range(1, max(1, min(n_modes, int(width // min_width))) + 1):
         pixels = width / (columns * best.cell[1] + _MARGIN)
         one = MosaicLayout(shape, columns, 1, int(np.ceil(head / max(pixels, 1e-6))))
         rows = max(1, min(int((height / max(pixels, 1e-6) - _MARGIN) // one.cell[0]), -(-n_modes // columns)))
@@ -124,9 +124,9 @@ class ModeStatistics:
         rms = np.sqrt(np.mean(np.square(data, dtype=float), axis=0))
         if sigma is None or sigma.shape != data.shape:
             return cls(rms, np.full(rms.shape, np.inf))
-        return cls(rms, np.asarray(snr_of(data, np.nan_to_num(sigma, nan=0.0, posinf=0.0))))
+        return cls(rms, np.asarray(snr_per_mode(data, np.nan_to_num(sigma, nan=0.0, posinf=0.0))))
 
-    def trust(self) -> NDArray[np.float64]:
+    def wiener_weight(self) -> NDArray[np.float64]:
         """Share of each mode's power that is signal, 0 to 1: the Wiener weight SNR² / (1 + SNR²)."""
         with np.errstate(invalid="ignore"):
             power = np.square(self.snr)
@@ -145,11 +145,11 @@ def normalised(data: NDArray[np.floating], statistics: ModeStatistics, fade: boo
     """
     scale = np.divide(1.0, statistics.rms, out=np.zeros_like(statistics.rms), where=statistics.rms > 0)
     if fade:
-        scale = scale * statistics.trust()
+        scale = scale * statistics.wiener_weight()
     return np.asarray(data * scale, dtype=np.float32)
 
 
-def indices(values: NDArray[np.floating], limit: float = LIMIT) -> NDArray[np.uint8]:
+def colour_indices(values: NDArray[np.floating], limit: float = LIMIT) -> NDArray[np.uint8]:
     """Colour indices of signed values: 1 to 255, zero at 128; what is not finite lies outside."""
     scaled = np.clip(np.nan_to_num(values, nan=0.0, posinf=limit, neginf=-limit) * (127 / limit), -127, 127)
     painted = (np.rint(scaled) + ZERO).astype(np.uint8)
@@ -167,10 +167,10 @@ def pages(layout: MosaicLayout, n_modes: int) -> int:
     return max(1, -(-n_modes // layout.per_page))
 
 
-def paint(
+def render_page(
     layout: MosaicLayout, valid: NDArray[np.bool_], values: NDArray[np.float32], modes: range
 ) -> NDArray[np.uint8]:
-    """The picture of a page, colour indices as of :func:`indices`.
+    """The picture of a page, colour indices as of :func:`colour_indices`.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def paint(
     """
     picture = np.full(layout.size, OUTSIDE, np.uint8)
     n, (rows, columns) = int(valid.sum()), layout.shape
-    painted = indices(values[:, modes.start : modes.stop])
+    painted = colour_indices(values[:, modes.start : modes.stop])
     for place in range(len(modes)):
         top, left = layout.corner(place)
         for part in (0, 1):

@@ -10,14 +10,22 @@ import numpy as np
 
 from escape_gui.views.convergence import short_unit
 from escape_hw.api.registration import PARAMETERS
-from escape_hw.api.results import Measured
-from escape_hw.remote.state import Arguments, Ended, Finish, Parameter, Plan, Product, Running
-from escape_hw.report.tables import TITLES, with_error
+from escape_hw.api.results import Estimate
+from escape_hw.remote.state import (
+    ActiveRun,
+    Arguments,
+    Finish,
+    FinishedRun,
+    ProcedureParameter,
+    ProcedurePlan,
+    ProductEntry,
+)
+from escape_hw.report.tables import TITLES, format_with_error
 
 #: What an argument without a value is called in a list of choices.
-NONE = "–"
+NO_CHOICE = "–"
 #: Words for parameters whose names do not read like words.
-_WORDS = {
+_LABELS = {
     "snr": "SNR goal", "im": "Matrix", "closed_loop": "In closed loop on", "frames": "Frames", "poke": "Poke",
     "accuracy": "Accuracy goal", "strehl": "Measure Strehl", "best": "Search best gain",
     "resume": "Resume run", "plain": "Paper's estimator",
@@ -25,12 +33,12 @@ _WORDS = {
 }  # fmt: skip
 
 
-def label(parameter: Parameter) -> str:
+def label(parameter: ProcedureParameter) -> str:
     """How a parameter is called in the form."""
-    return _WORDS.get(parameter.name, parameter.name.replace("_", " ").capitalize())
+    return _LABELS.get(parameter.name, parameter.name.replace("_", " ").capitalize())
 
 
-def hint(parameter: Parameter) -> str:
+def parameter_hint(parameter: ProcedureParameter) -> str:
     """Its help with the allowed range."""
     low, high, unit = parameter.low, parameter.high, f" {parameter.unit}" if parameter.unit else ""
     words = [parameter.help]
@@ -47,14 +55,14 @@ def hint(parameter: Parameter) -> str:
     return " ".join(word for word in words if word)
 
 
-def text_of(value: object) -> str:
+def format_value(value: object) -> str:
     """A value as it stands in the form."""
     if value is None:
         return ""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def value_of(parameter: Parameter, text: str) -> float | int | str | None:
+def parse_value(parameter: ProcedureParameter, text: str) -> float | int | str | None:
     """What a field's text means.
 
     Raises
@@ -63,10 +71,10 @@ def value_of(parameter: Parameter, text: str) -> float | int | str | None:
         It is no number, not whole or out of range; says what would do.
     """
     text = text.strip().replace("−", "-")
-    if not text or text == NONE:
+    if not text or text == NO_CHOICE:
         if parameter.default is None:
             return None
-        raise ValueError(f"{label(parameter)}: empty; {text_of(parameter.default)} is usual")
+        raise ValueError(f"{label(parameter)}: empty; {format_value(parameter.default)} is usual")
     if parameter.kind not in ("int", "float"):
         return text
     try:
@@ -76,7 +84,7 @@ def value_of(parameter: Parameter, text: str) -> float | int | str | None:
     low = -math.inf if parameter.low is None else parameter.low
     high = math.inf if parameter.high is None else parameter.high
     if not (math.isfinite(number) and low <= number <= high):
-        raise ValueError(f"{label(parameter)}: {text} is out of range. {hint(parameter)}")
+        raise ValueError(f"{label(parameter)}: {text} is out of range. {parameter_hint(parameter)}")
     if parameter.kind == "float":
         return number
     if number != int(number):
@@ -84,12 +92,12 @@ def value_of(parameter: Parameter, text: str) -> float | int | str | None:
     return int(number)
 
 
-def matrices(products: tuple[Product, ...]) -> tuple[str, ...]:
+def matrices(products: tuple[ProductEntry, ...]) -> tuple[str, ...]:
     """Names of the matrices to choose from, the newest first."""
     return tuple(one.name for one in reversed(products) if one.kind == "matrix")
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A length of time for people: ``8.0 s``, ``4:12``, ``1:02:03``."""
     if not math.isfinite(seconds):
         return "–"
@@ -100,15 +108,15 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d} min"
 
 
-def plan_lines(plan: Plan) -> list[str]:
+def plan_lines(plan: ProcedurePlan) -> list[str]:
     """A plan in two lines: what it takes, and how far the mirror moves."""
     stroke = f"pokes reach {100 * plan.stroke:.3g} % of the stroke" if plan.stroke else "no pokes"
     if not plan.frames:
         return ["no frames, nothing moves: it computes with what was measured", ""]
-    return [f"{plan.frames} frames, {duration(plan.seconds)} at the camera's rate", stroke]
+    return [f"{plan.frames} frames, {format_duration(plan.seconds)} at the camera's rate", stroke]
 
 
-def progress_line(running: Running) -> str:
+def progress_line(running: ActiveRun) -> str:
     """How far a procedure is."""
     many = "s" if (running.total or running.done) != 1 else ""
     # What goes on until it is stopped has no total.
@@ -117,7 +125,7 @@ def progress_line(running: Running) -> str:
     if running.paused:
         return f"{line}, paused"
     if running.remaining_s is not None and math.isfinite(running.remaining_s):
-        line += f", {duration(running.remaining_s)} left"
+        line += f", {format_duration(running.remaining_s)} left"
     return line
 
 
@@ -135,7 +143,7 @@ def worst_mode(snr: np.ndarray[Any, np.dtype[np.float64]]) -> str:
     return f"worst mode {int(np.argmin(known)) + 1}: SNR {known.min():.3g}"
 
 
-def ended_line(ended: Ended) -> str:
+def result_line(ended: FinishedRun) -> str:
     """How a procedure ended, in one line."""
     word = {
         Finish.DONE: "Done",
@@ -175,11 +183,11 @@ def _registration_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None
         if not one or one.get("value") is None:
             continue
         title, unit = TITLES[name]
-        line = f"{title}: {with_error(Measured(one['value'], one.get('sigma') or 0.0))} {short_unit(unit)}"
+        line = f"{title}: {format_with_error(Estimate(one['value'], one.get('sigma') or 0.0))} {short_unit(unit)}"
         last = old.get(name)
         if last and last.get("value") is not None:
             error = math.hypot(one.get("sigma") or 0.0, last.get("sigma") or 0.0)
-            line += f" (Δ {with_error(Measured(one['value'] - last['value'], error))})"
+            line += f" (Δ {format_with_error(Estimate(one['value'] - last['value'], error))})"
         lines.append(line)
     return lines
 
@@ -188,6 +196,6 @@ def _change(value: float, before: object, unit: str) -> str:
     return f" (before: {before:.4g}{unit})" if isinstance(before, int | float) else ""
 
 
-def asked(parameters: tuple[Parameter, ...], values: Arguments) -> Arguments:
+def non_default_arguments(parameters: tuple[ProcedureParameter, ...], values: Arguments) -> Arguments:
     """What to send: arguments that differ from the defaults."""
     return {one.name: values[one.name] for one in parameters if values[one.name] != one.default}

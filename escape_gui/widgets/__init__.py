@@ -1,1 +1,1 @@
-"""Widgets that several panels use; none knows what it shows."""
+"""Reusable widgets: controls, plots, images."""

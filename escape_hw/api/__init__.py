@@ -1,1 +1,1 @@
-"""Interfaces of the devices, of the procedures and of their results."""
+"""Device interfaces, procedures and result types. Hardware drivers are in escape_drivers, simulated devices in escape_sim, numerics in escape_hw.pipeline and escape_hw.calibration."""

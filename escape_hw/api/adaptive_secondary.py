@@ -30,8 +30,8 @@ class ShellState(enum.StrEnum):
     FAULT = "fault"
 
 
-#: The states that ``go`` moves through, one after the other.
-LADDER = (ShellState.OFF, ShellState.RESTED, ShellState.SET, ShellState.RUNNING)
+#: The states that ``go_to`` moves through, one after the other.
+STATE_ORDER = (ShellState.OFF, ShellState.RESTED, ShellState.SET, ShellState.RUNNING)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class AdaptiveSecondary(DeformableMirror):
     Commands are followed in the state ``RUNNING`` only. ``open`` leads there unless ``lift`` is
     false; ``close`` flattens and rests the shell. A fault is latched: nothing but :meth:`recover`
     ends it, and no command, no closing and no opening does. Drivers fill in ``_state``, ``_step``,
-    ``_recover``, ``_measure``, ``_health`` and, where it can be watched without control, ``_glance``
+    ``_recover``, ``_measure_positions``, ``_health`` and, where it can be watched without control, ``_observe_health``
     beside those of a mirror.
 
     Parameters
@@ -125,7 +125,7 @@ class AdaptiveSecondary(DeformableMirror):
         return self._health()
 
     @final
-    def glance(self) -> ShellHealth:
+    def observe_health(self) -> ShellHealth:
         """What the mirror says of itself, without taking control of it; works open or not.
 
         Raises
@@ -133,7 +133,7 @@ class AdaptiveSecondary(DeformableMirror):
         DeviceError
             It does not answer, or can only be watched by who controls it.
         """
-        return self._health() if self.is_open else self._glance()
+        return self._health() if self.is_open else self._observe_health()
 
     @final
     def measured_positions(self) -> NDArray[np.float64]:
@@ -145,7 +145,7 @@ class AdaptiveSecondary(DeformableMirror):
             The mirror is not connected, or did not deliver a position for each actuator.
         """
         self.require_open()
-        places = np.array(self._measure(), dtype=np.float64)
+        places = np.array(self._measure_positions(), dtype=np.float64)
         if places.shape != (self.info.n_act,):
             raise DeviceError(
                 self.name, f"reported positions of shape {places.shape} for {self.info.n_act} actuators"
@@ -153,7 +153,7 @@ class AdaptiveSecondary(DeformableMirror):
         return places
 
     @final
-    def go(self, state: ShellState) -> None:
+    def go_to(self, state: ShellState) -> None:
         """Lead the mirror to a state, one step of the ladder after the other.
 
         Raises
@@ -172,17 +172,17 @@ class AdaptiveSecondary(DeformableMirror):
             while (now := self._healthy_state()) is not state:
                 if now is ShellState.RUNNING:
                     self.flatten()
-                up = LADDER.index(state) > LADDER.index(now)
-                wanted = LADDER[LADDER.index(now) + (1 if up else -1)]
-                self._step(wanted)
-                if self._state() is not wanted:
+                up = STATE_ORDER.index(state) > STATE_ORDER.index(now)
+                next_state = STATE_ORDER[STATE_ORDER.index(now) + (1 if up else -1)]
+                self._step(next_state)
+                if self._state() is not next_state:
                     raise DeviceError(
                         self.name,
-                        f"is {self._state()}, not {wanted}, after a step from {now}; see its health",
+                        f"is {self._state()}, not {next_state}, after a step from {now}; see its health",
                     )
-                if wanted is ShellState.SET:
+                if next_state is ShellState.SET:
                     # A shell that floats anew is flat, whatever was sent before it was rested.
-                    self._checked().reset(self.flat)
+                    self._guard_when_open().reset(self.flat)
 
     @final
     def recover(self) -> None:
@@ -204,24 +204,24 @@ class AdaptiveSecondary(DeformableMirror):
     def _healthy_state(self) -> ShellState:
         state = self._state()
         if state is ShellState.FAULT:
-            raise self._latched(self._health().fault)
+            raise self._fault_error(self._health().fault)
         return state
 
-    def _latched(self, fault: str) -> DeviceError:
+    def _fault_error(self, fault: str) -> DeviceError:
         """The error of a mirror that stopped itself."""
         return DeviceError(self.name, f"fault latched: {fault}; see to the cause, then call recover()")
 
-    def _asleep(self, state: ShellState, why: str = "") -> DeviceError:
+    def _not_running_error(self, state: ShellState, why: str = "") -> DeviceError:
         """The error of a mirror that is not running."""
         return DeviceError(self.name, f"is {state} and follows no commands{why}; call go(ShellState.RUNNING)")
 
-    def _movable(self) -> bool:
+    def _accepts_commands(self) -> bool:
         return self._state() is ShellState.RUNNING
 
     def _after_open(self) -> None:
         super()._after_open()
         if self.lift:
-            self.go(ShellState.RUNNING)
+            self.go_to(ShellState.RUNNING)
 
     def _before_close(self) -> None:
         end = ShellState.SET if self.leave_set else ShellState.RESTED
@@ -229,15 +229,15 @@ class AdaptiveSecondary(DeformableMirror):
             super()._before_close()
         except DeviceError as error:
             # A shell that cannot be flattened is better at rest than afloat with nobody there.
-            self._tidy(lambda: self._lower(end), error)
+            self._clean_up(lambda: self._step_down(end), error)
             raise
         if self._state() in (ShellState.SET, ShellState.RUNNING):
-            self.go(end)
+            self.go_to(end)
 
-    def _lower(self, end: ShellState) -> None:
+    def _step_down(self, end: ShellState) -> None:
         """Step down to a state without asking for a shape."""
-        for state in reversed(LADDER[LADDER.index(end) : -1]):
-            if self._state() in LADDER[LADDER.index(state) + 1 :]:
+        for state in reversed(STATE_ORDER[STATE_ORDER.index(end) : -1]):
+            if self._state() in STATE_ORDER[STATE_ORDER.index(state) + 1 :]:
                 self._step(state)
 
     @final
@@ -246,19 +246,19 @@ class AdaptiveSecondary(DeformableMirror):
         if state is ShellState.FAULT:
             self._healthy_state()
         if state is not ShellState.RUNNING:
-            raise self._asleep(state)
-        return self._drive(command)
+            raise self._not_running_error(state)
+        return self._send_to_shell(command)
 
     def _known_state(self) -> ShellState:
         """Where the mirror stood when it last spoke: asked before every command, so it must be cheap."""
         return self._state()
 
-    def _glance(self) -> ShellHealth:
+    def _observe_health(self) -> ShellHealth:
         """Ask for the health over a way that needs no control; the mirror is not open."""
         raise DeviceError(self.name, "tells its health only to who controls it; open it first")
 
     @abc.abstractmethod
-    def _drive(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def _send_to_shell(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Transfer a guarded command ``(n_act,)`` to the running mirror.
 
         Returns
@@ -280,7 +280,7 @@ class AdaptiveSecondary(DeformableMirror):
         """End a fault; leads to ``RESTED`` or ``OFF``."""
 
     @abc.abstractmethod
-    def _measure(self) -> NDArray[np.float64]:
+    def _measure_positions(self) -> NDArray[np.float64]:
         """Positions ``(n_act,)``, fractions of full stroke."""
 
     @abc.abstractmethod

@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import DTypeLike
 
-from escape_hw.api.threads import hold_to_one_thread
+from escape_hw.api.concurrency import limit_to_one_thread
 
-Better = Literal["higher", "lower"]
+Preference = Literal["higher", "lower"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class BenchmarkRow:
     peer: float | None
     peer_name: str
     unit: str
-    better: Better
+    better: Preference
     note: str = ""
     floor: float | None = None
 
@@ -71,7 +71,7 @@ class BenchmarkRow:
 Benchmark = Callable[[], list[BenchmarkRow]]
 
 
-def alternate(
+def time_alternately(
     ours: Callable[[], object], peer: Callable[[], object] | None, *, seconds: float = 1.0, rounds: int = 7
 ) -> tuple[float, float | None]:
     """Median seconds per call of two functions timed in turn.
@@ -126,7 +126,7 @@ def _elapsed(call: Callable[[], object], repeats: int) -> float:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def single_thread() -> Iterator[None]:
     """Hold the linear-algebra libraries to one thread, for thread pools fight and hide the cost."""
-    with hold_to_one_thread():
+    with limit_to_one_thread():
         yield

@@ -1,18 +1,100 @@
-"""Cameras: wavefront sensor and science."""
+"""Interface of cameras, with their frames, settings and counters."""
 
 from __future__ import annotations
 
 import abc
 import math
 from collections.abc import Callable
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
 from typing import final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from escape_hw.api.device import Device
-from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, FrameStatus
+from escape_hw.api.representation import short_repr
 from escape_hw.errors import DeviceError, FrameTimeout, SettingRejected
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One camera frame.
+
+    Parameters
+    ----------
+    data
+        Counts ``(rows, columns)``, uint16, read-only, and not overwritten by later frames.
+    index
+        The device's own frame counter; a step larger than one is a lost frame.
+    exposed_ns, arrived_ns
+        Monotonic time of the end of the exposure and of the arrival in this computer.
+    n_saturated
+        Number of pixels at the top of the scale.
+    """
+
+    data: NDArray[np.uint16]
+    index: int
+    exposed_ns: int
+    arrived_ns: int
+    n_saturated: int = 0
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """Region read from the sensor, in pixels."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """Settings of a camera; ``check`` and ``configure`` answer with the achievable ones.
+
+    Parameters
+    ----------
+    region
+        Region read out.
+    exposure_s
+        Exposure time in seconds.
+    frame_rate_hz
+        Frames per second.
+    gain_db
+        Analogue gain in decibels.
+    """
+
+    region: Region
+    exposure_s: float
+    frame_rate_hz: float
+    gain_db: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """Identity and fixed properties of a camera."""
+
+    model: str
+    serial: str
+    sensor_shape: tuple[int, int]
+    bit_depth: int
+    simulated: bool
+
+    @property
+    def full_scale(self) -> int:
+        """Highest count a pixel can report."""
+        return int(2**self.bit_depth - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameStatus:
+    """Counters of a camera since ``start``: delivered, lost (gaps of the index), time-outs."""
+
+    delivered: int = 0
+    lost: int = 0
+    timeouts: int = 0
 
 
 class Camera(Device):
@@ -24,12 +106,12 @@ class Camera(Device):
     Attributes
     ----------
     tap
-        Told of every frame, see :class:`~escape_hw.api.taps.Taps`.
+        Told of every frame, see :class:`~escape_hw.api.callbacks.Callbacks`.
     """
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self.tap: Callable[[Frame], object] | None = None
+        self.callback: Callable[[Frame], object] | None = None
         self._running = False
         self._delivered = self._lost = self._timeouts = 0
         self._last_index: int | None = None
@@ -149,7 +231,7 @@ class Camera(Device):
         except FrameTimeout:
             self._timeouts += 1
             raise
-        return self._accept(frame)
+        return self._register_frame(frame)
 
     @final
     def poll(self) -> Frame | None:
@@ -166,9 +248,9 @@ class Camera(Device):
         self.require_open()
         self.start()
         frame = self._poll()
-        return None if frame is None else self._accept(frame)
+        return None if frame is None else self._register_frame(frame)
 
-    def _accept(self, frame: Frame) -> Frame:
+    def _register_frame(self, frame: Frame) -> Frame:
         if not isinstance(frame, Frame):
             raise DeviceError(
                 self.name, f"delivered {type(frame).__name__} for a frame; this is a defect of its driver"
@@ -183,8 +265,8 @@ class Camera(Device):
             self._lost += frame.index - self._last_index - 1
         self._last_index = frame.index
         self._delivered += 1
-        if self.tap is not None:
-            self.tap(frame)
+        if self.callback is not None:
+            self.callback(frame)
         return frame
 
     @property

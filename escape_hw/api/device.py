@@ -49,14 +49,14 @@ class Device(abc.ABC):
             try:
                 self._open()
             except BaseException as cause:
-                self._tidy(self._abandon, cause)
+                self._clean_up(self._release_after_failed_open, cause)
                 raise
             self._is_open = True
             try:
                 self._after_open()
             except BaseException as cause:
                 self._is_open = False
-                self._tidy(self._close, cause)
+                self._clean_up(self._close, cause)
                 raise
         return self
 
@@ -79,7 +79,7 @@ class Device(abc.ABC):
                 self._before_close()
             except BaseException as cause:
                 self._is_open = False
-                self._tidy(self._close, cause)
+                self._clean_up(self._close, cause)
                 raise
             self._is_open = False
             self._close()
@@ -93,7 +93,7 @@ class Device(abc.ABC):
         if error is None:
             self.close()
         else:
-            self._tidy(self.close, error)
+            self._clean_up(self.close, error)
 
     def require_open(self) -> None:
         """Raise :class:`NotOpen` unless the device is open."""
@@ -104,7 +104,7 @@ class Device(abc.ABC):
         """The device's monotonic clock in nanoseconds (a twin's clock is simulated)."""
         return time.monotonic_ns()
 
-    def _tidy(self, step: Callable[[], None], cause: BaseException) -> None:
+    def _clean_up(self, step: Callable[[], None], cause: BaseException) -> None:
         """Take a last step after a failure; if it fails too, the first cause stays the news."""
         try:
             step()
@@ -124,11 +124,11 @@ class Device(abc.ABC):
     def _close(self) -> None:
         """Disconnect; must not raise when the device has already gone."""
 
-    def _abandon(self) -> None:  # noqa: B027 - an optional hook
+    def _release_after_failed_open(self) -> None:
         """Release whatever a failed ``_open`` left behind."""
 
-    def _after_open(self) -> None:  # noqa: B027 - an optional hook
+    def _after_open(self) -> None:
         """Work of the kind's base class once connected."""
 
-    def _before_close(self) -> None:  # noqa: B027 - an optional hook
+    def _before_close(self) -> None:
         """Work of the kind's base class before disconnecting, such as flattening a mirror."""

@@ -8,7 +8,7 @@ from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class DiscoveredDevice:
     """A device that can be reached.
 
     Parameters
@@ -37,14 +37,14 @@ class Found:
 
 
 #: What an entry point of the group ``escape.discover`` is: looks at hosts (``name`` or ``name:port``).
-Discoverer = Callable[[Sequence[str]], list[Found]]
+Discoverer = Callable[[Sequence[str]], list[DiscoveredDevice]]
 
 
 class NativeLibrary(Protocol):
     """What an entry point of the group ``escape.libraries`` is, by the name of the driver that loads it."""
 
     @property
-    def what(self) -> str:
+    def title(self) -> str:
         """Name for people."""
 
     @property

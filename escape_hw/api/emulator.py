@@ -1,4 +1,4 @@
-"""Emulators: programs that answer on a device's own wire, for drivers to be tried on without the device."""
+"""Interfaces of device emulators and of the simulated bench behind stand-ins of vendor libraries."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class EmulatorRequest:
         Dictionary of an opened system, through which the emulator finds the twins that it belongs to;
         ``None``: it stands alone.
     config
-        Configuration of that system (a :class:`~escape_hw.config.models.SystemConfig`).
+        Configuration of that system (a :class:`~escape_hw.config.system.SystemConfig`).
     """
 
     host: str = "127.0.0.1"
@@ -80,3 +80,28 @@ class Emulator(abc.ABC):
 
 #: What an entry point of the group ``escape.emulators`` is. Raises ``ConfigError`` on an unknown option.
 EmulatorFactory = Callable[[EmulatorRequest], Emulator]
+
+
+class StandInBench(Protocol):
+    """A simulated bench that real drivers reach, each through its own library."""
+
+    @property
+    def environment(self) -> Mapping[str, str]:
+        """What a process needs in its environment for its drivers to find the bench."""
+
+    def start(self) -> str:
+        """Begin to serve; returns where.
+
+        Raises
+        ------
+        EscapeError
+            This machine cannot: it has no C compiler, for instance.
+        """
+
+    def stop(self) -> None:
+        """Hang up on everybody; may be repeated."""
+
+
+#: What an entry point of the group ``escape.rehearsals`` is: takes the configuration of the system
+#: (:class:`~escape_hw.config.system.SystemConfig`).
+StandInBenchFactory = Callable[[Any], StandInBench]

@@ -11,8 +11,8 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from escape_hw.api.brief import brief
 from escape_hw.api.device import Device
+from escape_hw.api.representation import short_repr
 from escape_hw.errors import CommandRejected, DeviceError, SettingRejected
 from escape_hw.safety.guard import CommandGuard, GuardReport
 from escape_hw.safety.limits import MirrorLimits, nearest_pairs, neighbour_pairs
@@ -41,7 +41,7 @@ class DMInfo:
     positions_m: NDArray[np.float64]
     stroke_m: float
     simulated: bool
-    __repr__ = brief
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +64,7 @@ class SendReport:
     sent_ns: int
     guard: GuardReport
     skipped: bool = False
-    __repr__ = brief
+    __repr__ = short_repr
 
 
 class DeformableMirror(Device):
@@ -79,7 +79,7 @@ class DeformableMirror(Device):
     flattened_count
         How often it was flattened; every loop begins with that.
     tap
-        Told of every shape that was sent, see :class:`~escape_hw.api.taps.Taps`.
+        Told of every shape that was sent, see :class:`~escape_hw.api.callbacks.Callbacks`.
     """
 
     #: Largest step of the ramp that ``flatten`` uses, fraction of full stroke.
@@ -91,8 +91,8 @@ class DeformableMirror(Device):
         self.sent_count = 0
         self.clipped_count = 0
         self.rejected_count = 0
-        self.flattened_count = 0
-        self.tap: Callable[[NDArray[np.float64]], object] | None = None
+        self.flatten_count = 0
+        self.callback: Callable[[NDArray[np.float64]], object] | None = None
         self._flat: NDArray[np.float64] | None = None
         self._guard: CommandGuard | None = None
         self._shape_known = False
@@ -105,12 +105,12 @@ class DeformableMirror(Device):
     @property
     def shape(self) -> NDArray[np.float64]:
         """The last command sent, ``(n_act,)`` (a copy)."""
-        return self._checked().last.copy()
+        return self._guard_when_open().last.copy()
 
     @property
     def flat(self) -> NDArray[np.float64]:
         """The command that ``flatten`` ends at, ``(n_act,)`` (a copy); zeros unless set."""
-        n_act = self._checked().n_act
+        n_act = self._guard_when_open().n_act
         return np.zeros(n_act) if self._flat is None else self._flat.copy()
 
     @final
@@ -122,11 +122,11 @@ class DeformableMirror(Device):
         CommandRejected
             The command is malformed or breaks a limit by itself.
         """
-        guard = self._checked()
+        guard = self._guard_when_open()
         wanted = guard.validate(command)
-        breach = guard.breach(wanted)
-        if breach is not None:
-            raise CommandRejected(self.name, f"flat refused: {breach}")
+        find_violation = guard.find_violation(wanted)
+        if find_violation is not None:
+            raise CommandRejected(self.name, f"flat refused: {find_violation}")
         self._flat = wanted
 
     @final
@@ -152,21 +152,21 @@ class DeformableMirror(Device):
         """
         # The slew rule holds between what reached the mirror, so no other command may slip in.
         with self._lock:
-            guard = self._checked()
+            guard = self._guard_when_open()
             try:
                 safe, report = guard.limit(command)
             except CommandRejected:
                 self.rejected_count += 1
                 raise
-            kept = self._send(safe)
-            shape = safe if kept is None else kept
-            guard.accept(shape)
+            kept_shape = self._send(safe)
+            shape = safe if kept_shape is None else kept_shape
+            guard.set_last(shape)
             self._shape_known = True
             self.sent_count += 1
             self.clipped_count += report.clipped
-            if self.tap is not None:
-                self.tap(shape)
-            return SendReport(shape, self.now_ns(), report, kept is not None)
+            if self.callback is not None:
+                self.callback(shape)
+            return SendReport(shape, self.now_ns(), report, kept_shape is not None)
 
     @final
     def check(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
@@ -189,15 +189,15 @@ class DeformableMirror(Device):
         CommandRejected
             Malformed or not finite.
         """
-        return self._checked().limit(command)
+        return self._guard_when_open().limit(command)
 
     @final
-    def obeys(self, command: NDArray[np.float64]) -> bool:
+    def is_legal(self, command: NDArray[np.float64]) -> bool:
         """Whether a shape ``(n_act,)`` would pass :meth:`send` as it is; sends nothing."""
-        return self._checked().obeys(command)
+        return self._guard_when_open().is_legal(command)
 
     @final
-    def allowed_share(self, command: ArrayLike) -> float:
+    def largest_legal_scale(self, command: ArrayLike) -> float:
         """Largest factor, at most 1, with which a shape breaks no limit by itself (slew apart).
 
         A measurement that must know the form of what it sends scales by it, instead of having
@@ -213,7 +213,7 @@ class DeformableMirror(Device):
         CommandRejected
             Malformed or not finite.
         """
-        return self._checked().allowed_share(command)
+        return self._guard_when_open().largest_legal_scale(command)
 
     @final
     def flatten(self) -> None:
@@ -227,10 +227,10 @@ class DeformableMirror(Device):
             The mirror is not connected, or did not arrive.
         """
         with self._lock:
-            guard = self._checked()
-            if not self._movable():
+            guard = self._guard_when_open()
+            if not self._accepts_commands():
                 return
-            self.flattened_count += 1
+            self.flatten_count += 1
             target = self.flat
             step = min(self.RAMP_STEP, self.limits.max_slew or self.RAMP_STEP)
             distance = float(np.abs(target - guard.last).max(initial=0.0))
@@ -246,7 +246,7 @@ class DeformableMirror(Device):
                     self.name, "did not reach its flat shape; check max_slew against the flat and the limits"
                 )
 
-    def _checked(self) -> CommandGuard:
+    def _guard_when_open(self) -> CommandGuard:
         self.require_open()
         if self._guard is None:
             raise DeviceError(self.name, "has no guard; its driver must not override _after_open")
@@ -259,14 +259,14 @@ class DeformableMirror(Device):
                 self.name, f"its layout has {int(info.layout.sum())} places for {info.n_act} actuators"
             )
         try:
-            pairs = _neighbours(info)
+            pairs = _neighbour_pairs(info)
             guard = CommandGuard(self.name, info.n_act, self.limits, pairs)
         except ValueError as error:
             raise SettingRejected(self.name, f"its limits do not fit it: {error}") from error
         present = self._present_shape()
         guard.reset(present)
         self._guard, self._shape_known = guard, present is not None
-        self.sent_count = self.clipped_count = self.rejected_count = self.flattened_count = 0
+        self.sent_count = self.clipped_count = self.rejected_count = self.flatten_count = 0
 
     def _before_close(self) -> None:
         self.flatten()
@@ -278,7 +278,7 @@ class DeformableMirror(Device):
         """
         return None
 
-    def _movable(self) -> bool:
+    def _accepts_commands(self) -> bool:
         """False while the mirror lies at rest and follows no commands."""
         return True
 
@@ -294,6 +294,6 @@ class DeformableMirror(Device):
         """
 
 
-def _neighbours(info: DMInfo) -> NDArray[np.intp]:
+def _neighbour_pairs(info: DMInfo) -> NDArray[np.intp]:
     """Pairs of adjacent actuators ``(n_pairs, 2)``, on the grid or, where there is none, by distance."""
     return nearest_pairs(info.positions_m) if info.layout is None else neighbour_pairs(info.layout)

@@ -56,7 +56,7 @@ class TipTiltModulator(Device):
     """A tip-tilt stage that turns the beam in a circle; parks at its centre when stopped.
 
     Drivers fill in ``_open``, ``_close``, ``_check``, ``_modulate``, ``_park``,
-    ``info`` and ``modulation``; where they can, ``_status``, ``_look`` and ``_release`` too. Closing
+    ``info`` and ``modulation``; where they can, ``_status``, ``_status_when_closed`` and ``_release`` too. Closing
     parks first.
     """
 
@@ -86,10 +86,11 @@ class TipTiltModulator(Device):
             )
         if not all(map(math.isfinite, want.centre_rad)):
             raise SettingRejected(self.name, f"{want}: the centre must be finite")
-        furthest = want.radius_rad + math.hypot(*want.centre_rad)
-        if furthest > self.info.max_tilt_rad:
+        largest_tilt = want.radius_rad + math.hypot(*want.centre_rad)
+        if largest_tilt > self.info.max_tilt_rad:
             raise SettingRejected(
-                self.name, f"{want}: tilts by {furthest:.4g} rad; it does 0 to {self.info.max_tilt_rad:g} rad"
+                self.name,
+                f"{want}: tilts by {largest_tilt:.4g} rad; it does 0 to {self.info.max_tilt_rad:g} rad",
             )
         return self._check(want)
 
@@ -111,10 +112,10 @@ class TipTiltModulator(Device):
         """
         achievable = self.check(want)
         self._modulate(achievable)
-        reached = self.modulation
-        if reached is None:
+        achieved = self.modulation
+        if achieved is None:
             raise DeviceError(self.name, f"does not move although it was told to do {achievable}")
-        return reached
+        return achieved
 
     @final
     def park(self) -> None:
@@ -132,7 +133,7 @@ class TipTiltModulator(Device):
             It cannot be asked.
         """
         with self._lock:
-            return self._status() if self.is_open else self._look()
+            return self._status() if self.is_open else self._status_when_closed()
 
     @final
     def release(self) -> bool:
@@ -160,7 +161,7 @@ class TipTiltModulator(Device):
         """Status of an open stage."""
         return ModulatorStatus(self.info, self.modulation)
 
-    def _look(self) -> ModulatorStatus:
+    def _status_when_closed(self) -> ModulatorStatus:
         """Status of a stage that is not open."""
         with self:
             return self._status()

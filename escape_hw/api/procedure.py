@@ -15,8 +15,8 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.brief import brief
-from escape_hw.api.flag import Flag
+from escape_hw.api.concurrency import SignalSafeFlag
+from escape_hw.api.representation import short_repr
 from escape_hw.errors import Aborted
 
 log = logging.getLogger(__name__)
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 #: How long a procedure may clear up after it was aborted, in wall-clock seconds.
-GRACE_S = 1.0
+ABORT_GRACE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class Progress:
     elapsed_s: float = 0.0
     metrics: Mapping[str, float] = field(default_factory=dict)
     arrays: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    __repr__ = brief
+    __repr__ = short_repr
 
     @property
     def fraction(self) -> float:
@@ -70,8 +70,8 @@ class Progress:
         return self.elapsed_s * max(0, self.total - self.done) / self.done
 
 
-class Stop(Protocol):
-    """What tells a procedure to stop: a :class:`Flag`, or a :class:`threading.Event`."""
+class StopSignal(Protocol):
+    """What tells a procedure to stop: a :class:`SignalSafeFlag`, or a :class:`threading.Event`."""
 
     def is_set(self) -> bool:
         """Whether to stop."""
@@ -122,14 +122,14 @@ def run(
     procedure: Procedure[T],
     *,
     observers: tuple[Observer, ...] = (),
-    abort: Stop | None = None,
+    abort: StopSignal | None = None,
 ) -> T:
     """Drive a procedure to its end and return its result.
 
     The procedure is responsible for leaving the mirror flat (``finally``); the runner makes sure
     that it gets the chance. To stop it, :class:`Aborted` is thrown into it **once**, between two
     steps, so that no transfer to a device is cut in half. It may return what it has, raise, or
-    yield a little longer while it clears up; after :data:`GRACE_S` it is closed whether it likes
+    yield a little longer while it clears up; after :data:`ABORT_GRACE_S` it is closed whether it likes
     it or not, its ``finally`` clauses included.
 
     Ctrl-C stops it in the same way when this is the main thread and nobody has installed another
@@ -149,55 +149,55 @@ def run(
     Aborted
         Stopped by ``abort`` or Ctrl-C; carries the partial result when the procedure made one.
     """
-    interrupted = Flag()
+    interrupted = SignalSafeFlag()
     try:
-        with _ctrl_c_sets(interrupted):
-            return _drive(procedure, list(observers), abort or Flag(), interrupted)
+        with _set_on_ctrl_c(interrupted):
+            return _advance_until_done(procedure, list(observers), abort or SignalSafeFlag(), interrupted)
     except KeyboardInterrupt:
         raise Aborted("interrupted by Ctrl-C") from None
     finally:
         _close(procedure)
 
 
-def _drive(
+def _advance_until_done(
     procedure: Procedure[T],
-    watching: list[Observer],
-    abort: Stop,
-    interrupted: Flag,
+    observers_left: list[Observer],
+    abort: StopSignal,
+    interrupted: SignalSafeFlag,
 ) -> T:
     deadline = None
     while True:
         throw = deadline is None and (abort.is_set() or interrupted.is_set())
         try:
             if throw:
-                deadline = time.monotonic() + GRACE_S
-                progress = procedure.throw(_aborted(interrupted))
+                deadline = time.monotonic() + ABORT_GRACE_S
+                progress = procedure.throw(_aborted_error(interrupted))
             else:
                 progress = next(procedure)
         except StopIteration as done:
             result: T = done.value
             if deadline is not None:
-                raise _aborted(interrupted, partial=result) from None
+                raise _aborted_error(interrupted, partial=result) from None
             return result
         if deadline is not None and time.monotonic() > deadline:
-            log.error("the procedure went on for %g s after it was aborted; it is closed", GRACE_S)
-            raise _aborted(interrupted)
+            log.error("the procedure went on for %g s after it was aborted; it is closed", ABORT_GRACE_S)
+            raise _aborted_error(interrupted)
         try:
-            _tell(watching, progress)
+            _notify_observers(observers_left, progress)
         except KeyboardInterrupt:
             interrupted.set()
 
 
-def _tell(watching: list[Observer], progress: Progress) -> None:
-    for observer in tuple(watching):
+def _notify_observers(observers_left: list[Observer], progress: Progress) -> None:
+    for observer in tuple(observers_left):
         try:
             observer(progress)
         except Exception:
             log.exception("observer %r failed and is dropped", observer)
-            watching.remove(observer)
+            observers_left.remove(observer)
 
 
-def _aborted(interrupted: Flag, partial: object = None) -> Aborted:
+def _aborted_error(interrupted: SignalSafeFlag, partial: object = None) -> Aborted:
     if interrupted.is_set():
         return Aborted("interrupted by Ctrl-C", partial)
     return Aborted(partial=partial)
@@ -212,21 +212,21 @@ def _close(procedure: Procedure[T]) -> None:
 
 
 @contextmanager
-def _ctrl_c_sets(flag: Flag) -> Iterator[None]:
+def _set_on_ctrl_c(flag: SignalSafeFlag) -> Iterator[None]:
     """Let the first Ctrl-C set ``flag``, and the next one interrupt as usual.
 
     Leaves alone what another thread or the application has arranged.
     """
-    ours = threading.current_thread() is threading.main_thread()
-    if not ours or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
         return
 
-    def first(signum: int, frame: FrameType | None) -> None:
+    def on_first_interrupt(signum: int, frame: FrameType | None) -> None:
         flag.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    signal.signal(signal.SIGINT, first)
+    signal.signal(signal.SIGINT, on_first_interrupt)
     try:
         yield
     finally:

@@ -8,14 +8,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.brief import brief
+from escape_hw.api.representation import short_repr
 from escape_hw.api.sensor import SensorGeometry
 
 #: Names of the four pupil images in the order used everywhere: ``2 * lower + right``.
 IMAGES = ("upper left", "upper right", "lower left", "lower right")
 
 #: Share of the radius inside which no pixel is cut by the rim of an image.
-_INNER = 0.9
+_INNER_RADIUS = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +71,7 @@ class PyramidPupils(SensorGeometry):
     kind: ClassVar[str] = "pyramid"
     slope_unit: ClassVar[str] = "1"
     elements: ClassVar[str] = "pupil pixels"
-    short_look: ClassVar[str] = (
+    short_run_note: ClassVar[str] = (
         "the centres of the pupil images were found in {seconds:.1f} s of turbulence, which may leave them "
         "some hundredths of a pixel off; the shifts of the registration, which refer to them, are so too"
     )
@@ -89,27 +89,29 @@ class PyramidPupils(SensorGeometry):
     modulation: float = 0.0
     centre_sigma_px: float = 0.0
     pokes: float = 0.0
-    looks: float = 0.0
-    steady: float = 0.0
-    __repr__ = brief
+    n_effective: float = 0.0
+    persistent_fraction: float = 0.0
+    __repr__ = short_repr
 
     def with_background(self, counts: float) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_background`."""
         return replace(self, background=counts)
 
-    def with_motion(
-        self, rms: float, pokes: float = 0.0, looks: float = 0.0, steady: float = 0.0
+    def with_slope_statistics(
+        self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0
     ) -> PyramidPupils:
-        """See :meth:`SensorGeometry.with_motion`."""
-        return replace(self, motion=rms, pokes=pokes, looks=looks, steady=steady)
+        """See :meth:`SensorGeometry.with_slope_statistics`."""
+        return replace(
+            self, motion=rms, pokes=pokes, n_effective=n_effective, persistent_fraction=persistent_fraction
+        )
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_mean_slopes`; of the mean only what is not smooth counts."""
-        moved = self.references + without_low_orders(mean.reshape(2, -1).T, self.valid, self.flux)
-        return replace(self, references=moved.astype(np.float32))
+        new_references = self.references + remove_low_orders(mean.reshape(2, -1).T, self.valid, self.flux)
+        return replace(self, references=new_references.astype(np.float32))
 
 
-def without_low_orders(
+def remove_low_orders(
     slopes: NDArray[np.float64], valid: NDArray[np.bool_], flux: NDArray[np.float32]
 ) -> NDArray[np.float64]:
     """Mean slopes under turbulence, less the smooth part that may be the turbulence's own.
@@ -131,12 +133,12 @@ def without_low_orders(
     rows, columns = np.nonzero(valid)
     x, y = (2 * columns - (n - 1)) / n, (2 * rows - (n - 1)) / n
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    inner = x * x + y * y < _INNER**2
+    inner = x * x + y * y < _INNER_RADIUS**2
     weight = np.sqrt(np.maximum(flux[valid], 0.0))[inner, None]
-    shares = np.linalg.lstsq(terms[inner] * weight, slopes[inner] * weight, rcond=None)[0]
-    return np.asarray(slopes - terms @ shares)
+    coefficients = np.linalg.lstsq(terms[inner] * weight, slopes[inner] * weight, rcond=None)[0]
+    return np.asarray(slopes - terms @ coefficients)
 
 
-def boxes(centres_px: NDArray[np.float64], n: int) -> NDArray[np.intp]:
+def pupil_boxes(centres_px: NDArray[np.float64], n: int) -> NDArray[np.intp]:
     """First pixels ``(4, 2)`` as (x, y) of boxes of n x n pixels whose centres come nearest."""
     return np.rint(np.asarray(centres_px) - (n - 1) / 2).astype(np.intp)

@@ -18,7 +18,7 @@ UNITS = {
     "tangential_scaling": "% of the diameter",
 }
 #: From these units to sub-apertures, radians and shares of the diameter, ``(5,)``: the units of streams.
-TO_PLAIN = np.array([0.01, 0.01, np.pi / 180, 0.01, 0.01])
+TO_STREAM_UNITS = np.array([0.01, 0.01, np.pi / 180, 0.01, 0.01])
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Registration:
     anamorphosis_angle
         In degrees: the radial scaling acts along the direction at minus this angle from +x towards
         +y (OOPAO's sense). Arrays and tables leave it out: SPRINT fits the scalings along x and y and,
-        where it is asked to, a shear beside them (:meth:`sheared`).
+        where it is asked to, a shear beside them (:meth:`with_shear`).
     """
 
     shift_x: float = 0.0
@@ -70,14 +70,16 @@ class Registration:
         return values
 
     @property
-    def stretch(self) -> NDArray[np.float64]:
+    def scaling_matrix(self) -> NDArray[np.float64]:
         """The matrix ``S (2, 2)``."""
         angle = np.deg2rad(self.anamorphosis_angle)
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        rotation_matrix = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         scaling = np.diag([1 + self.radial_scaling / 100, 1 + self.tangential_scaling / 100])
-        return np.asarray(turn.T @ scaling @ turn) if self.anamorphosis_angle else scaling
+        return (
+            np.asarray(rotation_matrix.T @ scaling @ rotation_matrix) if self.anamorphosis_angle else scaling
+        )
 
-    def sheared(self, shear: float) -> Registration:
+    def with_shear(self, shear: float) -> Registration:
         """The same with a shear: ``S`` with ``shear / 100`` beside its diagonal.
 
         Scalings along x and y, and a shear, are all that a symmetric ``S`` can be. The result has
@@ -88,29 +90,29 @@ class Registration:
         shear
             In %: the scaling along one diagonal less that along the other, by half.
         """
-        stretch = self.stretch + np.array([[0.0, shear], [shear, 0.0]]) / 100
+        scaling_matrix = self.scaling_matrix + np.array([[0.0, shear], [shear, 0.0]]) / 100
         # Half the angle by which the larger axis leans from x towards y.
-        lean = 0.5 * np.arctan2(2 * stretch[0, 1], stretch[0, 0] - stretch[1, 1])
-        mean = (stretch[0, 0] + stretch[1, 1]) / 2
-        half = np.hypot((stretch[0, 0] - stretch[1, 1]) / 2, stretch[0, 1])
+        axis_angle = 0.5 * np.arctan2(2 * scaling_matrix[0, 1], scaling_matrix[0, 0] - scaling_matrix[1, 1])
+        mean = (scaling_matrix[0, 0] + scaling_matrix[1, 1]) / 2
+        half = np.hypot((scaling_matrix[0, 0] - scaling_matrix[1, 1]) / 2, scaling_matrix[0, 1])
         return replace(
             self,
             radial_scaling=float(100 * (mean + half - 1)),
             tangential_scaling=float(100 * (mean - half - 1)),
-            anamorphosis_angle=float(-np.rad2deg(lean)),
+            anamorphosis_angle=float(-np.rad2deg(axis_angle)),
         )
 
     @property
-    def along_axes(self) -> tuple[Registration, float]:
-        """The same with scalings along x and y, and the shear in % that :meth:`sheared` gives back."""
-        stretch = 100 * (self.stretch - np.eye(2))
-        straight = replace(
+    def axis_scalings_and_shear(self) -> tuple[Registration, float]:
+        """The same with scalings along x and y, and the shear in % that :meth:`with_shear` gives back."""
+        scaling_matrix = 100 * (self.scaling_matrix - np.eye(2))
+        axis_aligned = replace(
             self,
-            radial_scaling=float(stretch[0, 0]),
-            tangential_scaling=float(stretch[1, 1]),
+            radial_scaling=float(scaling_matrix[0, 0]),
+            tangential_scaling=float(scaling_matrix[1, 1]),
             anamorphosis_angle=0.0,
         )
-        return straight, float(stretch[0, 1])
+        return axis_aligned, float(scaling_matrix[0, 1])
 
     def affine(self, sub_aperture_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Matrix ``(2, 2)`` and offset ``(2,)`` in metres that place the actuators.
@@ -121,5 +123,7 @@ class Registration:
             Size of one sub-aperture on the pupil in metres.
         """
         angle = np.deg2rad(self.rotation)
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        return turn @ self.stretch, np.array([self.shift_x, self.shift_y]) * sub_aperture_m / 100
+        rotation_matrix = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        return rotation_matrix @ self.scaling_matrix, np.array(
+            [self.shift_x, self.shift_y]
+        ) * sub_aperture_m / 100

@@ -1,4 +1,4 @@
-"""What the procedures return; every number comes with its standard error."""
+"""Results of the procedures; every number with its standard error."""
 
 from __future__ import annotations
 
@@ -9,16 +9,41 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.brief import brief
-from escape_hw.api.departures import MirrorDepartures
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
+from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.sensor import SensorGeometry
-from escape_hw.api.thumbnail import curve, table
+
+#: Width of the broad pedestal that influence functions may stand on, relative to their own.
+PEDESTAL = 1.7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ActuatorCorrections:
+    """What SPRINT found of the mirror beside gain, registration and common width.
+
+    Posterior means under priors of zero mean, so what the data hardly tell is nearly zero (best
+    linear unbiased prediction; Robinson 1991).
+
+    Parameters
+    ----------
+    gain, gain_sigma
+        Relative gain of every actuator beyond the common one, and its standard error ``(n_act,)``.
+    width
+        Width of every influence function beyond the common one, relative ``(n_act,)``.
+    pedestal
+        Share of the broad pedestal in all influence functions.
+    """
+
+    gain: NDArray[np.float64]
+    gain_sigma: NDArray[np.float64]
+    width: NDArray[np.float64]
+    pedestal: float
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class Estimate:
     """A value, its standard error and its unit."""
 
     value: float
@@ -40,7 +65,7 @@ class TemporalResponse:
 
     weights: NDArray[np.float64]
     sigma: NDArray[np.float64]
-    __repr__ = brief
+    __repr__ = short_repr
 
     @property
     def delay(self) -> float:
@@ -78,51 +103,51 @@ class RegistrationEstimate:
 
     registration: Registration
     covariance: NDArray[np.float64]
-    gain: Measured
-    width: Measured
+    gain: Estimate
+    width: Estimate
     converged: bool
     iterations: tuple[SprintIteration, ...]
     chi2: float
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    departures: MirrorDepartures | None = None
-    extras: Mapping[str, Measured] = field(default_factory=dict)
+    actuator_corrections: ActuatorCorrections | None = None
+    extras: Mapping[str, Estimate] = field(default_factory=dict)
 
     @property
     def sigma(self) -> NDArray[np.float64]:
         """Standard errors ``(5,)`` in the order of ``PARAMETERS``."""
         return np.sqrt(np.diag(self.covariance))
 
-    def measured(self) -> dict[str, Measured]:
+    def measured(self) -> dict[str, Estimate]:
         """Every parameter with its standard error and unit."""
         values = self.registration.to_array()
         return {
-            name: Measured(float(v), float(s), UNITS[name])
+            name: Estimate(float(v), float(s), UNITS[name])
             for name, v, s in zip(PARAMETERS, values, self.sigma, strict=True)
         }
 
     def __repr__(self) -> str:
-        found = ", ".join(f"{name} {text}" for name, text in self._found().items())
+        texts = ", ".join(f"{name} {text}" for name, text in self._formatted_values().items())
         state = "converged" if self.converged else "NOT CONVERGED"
-        return f"<{type(self).__name__} {found}; {state} in {len(self.iterations)} iterations>"
+        return f"<{type(self).__name__} {texts}; {state} in {len(self.iterations)} iterations>"
 
-    def _found(self) -> dict[str, str]:
+    def _formatted_values(self) -> dict[str, str]:
         """Parameters and gain with errors and units."""
-        found = {
+        texts = {
             name: f"{one.value:.3f} ± {one.sigma:.3f} {one.unit}"
             for name, one in {**self.measured(), **self.extras}.items()
         }
-        return {**found, "gain": f"{self.gain.value:.4f} ± {self.gain.sigma:.4f}"}
+        return {**texts, "gain": f"{self.gain.value:.4f} ± {self.gain.sigma:.4f}"}
 
     def _repr_html_(self) -> str:
         """For notebooks: the parameters with their errors and units, and how SPRINT came there."""
         rows = {
-            **self._found(),
+            **self._formatted_values(),
             "converged": f"{'yes' if self.converged else 'NO'}, {len(self.iterations)} iterations",
             **{f"warning {number}": text for number, text in enumerate(self.warnings, 1)},
         }
-        return table(
-            rows, "Registration", curve([np.log10(max(one.step_norm, 1e-12)) for one in self.iterations])
+        return table_html(
+            rows, "Registration", line_html([np.log10(max(one.step_norm, 1e-12)) for one in self.iterations])
         )
 
 
@@ -150,14 +175,14 @@ class CalibrationResult:
     def __repr__(self) -> str:
         state = ", PARTIAL" if self.partial else ""
         parts = [
-            f"{type(self).__name__} of {self.frames} frames, {self._taken()}{state}",
+            f"{type(self).__name__} of {self.frames} frames, {self._frames_summary()}{state}",
             f"matrix: {self.matrix!r}",
         ]
         if self.registration is not None:
             parts.append(f"registration: {self.registration!r}")
         return f"<{chr(10).join(parts)}>".replace("\n", "\n  ")
 
-    def _taken(self) -> str:
+    def _frames_summary(self) -> str:
         return f"{self.lost_frames} lost, {self.sky_seconds:.1f} s"
 
     def _repr_html_(self) -> str:
@@ -166,20 +191,20 @@ class CalibrationResult:
         if self.registration is not None:
             parts.append(self.registration._repr_html_())
         rows = {
-            "frames": f"{self.frames}, {self._taken()}",
+            "frames": f"{self.frames}, {self._frames_summary()}",
             **({"PARTIAL": "stopped by the operator"} if self.partial else {}),
             **{f"note {number}": text for number, text in enumerate(self.notes, 1)},
         }
-        return "".join([*parts, table(rows)])
+        return "".join([*parts, table_html(rows)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StrehlEstimate:
     """Strehl ratio three ways (paper, lab results): peak, optical transfer function, encircled energy."""
 
-    peak: Measured
-    otf: Measured
-    encircled: Measured
+    peak: Estimate
+    otf: Estimate
+    encircled: Estimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)

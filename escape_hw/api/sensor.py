@@ -9,12 +9,12 @@ from typing import ClassVar, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.brief import brief
+from escape_hw.api.representation import short_repr
 from escape_hw.errors import IncompatibleProduct
 
 #: Spots move and blur by more than their centres of gravity show: what the window and the threshold
 #: cut off, and the turbulence within each lenslet. Found on a twin with known optics (docs/decisions).
-MOTION_FACTOR = 1.2
+SPOT_MOTION_FACTOR = 1.2
 
 
 class SensorGeometry(abc.ABC):
@@ -48,7 +48,7 @@ class SensorGeometry(abc.ABC):
     kind: ClassVar[str]
     slope_unit: ClassVar[str]
     elements: ClassVar[str]
-    short_look: ClassVar[str]
+    short_run_note: ClassVar[str]
 
     valid: NDArray[np.bool_]
     flux: NDArray[np.float32]
@@ -70,7 +70,9 @@ class SensorGeometry(abc.ABC):
         """The geometry with the background level that was subtracted."""
 
     @abc.abstractmethod
-    def with_motion(self, rms: float, pokes: float = 0.0, looks: float = 0.0, steady: float = 0.0) -> Self:
+    def with_slope_statistics(
+        self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0
+    ) -> Self:
         """The geometry with the motion that a measurement saw.
 
         Parameters
@@ -162,7 +164,7 @@ class SubApertureGrid(SensorGeometry):
     kind: ClassVar[str] = "shack-hartmann"
     slope_unit: ClassVar[str] = "pixel"
     elements: ClassVar[str] = "sub-apertures"
-    short_look: ClassVar[str] = (
+    short_run_note: ClassVar[str] = (
         "the references hold the mean focus of {seconds:.2g} s of turbulence, which costs Strehl ratio "
         "and which the wind does not explain; the matrix is not touched by it: close the loop on "
         "references taken over a longer time"
@@ -176,8 +178,8 @@ class SubApertureGrid(SensorGeometry):
     counts: float = 0.0
     motion_px: float = 0.0
     background: float = 0.0
-    air_px: float = 0.0
-    __repr__ = brief
+    turbulence_px: float = 0.0
+    __repr__ = short_repr
 
     def centres_px(self) -> NDArray[np.float64]:
         """Centres ``(n_valid, 2)`` of the valid lenslets as (x, y) in pixels."""
@@ -190,16 +192,20 @@ class SubApertureGrid(SensorGeometry):
         """See :meth:`SensorGeometry.with_background`."""
         return replace(self, background=counts)
 
-    def with_motion(
-        self, rms: float, pokes: float = 0.0, looks: float = 0.0, steady: float = 0.0
+    def with_slope_statistics(
+        self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0
     ) -> SubApertureGrid:
-        """See :meth:`SensorGeometry.with_motion`; the spots move more than the slopes say.
+        """See :meth:`SensorGeometry.with_slope_statistics`; the spots move more than the slopes say.
 
         What is known of the air stays where a measurement tells nothing of it, as in a closed loop, which
         takes away the motion of the spots but not the turbulence within a lenslet.
         """
-        air = MOTION_FACTOR * rms * float(np.sqrt(steady)) if steady else self.air_px
-        return replace(self, motion_px=MOTION_FACTOR * rms, air_px=air)
+        turbulence = (
+            SPOT_MOTION_FACTOR * rms * float(np.sqrt(persistent_fraction))
+            if persistent_fraction
+            else self.turbulence_px
+        )
+        return replace(self, motion_px=SPOT_MOTION_FACTOR * rms, turbulence_px=turbulence)
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> SubApertureGrid:
         """See :meth:`SensorGeometry.with_mean_slopes`: a lattice through the mean spots.
@@ -224,7 +230,7 @@ class SubApertureGrid(SensorGeometry):
 G = TypeVar("G", bound=SensorGeometry)
 
 
-def of_kind(grid: SensorGeometry, kind: type[G]) -> G:
+def require_kind(grid: SensorGeometry, kind: type[G]) -> G:
     """The geometry, for code that works with one kind of sensor only.
 
     Raises

@@ -11,11 +11,11 @@ from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import CalibrationResult
 
 #: Columns of the table, after those of the registration.
-_OTHERS = (
+_LOOP_COLUMNS = (
     "optical_gain", "optical_gain_sigma", "misfit", "surprise", "noise", "mismatch", "residual_nm",
     "strehl", "strehl_sigma", "exchanged",
 )  # fmt: skip
-COLUMNS = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS), *_OTHERS)
+COLUMNS = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS), *_LOOP_COLUMNS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ class TrackResult:
     poke: float = 0.0
     stable: bool = True
     partial: bool = False
-    began_ns: int = 0
+    start_ns: int = 0
 
     def __repr__(self) -> str:
         seconds = self.rows["seconds"][-1] if self.rows["seconds"] else 0.0

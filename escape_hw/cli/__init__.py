@@ -1,4 +1,4 @@
-"""The command line."""
+"""The command line `escape`. Commands parse options, run a procedure or query, and print; the work itself is in escape_hw.runtime."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         except KeyboardInterrupt:
             # Before a command has taken Ctrl-C over nothing is open.
             sys.stderr.write("stopped before anything was opened\n")
-            _leave_at_once(130)
+            _exit_without_teardown(130)
         except SystemExit as ended:
             ended.code = output.verdict(ended.code)
             # Only where the process is ours alone, and somebody has pressed Ctrl-C and waits.
             if arguments is None and ended.code == 130:
-                _leave_at_once(130)
+                _exit_without_teardown(130)
             raise
 
 
-def _leave_at_once(code: int) -> None:
+def _exit_without_teardown(code: int) -> None:
     """End the process without taking the interpreter apart, which takes a second with all loaded.
 
     The devices are closed and the files written; what was registered to happen at exit happens.
@@ -36,7 +36,7 @@ def _leave_at_once(code: int) -> None:
     import logging
     import os
 
-    atexit._run_exitfuncs()  # noqa: SLF001 - the only way to run them now
+    atexit._run_exitfuncs()
     logging.shutdown()
     sys.stdout.flush()
     sys.stderr.flush()

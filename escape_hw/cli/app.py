@@ -8,32 +8,12 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli import (
-    asm,
-    calibrate,
-    camera,
-    discover,
-    dm,
-    doctor,
-    emulate,
-    gains,
-    gui,
-    interchange,
-    keys,
-    loop,
-    modulator,
-    perf,
-    products,
-    rehearse,
-    reproduce,
-    serve,
-    sprint,
-    streams,
-    sweep,
-    systems,
-    track,
-    udev,
-)
+from escape_hw.cli.calibration import calibrate, gains, loop, reproduce, sprint, sweep, track
+from escape_hw.cli.devices import asm, camera, discover, dm, emulate, modulator, with_stand_ins
+from escape_hw.cli.products import inspection as products
+from escape_hw.cli.products import interchange
+from escape_hw.cli.system import configuration as systems
+from escape_hw.cli.system import doctor, gui, keys, perf, serve, streams, udev
 
 app = typer.Typer(
     name="escape",
@@ -72,13 +52,13 @@ app.command("doctor")(doctor.doctor)
 app.command("discover")(discover.discover)
 app.add_typer(udev.app, name="udev")
 app.command("emulate")(emulate.emulate)
-app.command("rehearse")(rehearse.rehearse)
+app.command("rehearse")(with_stand_ins.with_stand_ins)
 app.command("streams")(streams.streams)
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
-        from escape_hw import __version__
+def _version(requested: bool) -> None:
+    if requested:
+        from escape_hw.version import __version__
 
         typer.echo(f"escape {__version__}")
         raise typer.Exit
@@ -104,16 +84,16 @@ def run(arguments: Sequence[str] | None = None) -> None:
     except Exception as error:
         if not hasattr(error, "format_message") or not hasattr(error, "exit_code"):
             raise
-        _tell_usage(error, words)
+        _print_usage_error(error, words)
         code = error.exit_code
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _tell_usage(error: Exception, words: Sequence[str]) -> None:
-    from escape_hw.io.documents import dumps, head
+def _print_usage_error(error: Exception, words: Sequence[str]) -> None:
+    from escape_hw.io.documents import dumps, header_fields
 
     message = str(error.format_message())  # type: ignore[attr-defined]
     typer.echo(f"error: {message}", err=True)
     command = next((word for word in words if not word.startswith("-")), "")
     failure = {"type": "UsageError", "message": message}
-    typer.echo(dumps({**head(command, None, None, None), "error": failure}))
+    typer.echo(dumps({**header_fields(command, None, None, None), "error": failure}))

@@ -22,7 +22,7 @@ Set = Annotated[
 Seed = Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")]
 Mode = Annotated[str | None, typer.Option("--mode", metavar="sim|hardware", help="Twins or real devices.")]
 Matrix = Annotated[Path, typer.Option("--im", metavar="FILE", help="Interaction matrix (FITS).")]
-Pokes = Annotated[
+PokePattern = Annotated[
     str | None, typer.Option("--pokes", help="DO-CRIME: white, shaped or equal-snr (default: configured).")
 ]
 Solver = Annotated[
@@ -31,7 +31,7 @@ Solver = Annotated[
         "--solver", help="SPRINT: effects, light, frozen, batches or diagonal (default: configured)."
     ),
 ]
-Also = Annotated[
+ExtraParameters = Annotated[
     str | None,
     typer.Option(
         "--also", help="What SPRINT fits beside the registration: anamorphosis, pupil_shift (comma between)."
@@ -39,7 +39,7 @@ Also = Annotated[
 ]
 
 
-def listed(names: str | None) -> str | None:
+def as_toml_list(names: str | None) -> str | None:
     """Names with commas between them as a list for an override; ``None`` stays."""
     if names is None:
         return None
@@ -57,7 +57,7 @@ Force = Annotated[bool, typer.Option("--force", help="Allow a simulated matrix o
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class SystemSelection:
     """Which system, and how its configuration is changed."""
 
     system: str
@@ -65,15 +65,19 @@ class Choice:
     seed: int | None = None
     mode: str | None = None
 
-    def plus(self, *overrides: str) -> Choice:
+    def with_overrides(self, *overrides: str) -> SystemSelection:
         """The same with further overrides, which go last."""
         return replace(self, set=(*self.set, *overrides))
 
-    def calibrating(self, **asked: str | None) -> Choice:
+    def with_calibration_settings(self, **asked: str | None) -> SystemSelection:
         """The same with what was asked of the calibration: values by key, ``None`` for as configured."""
-        return self.plus(*(f"calibration.{key}={value}" for key, value in asked.items() if value is not None))
+        return self.with_overrides(
+            *(f"calibration.{key}={value}" for key, value in asked.items() if value is not None)
+        )
 
     @classmethod
-    def of(cls, system: str, overrides: list[str] | None, seed: int | None, mode: str | None) -> Choice:
+    def of(
+        cls, system: str, overrides: list[str] | None, seed: int | None, mode: str | None
+    ) -> SystemSelection:
         """From the options as typer delivers them."""
         return cls(system, tuple(overrides or ()), seed, mode)

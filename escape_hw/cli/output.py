@@ -38,7 +38,7 @@ class Stream:
         self._absent = inner is None
         if inner is None:
             _occupy(descriptor)
-            inner = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - as long as the process
+            inner = open(os.devnull, "w", encoding="utf-8")
         self.inner = inner
 
     def write(self, text: str) -> int:

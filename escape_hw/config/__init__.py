@@ -1,1 +1,1 @@
-"""Configuration of systems: models, files, overrides and the registry of drivers and twins."""
+"""System files: models of their sections, reading and overriding, and the registry of entry points. The bundled systems are in systems/."""

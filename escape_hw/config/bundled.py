@@ -6,7 +6,7 @@ import importlib.resources
 import os
 from pathlib import Path
 
-from escape_hw.config.outline import nearest
+from escape_hw.config.key_tree import closest_match
 from escape_hw.errors import ConfigError
 
 _SUFFIX = ".toml"
@@ -29,8 +29,8 @@ def bundled_text(name: str) -> str:
     """
     known = bundled_systems()
     if name not in known:
-        meant = nearest(name, known)
-        hint = f"did you mean '{meant}'? " if meant else ""
+        suggestion = closest_match(name, known)
+        hint = f"did you mean '{suggestion}'? " if suggestion else ""
         raise ConfigError(
             f"unknown system '{name}' ({hint}bundled systems: {', '.join(known)}; "
             "a file is given by its path, ending in .toml)"

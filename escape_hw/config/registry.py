@@ -1,33 +1,118 @@
-"""Finds drivers, twins, models and emulators by name, through entry points, so that anybody may add one."""
+"""Registry of entry points: device drivers, twins, synthetic models, emulators, simulated benches and the window."""
 
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Callable
+import inspect
+import traceback
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from escape_hw.api.device import Device
-from escape_hw.api.emulator import EmulatorFactory
-from escape_hw.api.model import SyntheticModel
-from escape_hw.api.rehearsal import RehearsalFactory
+from escape_hw.api.emulator import EmulatorFactory, StandInBenchFactory
 from escape_hw.api.sensor import SensorGeometry
-from escape_hw.config.factories import made, require_factory
-from escape_hw.config.models import SystemConfig
-from escape_hw.config.outline import nearest
-from escape_hw.errors import ConfigError
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.config.key_tree import closest_match
+from escape_hw.config.system import SystemConfig
+from escape_hw.errors import ConfigError, EscapeError
+
+T = TypeVar("T")
+
+
+def require_factory(what: str, where: str, factory: object, parameters: Sequence[str]) -> None:
+    """Refuse what cannot be called as a factory is.
+
+    Parameters
+    ----------
+    what, where
+        Of whom it is, and where it was found.
+    factory
+        What was found.
+    parameters
+        What it is called with, in this order.
+
+    Raises
+    ------
+    ConfigError
+        It is not callable, or takes other arguments.
+    """
+    call = f"factory({', '.join(parameters)})"
+    if not callable(factory):
+        raise ConfigError(
+            f"{what} is broken: {where} is not callable (it is of type {type(factory).__name__}); {call} is "
+            "expected"
+        )
+    try:
+        signature = inspect.signature(factory)
+    except (TypeError, ValueError):
+        # Some compiled functions do not tell; calling them will.
+        return
+    try:
+        signature.bind(*parameters)
+    except TypeError as error:
+        raise ConfigError(
+            f"{what} is broken: {where} takes {signature} ({error}); it is called as {call}"
+        ) from error
+
+
+def call_factory(what: str, kind: type[T], factory: Callable[..., object], *arguments: Any) -> T:
+    """What a factory makes, if it is of the right kind.
+
+    Parameters
+    ----------
+    what
+        Of whom it is.
+    kind
+        What it must make.
+    factory, arguments
+        Called with these.
+
+    Raises
+    ------
+    ConfigError
+        It fails, or makes something else.
+    EscapeError
+        The factory's own.
+    """
+    try:
+        one = factory(*arguments)
+    except EscapeError:
+        raise
+    except Exception as error:
+        raise ConfigError(
+            f"{what} cannot be made: {_factory_name(factory)} failed with {type(error).__name__}: {error}"
+            f"{_raised_at(error)}"
+        ) from error
+    if not isinstance(one, kind):
+        raise ConfigError(
+            f"{what} makes a {type(one).__name__}, not a {kind.__name__}; {_factory_name(factory)} must return one"
+        )
+    return one
+
+
+def _factory_name(factory: object) -> str:
+    module, name = (getattr(factory, key, "") for key in ("__module__", "__qualname__"))
+    return f"{module}:{name}" if module and name else repr(factory)
+
+
+def _raised_at(error: Exception) -> str:
+    """Where it was raised, for its author."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+
 
 DEVICES = "escape.devices"
 MODELS = "escape.models"
 EMULATORS = "escape.emulators"
-REHEARSALS = "escape.rehearsals"
+STAND_INS = "escape.stand_ins"
 WINDOWS = "escape.windows"
 _KINDS = {
     DEVICES: "device driver",
     MODELS: "synthetic model",
     EMULATORS: "emulator",
-    REHEARSALS: "rehearsal",
+    STAND_INS: "simulated bench",
     WINDOWS: "window",
 }
 #: What the factories of each group are called with.
@@ -35,11 +120,11 @@ _PARAMETERS = {
     DEVICES: ("name", "config", "shared"),
     MODELS: ("config", "grid"),
     EMULATORS: ("request",),
-    REHEARSALS: ("config",),
+    STAND_INS: ("config",),
     WINDOWS: ("system", "address", "screenshot", "reset_settings"),
 }
 #: What the name of every twin begins with; other drivers drive real hardware.
-TWIN = "sim-"
+TWIN_PREFIX = "sim-"
 
 #: ``factory(name, config, shared) -> device``: the key in ``[devices]``, the whole configuration and
 #: one dictionary per opened system, through which the twins of one bench find each other.
@@ -49,7 +134,7 @@ ModelFactory = Callable[[SystemConfig, SensorGeometry | None], SyntheticModel]
 #: ``run(system, address, screenshot, reset_settings) -> exit code``: shows the window until it is closed.
 WindowRunner = Callable[[str, str, Path | None, bool], int]
 #: Drivers that a script registered for its own process.
-_OWN: dict[str, DeviceFactory] = {}
+_REGISTERED: dict[str, DeviceFactory] = {}
 
 
 def register_device(name: str, factory: DeviceFactory) -> None:
@@ -73,12 +158,12 @@ def register_device(name: str, factory: DeviceFactory) -> None:
     require_factory(f"device driver '{name}'", repr(factory), factory, _PARAMETERS[DEVICES])
     if any(entry.name == name for entry in importlib.metadata.entry_points(group=DEVICES)):
         raise ConfigError(f"device driver '{name}' is offered by an installed package; choose another name")
-    _OWN[name] = factory
+    _REGISTERED[name] = factory
 
 
 def available(group: str) -> tuple[str, ...]:
     """Names registered in a group (:data:`DEVICES`, :data:`MODELS`, :data:`EMULATORS`), sorted."""
-    own = _OWN if group == DEVICES else ()
+    own = _REGISTERED if group == DEVICES else ()
     return tuple(sorted({*own, *(entry.name for entry in importlib.metadata.entry_points(group=group))}))
 
 
@@ -97,7 +182,7 @@ def device_factory(name: str, *, hardware: bool = False) -> DeviceFactory:
     ConfigError
         Unknown name (with the nearest one), or its package is not completely installed.
     """
-    return _OWN[name] if name in _OWN else cast(DeviceFactory, _load(DEVICES, name, hardware))
+    return _REGISTERED[name] if name in _REGISTERED else cast(DeviceFactory, _load(DEVICES, name, hardware))
 
 
 def model_factory(name: str) -> ModelFactory:
@@ -108,7 +193,9 @@ def model_factory(name: str) -> ModelFactory:
     ConfigError
         Unknown name (with the nearest one), its package is not completely installed, or is broken.
     """
-    return cast(ModelFactory, partial(made, f"synthetic model '{name}'", SyntheticModel, _load(MODELS, name)))
+    return cast(
+        ModelFactory, partial(call_factory, f"synthetic model '{name}'", SyntheticModel, _load(MODELS, name))
+    )
 
 
 def emulator_factory(name: str) -> EmulatorFactory:
@@ -122,7 +209,7 @@ def emulator_factory(name: str) -> EmulatorFactory:
     return cast(EmulatorFactory, _load(EMULATORS, name))
 
 
-def rehearsal_factory() -> RehearsalFactory:
+def stand_in_bench_factory() -> StandInBenchFactory:
     """The factory of the simulated bench behind real drivers.
 
     Raises
@@ -130,7 +217,7 @@ def rehearsal_factory() -> RehearsalFactory:
     ConfigError
         The package that holds it is not completely installed.
     """
-    return cast(RehearsalFactory, _load(REHEARSALS, "bench"))
+    return cast(StandInBenchFactory, _load(STAND_INS, "bench"))
 
 
 def window_runner() -> WindowRunner:
@@ -150,7 +237,7 @@ def _load(group: str, name: str, hardware: bool = False) -> Any:
         entry.value: entry for entry in importlib.metadata.entry_points(group=group) if entry.name == name
     }
     if not entries:
-        raise ConfigError(_no_driver(name) if hardware else _unknown(group, name))
+        raise ConfigError(_no_driver_message(name) if hardware else _unknown_name_message(group, name))
     if len(entries) > 1:
         owners = " and ".join(f"{value} ({_package(entry)})" for value, entry in sorted(entries.items()))
         raise ConfigError(f"{kind} '{name}' is offered twice: {owners}; uninstall one of the packages")
@@ -158,7 +245,7 @@ def _load(group: str, name: str, hardware: bool = False) -> Any:
     try:
         factory = entry.load()
     except ImportError as error:
-        raise ConfigError(_missing(kind, entry, error)) from error
+        raise ConfigError(_missing_module_message(kind, entry, error)) from error
     except AttributeError as error:
         raise ConfigError(
             f"{kind} '{name}' of {_package(entry)} is broken: {entry.value} does not exist ({error})"
@@ -167,10 +254,10 @@ def _load(group: str, name: str, hardware: bool = False) -> Any:
     return factory
 
 
-def _unknown(group: str, name: str) -> str:
+def _unknown_name_message(group: str, name: str) -> str:
     known = available(group)
-    meant = nearest(name, known)
-    hint = f"did you mean '{meant}'? " if meant else ""
+    suggestion = closest_match(name, known)
+    hint = f"did you mean '{suggestion}'? " if suggestion else ""
     listing = ", ".join(known) if known else "none: is escape-hw itself installed in this environment?"
     return (
         f"no {_KINDS[group]} '{name}' is installed ({hint}installed: {listing}); "
@@ -178,10 +265,10 @@ def _unknown(group: str, name: str) -> str:
     )
 
 
-def _no_driver(name: str) -> str:
-    real = tuple(driver for driver in available(DEVICES) if not driver.startswith(TWIN))
-    meant = nearest(name, real)
-    hint = f"did you mean '{meant}'? " if meant else ""
+def _no_driver_message(name: str) -> str:
+    real = tuple(driver for driver in available(DEVICES) if not driver.startswith(TWIN_PREFIX))
+    suggestion = closest_match(name, real)
+    hint = f"did you mean '{suggestion}'? " if suggestion else ""
     return (
         f"no driver '{name}' for real hardware is installed ({hint}"
         f"installed: {', '.join(real) if real else 'none, only twins'}); install the package that offers "
@@ -189,7 +276,7 @@ def _no_driver(name: str) -> str:
     )
 
 
-def _missing(kind: str, entry: importlib.metadata.EntryPoint, error: ImportError) -> str:
+def _missing_module_message(kind: str, entry: importlib.metadata.EntryPoint, error: ImportError) -> str:
     package = _package(entry)
     missing = (error.name or "").partition(".")[0]
     if not missing:

@@ -20,7 +20,7 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-class Breach(NamedTuple):
+class RuleViolation(NamedTuple):
     """A rule over several keys that is broken: the key to blame (dotted), its value, what to do."""
 
     key: str
@@ -28,7 +28,7 @@ class Breach(NamedTuple):
     message: str
 
 
-def enforce(breaches: Iterable[Breach]) -> None:
+def raise_violations(violations: Iterable[RuleViolation]) -> None:
     """Raise one error that carries every broken rule; for ``model_validator(mode="after")``.
 
     Raises
@@ -36,15 +36,15 @@ def enforce(breaches: Iterable[Breach]) -> None:
     PydanticCustomError
         When there is any breach.
     """
-    found = list(breaches)
+    found = list(violations)
     if found:
         text = "; ".join(f"{b.key} = {b.value}: {b.message}" for b in found)
         raise PydanticCustomError(RULE_ERROR, "{text}", {"text": text, "breaches": found})
 
 
-def _tuple(value: Any) -> Any:
+def _list_to_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-#: ``Listed[tuple[float, ...]]``: a TOML array that is kept as a tuple, so that sections stay frozen.
-Listed = Annotated[T, BeforeValidator(_tuple)]
+#: ``TomlArray[tuple[float, ...]]``: a TOML array that is kept as a tuple, so that sections stay frozen.
+TomlArray = Annotated[T, BeforeValidator(_list_to_tuple)]

@@ -1,4 +1,4 @@
-"""Results as documents: plain values for ``--json`` and ``result.json``."""
+"""Results as JSON documents for ``--json`` and ``result.json``."""
 
 from __future__ import annotations
 
@@ -11,32 +11,34 @@ from typing import Any
 
 import numpy as np
 
-from escape_hw.api.gains import GainRound, GainsResult
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.optical_gains import GainRound, GainsResult
+from escape_hw.api.registration import PARAMETERS, UNITS
 from escape_hw.api.results import (
     CalibrationResult,
+    Estimate,
     LoopResult,
-    Measured,
     RegistrationEstimate,
     StrehlEstimate,
 )
+from escape_hw.api.tracking import TrackResult
 
 #: Version of the documents' fields.
 SCHEMA = 1
 
 
-def plain(value: Any) -> Any:
+def to_plain_values(value: Any) -> Any:
     """Plain JSON values; NaN and infinity, which JSON does not know, become ``None``."""
-    if isinstance(value, Measured):
-        return plain(value.to_dict())
+    if isinstance(value, Estimate):
+        return to_plain_values(value.to_dict())
     if is_dataclass(value) and not isinstance(value, type):
-        return plain(asdict(value))
+        return to_plain_values(asdict(value))
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_plain_values(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return to_plain_values(value.tolist())
     if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in value]
+        return [to_plain_values(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Path):
@@ -46,10 +48,12 @@ def plain(value: Any) -> Any:
 
 def dumps(document: Mapping[str, Any]) -> str:
     """One strict JSON document (RFC 8259: no NaN)."""
-    return json.dumps(plain(document), indent=2, allow_nan=False, ensure_ascii=False)
+    return json.dumps(to_plain_values(document), indent=2, allow_nan=False, ensure_ascii=False)
 
 
-def head(command: str, system: str | None, simulated: bool | None, seed: int | None) -> dict[str, Any]:
+def header_fields(
+    command: str, system: str | None, simulated: bool | None, seed: int | None
+) -> dict[str, Any]:
     """What every document begins with; ``None`` where a command concerns no system."""
     return {
         "schema": SCHEMA,
@@ -108,8 +112,8 @@ def strehl_document(strehl: StrehlEstimate | None) -> dict[str, Any] | None:
     """The Strehl ratio three ways; ``None`` where it was not measured."""
     if strehl is None:
         return None
-    ways = {"peak": strehl.peak, "otf": strehl.otf, "encircled": strehl.encircled}
-    return {name: {"value": one.value, "sigma": one.sigma} for name, one in ways.items()}
+    methods = {"peak": strehl.peak, "otf": strehl.otf, "encircled": strehl.encircled}
+    return {name: {"value": one.value, "sigma": one.sigma} for name, one in methods.items()}
 
 
 def loop_document(result: LoopResult) -> dict[str, Any]:
@@ -169,4 +173,36 @@ def _round_document(one: GainRound) -> dict[str, Any]:
         "residual_nm": one.residual_nm,
         "strehl_loss": one.strehl_loss,
         "strehl": strehl_document(one.strehl),
+    }
+
+
+#: Rows that a document holds at most; the table beside it has all.
+_MAX_ROWS = 2000
+
+
+def track_document(result: TrackResult) -> dict[str, Any]:
+    """What ``escape track --json`` says beside the head and the tail."""
+    n = len(result.rows["seconds"])
+    stride = max(1, -(-n // _MAX_ROWS))
+    residual, strehl = result.column("residual_nm"), result.column("strehl")
+    return {
+        "seconds": result.rows["seconds"][-1] if n else 0.0,
+        "frames": result.frames,
+        "lost_frames": result.lost_frames,
+        "rate_hz": result.rate_hz,
+        "poke": result.poke,
+        "stable": result.stable,
+        "partial": result.partial,
+        "registration": {
+            name: {"value": column[-1], "sigma": result.rows[f"{name}_sigma"][-1], "unit": UNITS[name]}
+            for name, column in result.rows.items()
+            if name in PARAMETERS and n
+        },
+        "optical_gain": result.optical_gain,
+        "optical_gain_sigma": result.optical_gain_sigma,
+        "residual_rms_nm": float(np.sqrt(np.nanmean(np.square(residual)))) if n else None,
+        "strehl": float(np.nanmean(strehl)) if np.isfinite(strehl).any() else None,
+        "exchanges": [asdict(one) for one in result.exchanges],
+        "alarms": [asdict(one) for one in result.alarms],
+        "track": {name: column[::stride] for name, column in result.rows.items()},
     }

@@ -10,8 +10,8 @@ from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 
-import escape_hw
 import escape_hw.errors
+from escape_hw.version import __version__
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,40 +42,40 @@ class Provenance:
     started: datetime | None = None
 
 
-def utc_text(moment: datetime | None = None) -> str:
+def format_utc(moment: datetime | None = None) -> str:
     """A time as FITS writes it, in UTC to the millisecond; now when none is given."""
     moment = datetime.now(UTC) if moment is None else moment.astimezone(UTC)
     return moment.replace(tzinfo=None).isoformat(timespec="milliseconds")
 
 
-def sha256_of(path: Path) -> str:
+def file_sha256(path: Path) -> str:
     """SHA-256 of a file in hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def software_version() -> str:
+def get_software_version() -> str:
     """Version of this package."""
-    return escape_hw.__version__
+    return __version__
 
 
 @cache
-def git_state() -> str:
+def get_git_state() -> str:
     """Commit of the checkout this code runs from, with ``+changes`` when it was edited.
 
     ``unknown`` when the code does not run from a git checkout; never fails.
     """
-    home = Path(escape_hw.errors.__file__).resolve().parent
-    commit = _git(home, "rev-parse", "--short=12", "HEAD")
+    package_folder = Path(escape_hw.errors.__file__).resolve().parent
+    commit = _run_git(package_folder, "rev-parse", "--short=12", "HEAD")
     # A site-packages folder may lie inside somebody else's repository: ask git whether it owns us.
-    owned = _git(home, "ls-files", "--error-unmatch", "errors.py")
-    if not commit or not owned:
+    is_tracked = _run_git(package_folder, "ls-files", "--error-unmatch", "errors.py")
+    if not commit or not is_tracked:
         return "unknown"
-    changes = _git(home, "status", "--porcelain", "--untracked-files=no")
+    changes = _run_git(package_folder, "status", "--porcelain", "--untracked-files=no")
     return commit + ("+changes" if changes else "")
 
 
-def _git(folder: Path, *arguments: str) -> str:
+def _run_git(folder: Path, *arguments: str) -> str:
     try:
         answer = subprocess.run(
             ["git", "-C", str(folder), *arguments],

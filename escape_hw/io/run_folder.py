@@ -15,17 +15,17 @@ import platformdirs
 
 from escape_hw.errors import EscapeError, ProductError
 from escape_hw.io.documents import dumps
-from escape_hw.io.provenance import git_state, software_version
+from escape_hw.io.provenance import get_git_state, get_software_version
 from escape_hw.io.storage import check_writable, make_folder, storage_error, write_atomic
 
 #: Room asked for before a run begins, in bytes; a run's products are a few megabytes.
-NEED_BYTES = 50_000_000
-LOG = "run.log"
+MIN_FREE_BYTES = 50_000_000
+LOG_FILE = "run.log"
 
 log = logging.getLogger(__name__)
 
 
-def default_base() -> Path:
+def default_runs_folder() -> Path:
     """Where runs go unless told otherwise: ``runs`` in the user's data directory."""
     return Path(platformdirs.user_data_dir("escape", appauthor=False)) / "runs"
 
@@ -38,7 +38,7 @@ class RunFolder:
     system, kind
         Name of the system and of what is done; both become part of the folder's name.
     out
-        The folder itself; ``None`` makes a new dated one under :func:`default_base`. A folder that
+        The folder itself; ``None`` makes a new dated one under :func:`default_runs_folder`. A folder that
         already holds a run is left alone and a sibling with a number is made.
 
     Attributes
@@ -59,19 +59,19 @@ class RunFolder:
         if out is None:
             # Local time: these names are for people. Headers and result.json carry UTC.
             now = datetime.now().astimezone()
-            name = f"{now:%H%M%S}_{_safe(system)}_{_safe(kind)}"
-            wanted = default_base() / f"{now:%Y-%m-%d}" / name
+            name = f"{now:%H%M%S}_{_sanitise_name(system)}_{_sanitise_name(kind)}"
+            requested = default_runs_folder() / f"{now:%Y-%m-%d}" / name
         else:
-            wanted = Path(out).expanduser().absolute()
-        self.path = _claim(wanted)
-        self.asked = wanted if out is not None and self.path != wanted else None
+            requested = Path(out).expanduser().absolute()
+        self.path = _create_unique_folder(requested)
+        self.requested_path = requested if out is not None and self.path != requested else None
         self.products: dict[str, Path] = {}
         self._handler: logging.Handler | None = None
-        check_writable(self.path, NEED_BYTES)
+        check_writable(self.path, MIN_FREE_BYTES)
 
     def __enter__(self) -> Self:
         """Start the log."""
-        path = self.path / LOG
+        path = self.path / LOG_FILE
         try:
             handler = logging.FileHandler(path, encoding="utf-8")
         except OSError as error:
@@ -84,7 +84,7 @@ class RunFolder:
         for name in ("escape_hw", "escape_sim", "escape_drivers"):
             logging.getLogger(name).addHandler(handler)
         self._handler = handler
-        log.info("%s on %s, ESCAPE %s (%s)", self.kind, self.system, software_version(), git_state())
+        log.info("%s on %s, ESCAPE %s (%s)", self.kind, self.system, get_software_version(), get_git_state())
         return self
 
     def __exit__(
@@ -102,15 +102,18 @@ class RunFolder:
             self._handler.close()
             self._handler = None
 
-    def place(self) -> dict[str, Any]:
+    def location_fields(self) -> dict[str, Any]:
         """For documents: the folder used, and the one asked for when that is another."""
-        return {"folder": str(self.path), "folder_asked": None if self.asked is None else str(self.asked)}
+        return {
+            "folder": str(self.path),
+            "folder_asked": None if self.requested_path is None else str(self.requested_path),
+        }
 
     def file(self, name: str) -> Path:
         """Path of a file in this folder."""
         return self.path / name
 
-    def add(self, name: str, path: Path) -> Path:
+    def add_product(self, name: str, path: Path) -> Path:
         """Remember a product under a name that ``result.json`` lists."""
         self.products[name] = path
         log.info("product %s: %s", name, path)
@@ -162,24 +165,24 @@ def read_result(folder: Path | str) -> dict[str, Any]:
     return document
 
 
-def _safe(text: str) -> str:
+def _sanitise_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-.") or "run"
 
 
-def _claim(wanted: Path) -> Path:
+def _create_unique_folder(requested: Path) -> Path:
     """Make the folder, or the first free sibling when it already holds a run (safe between processes)."""
-    make_folder(wanted.parent)
+    make_folder(requested.parent)
     for number in range(1, 10_000):
-        path = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
+        path = requested if number == 1 else requested.with_name(f"{requested.name}-{number}")
         try:
             path.mkdir(exist_ok=True)
             if any(path.iterdir()):
                 continue
             # Only one of several that find the folder empty can create the log.
-            (path / LOG).touch(exist_ok=False)
+            (path / LOG_FILE).touch(exist_ok=False)
         except FileExistsError:
             continue
         except OSError as error:
             raise storage_error(path, error) from error
         return path
-    raise storage_error(wanted, FileExistsError(17, "too many folders of that name"))
+    raise storage_error(requested, FileExistsError(17, "too many folders of that name"))

@@ -14,7 +14,7 @@ from escape_hw.errors import StorageError
 #: Room to leave on the disk beside the file itself, in bytes.
 MARGIN_BYTES = 1 << 20
 
-_WAYS_OUT = {
+_REMEDIES = {
     errno.ENOSPC: "free some space or choose another folder with --out",
     errno.EDQUOT: "your quota is used up; free some space or choose another folder with --out",
     errno.EFBIG: "files of this size are not allowed here; choose another folder with --out",
@@ -28,8 +28,8 @@ _WAYS_OUT = {
 
 def storage_error(path: Path, error: OSError) -> StorageError:
     """Put an operating-system error into words that name the path and the way out."""
-    way_out = _WAYS_OUT.get(error.errno or 0, "check the disk or choose another folder with --out")
-    return StorageError(f"{path}: cannot be written ({error.strerror or error}); {way_out}")
+    remedy = _REMEDIES.get(error.errno or 0, "check the disk or choose another folder with --out")
+    return StorageError(f"{path}: cannot be written ({error.strerror or error}); {remedy}")
 
 
 def make_folder(folder: Path) -> None:

@@ -1,1 +1,1 @@
-"""From camera frame to mirror command: pure functions on arrays."""
+"""Pure functions from camera frame to mirror command, and Strehl ratios of science frames. Procedures that move hardware are in escape_hw.calibration."""

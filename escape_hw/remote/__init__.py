@@ -1,1 +1,1 @@
-"""What a running server and those who look at it say to each other: state, requests, events, client."""
+"""The client side of a server: connection, requests, state documents, addresses and keys. The server itself is in escape_hw.server."""

@@ -33,7 +33,7 @@ class Endpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Listing:
+class ServerListing:
     """A server on this machine.
 
     Parameters
@@ -89,7 +89,7 @@ def local_endpoint(system: str, pid: int) -> Endpoint:
     return Endpoint(f"ipc://{base}.req", f"ipc://{base}.pub")
 
 
-def list_server(listing: Listing) -> Path:
+def register_server(listing: ServerListing) -> Path:
     """Write down that a server listens; readable for this user only.
 
     Raises
@@ -103,9 +103,9 @@ def list_server(listing: Listing) -> Path:
     return path
 
 
-def unlist_server(listing: Listing) -> None:
+def unregister_server(listing: ServerListing) -> None:
     """Take a server's listing and sockets away, if they are still its own."""
-    if find_listing(listing.system) == listing:
+    if find_server(listing.system) == listing:
         (runtime_folder() / f"{listing.system}.json").unlink(missing_ok=True)
     for address in (listing.requests, listing.events):
         path = Path(address.removeprefix("ipc://"))
@@ -115,17 +115,17 @@ def unlist_server(listing: Listing) -> None:
                 path.parent.rmdir()
 
 
-def find_listing(system: str) -> Listing | None:
+def find_server(system: str) -> ServerListing | None:
     """What is written down of a system's server, be it alive or dead."""
     try:
-        return Listing(**json.loads((runtime_folder() / f"{system}.json").read_bytes()))
+        return ServerListing(**json.loads((runtime_folder() / f"{system}.json").read_bytes()))
     except (OSError, ValueError, TypeError):
         return None
 
 
-def servers() -> tuple[Listing, ...]:
+def running_servers() -> tuple[ServerListing, ...]:
     """The servers of this user that live on this machine."""
-    found = (find_listing(path.stem) for path in sorted(runtime_folder().glob("*.json")))
+    found = (find_server(path.stem) for path in sorted(runtime_folder().glob("*.json")))
     return tuple(one for one in found if one is not None and one.alive)
 
 
@@ -159,9 +159,9 @@ def resolve(name: str) -> Endpoint:
         if match is None or not 0 < int(match["port"]) < 65535:
             raise ConfigError(f"{name!r} is no address; write tcp://HOST:PORT, or the name of a system")
         return tcp_endpoint(match["host"], int(match["port"]))
-    listing = find_listing(name)
+    listing = find_server(name)
     if listing is None or not listing.alive:
-        running = ", ".join(one.system for one in servers()) or "none"
+        running = ", ".join(one.system for one in running_servers()) or "none"
         raise ServerGone(
             f"no server of '{name}' runs here (running: {running}); start one with 'escape serve {name}'"
         )

@@ -1,20 +1,398 @@
-"""The client: what scripts, notebooks and screens hold in hand."""
+"""Connection to a server: state, streams, log, control, and runs started through it."""
 
 from __future__ import annotations
 
+import os
+import re
+import socket
+import sys
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
-from escape_hw.errors import ServerGone
+import numpy as np
+
+from escape_hw.api.procedure import Progress
+from escape_hw.errors import Aborted, CalibrationError, ClientUnknown, EscapeError, ServerGone
 from escape_hw.remote import requests as ask
-from escape_hw.remote.address import resolve
+from escape_hw.remote.address import Endpoint, resolve
 from escape_hw.remote.keys import client_keys, keys_hint
-from escape_hw.remote.run import Run
-from escape_hw.remote.state import Lease, Product
-from escape_hw.remote.viewer import SLOW_S, Viewer
+from escape_hw.remote.source import Sample
+from escape_hw.remote.state import (
+    SCHEMA,
+    ActiveRun,
+    Arguments,
+    Finish,
+    FinishedRun,
+    Geometry,
+    Lease,
+    LogLine,
+    Phase,
+    ProcedureEntry,
+    ProcedurePlan,
+    ProductEntry,
+    State,
+)
+from escape_hw.remote.transport import ClientTransport
+from escape_hw.streams.ring import ReaderCache
+
+#: A server that was not heard of for so long does not come back with a result.
+_SERVER_TIMEOUT_S = 15.0
 
 
-class Connection(Viewer):
+class RemoteRun:
+    """A run on a server.
+
+    Parameters
+    ----------
+    connection
+        To the server.
+    id
+        Its number there.
+    name
+        The procedure.
+    """
+
+    def __init__(self, connection: ReadOnlyConnection, id: int, name: str) -> None:
+        self._connection, self.id, self.name = connection, id, name
+
+    def __repr__(self) -> str:
+        ended = self.ended
+        return f"<run {self.id}: {self.name}, {'running' if ended is None else ended.finish.value}>"
+
+    @property
+    def ended(self) -> FinishedRun | None:
+        """How it ended; ``None`` while it runs."""
+        return self._connection.wait_for(self.id, 0.0)
+
+    @property
+    def running(self) -> ActiveRun | None:
+        """How far it is; ``None`` when it has ended."""
+        running = self._connection.state.procedure
+        return running if running is not None and running.id == self.id else None
+
+    def wait(self, timeout_s: float | None = None, progress: bool = False) -> Any:
+        """Wait for the end and load the result.
+
+        Parameters
+        ----------
+        timeout_s
+            Longest wait; for ever by default.
+        progress
+            Show a bar with the time left, in a terminal or a notebook.
+
+        Returns
+        -------
+        CalibrationResult, LoopResult, GainsResult or dict
+            What the procedure returns on the command line's side; the run's document where it has no
+            product that this machine can read.
+
+        Raises
+        ------
+        Aborted
+            It was aborted; ``partial`` holds what was measured, if anything.
+        CalibrationError
+            It failed; the message says why.
+        TimeoutError
+            It goes on.
+        ServerGone
+            Its server was not heard of any more.
+        """
+        from rich.console import Console
+
+        from escape_hw.runtime.display.progress import ProgressView
+
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        last_message_s = time.monotonic()
+        with ProgressView(Console(file=sys.stderr)) if progress else nullcontext() as view:
+            while (ended := self._connection.wait_for(self.id, 0.2)) is None:
+                now = time.monotonic()
+                last_message_s = now if self._connection.connected else last_message_s
+                if now - last_message_s > _SERVER_TIMEOUT_S:
+                    raise ServerGone(
+                        f"run {self.id}: its server has not been heard of for {now - last_message_s:.0f} s"
+                    )
+                if deadline is not None and now > deadline:
+                    raise TimeoutError(f"run {self.id} ({self.name}) goes on")
+                self._require_engine()
+                if view is not None and (running := self.running) is not None:
+                    view(_progress(running))
+        return self._result(ended)
+
+    def _require_engine(self) -> None:
+        """A run ends with its engine, without another word."""
+        state = self._connection.state
+        if state.procedure is not None or state.fault is None or state.engine_pid:
+            return
+        if self._connection.wait_for(self.id, 0.0) is None:
+            raise CalibrationError(f"run {self.id} ({self.name}) ended with its engine: {state.fault.reason}")
+
+    def _result(self, ended: FinishedRun) -> Any:
+        if ended.finish is Finish.FAILED:
+            raise CalibrationError(f"run {self.id} ({self.name}): {ended.message}")
+        result = load_result(ended)
+        if ended.finish is Finish.ABORTED:
+            raise Aborted(f"run {self.id} ({self.name}): {ended.message}", result)
+        return result
+
+
+def load_result(ended: FinishedRun) -> Any:
+    """The result of a run from its product, or its document where there is none that can be read here."""
+    from escape_hw.io.fits.gains import load_gains
+    from escape_hw.io.fits.loop import load_loop
+    from escape_hw.io.fits.matrix import load_matrix
+
+    loaders = {"gains": load_gains, "loop": load_loop, "im": load_matrix}
+    for key, load in loaders.items():
+        path = ended.products.get(key)
+        if path is not None and Path(path).is_file():
+            return load(path).result  # type: ignore[attr-defined]
+    return ended.document or None
+
+
+def _progress(running: ActiveRun) -> Progress:
+    return Progress(
+        running.stage, running.done, running.total, running.unit, running.elapsed_s, running.metrics
+    )
+
+
+#: Longest wait for an ordinary answer, and for one that comes when a mirror is flat, seconds.
+TIMEOUT_S, SLOW_TIMEOUT_S = 3.0, 30.0
+#: A server that tells its state five times a second and was not heard of for so long is gone.
+_STALE_S = 2.0
+_LINES = 5000
+#: Longest wait for the event that belongs to an answer, seconds.
+_EVENT_S = 10.0
+
+
+class ReadOnlyConnection:
+    """Looks at a server; satisfies :class:`~escape_hw.remote.source.Source`.
+
+    Parameters
+    ----------
+    endpoint
+        Where the server listens.
+    name
+        Who this is, for the other clients.
+    keys
+        Keys for a server on another machine.
+
+    Attributes
+    ----------
+    client
+        This client's number, as in ``state.lease.client``.
+
+    Raises
+    ------
+    ServerGone
+        Nobody answers.
+    RequestRefused
+        The server is of another version.
+    """
+
+    def __init__(
+        self, endpoint: Endpoint, name: str = "", keys: tuple[bytes, bytes, bytes] | None = None
+    ) -> None:
+        self.client = str(uuid.uuid4())
+        self._name = name or _program()
+        self._closed = self._registered = False
+        self._changed = threading.Condition()
+        self._state = State()
+        self._log: deque[LogLine] = deque(maxlen=_LINES)
+        self._ended: dict[int, FinishedRun] = {}
+        self._geometry: tuple[object, Geometry] | None = None
+        self._procedures: tuple[ProcedureEntry, ...] | None = None
+        self._readers = ReaderCache()
+        self._is_local = endpoint.requests.startswith("ipc://")
+        self._link = ClientTransport(endpoint, self._event, self._heartbeat, keys=keys)
+        try:
+            self._register()
+        except EscapeError:
+            self.close()
+            raise
+
+    def _register(self) -> None:
+        answer, _, _ = self._link.ask(self._registration(), TIMEOUT_S)
+        self._registered = True
+        with self._changed:
+            self._state = State.model_validate(answer)
+        lines, _ = self._ask(ask.GetLog(client=self.client, count=1000))
+        with self._changed:
+            known = {line.number for line in self._log}
+            old = [LogLine.model_validate(line) for line in lines if line["number"] not in known]
+            self._log = deque(sorted((*old, *self._log), key=lambda line: line.number), maxlen=_LINES)
+
+    def _registration(self) -> Mapping[str, Any]:
+        name, host = (re.sub(r"[^\w .+@:-]", "-", text)[:80] for text in (self._name, socket.gethostname()))
+        hello = ask.RegisterClient(
+            client=self.client, schema_version=SCHEMA, name=name, host=host, pid=os.getpid()
+        )
+        return hello.model_dump(mode="json")
+
+    # ------------------------------------------------------------ life
+    def close(self) -> None:
+        """Hang up; the server goes on."""
+        if self._closed:
+            return
+        self._closed = True
+        self._link.close()
+        self._readers.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        state = self.state
+        return f"<Connection to {state.system}, {state.phase.value}, {'alive' if self.connected else 'gone'}>"
+
+    def _repr_html_(self) -> str:
+        from escape_hw.remote.html import state_html
+
+        return state_html(self.state)
+
+    def _heartbeat(self, refused: bool) -> Mapping[str, Any] | None:
+        if not self._registered:
+            return None
+        # Who was halted for long has been forgotten.
+        return self._registration() if refused else {"verb": "heartbeat", "client": self.client}
+
+    def _ask(self, request: ask.Request, timeout_s: float = TIMEOUT_S) -> tuple[Any, bytes]:
+        document = request.model_dump(mode="json")
+        try:
+            answer, data, serial = self._link.ask(document, timeout_s)
+        except ClientUnknown:
+            self._register()
+            answer, data, serial = self._link.ask(document, timeout_s)
+        if isinstance(request, ask.STATE_CHANGING_REQUESTS):
+            # Events come another way than answers: who looks at the state next finds what was done.
+            with self._changed:
+                self._changed.wait_for(lambda: self._state.serial >= serial, _EVENT_S)
+        return answer, data
+
+    def _event(self, topic: str, document: dict[str, Any]) -> None:
+        with self._changed:
+            if topic == "state":
+                self._state = State.model_validate(document)
+            elif topic == "log":
+                line = LogLine.model_validate(document)
+                if not self._log or line.number > self._log[-1].number:
+                    self._log.append(line)
+            elif topic == "progress":
+                running = ActiveRun.model_validate(document)
+                self._state = self._state.model_copy(update={"procedure": running})
+            elif topic == "ended":
+                ended = FinishedRun.model_validate(document)
+                self._ended[ended.id] = ended
+            self._changed.notify_all()
+
+    # ------------------------------------------------------------ to look
+    @property
+    def connected(self) -> bool:
+        """Whether the server was heard of lately."""
+        return not self._closed and time.monotonic() - self._link.last_message_s < _STALE_S
+
+    @property
+    def state(self) -> State:
+        """The newest state."""
+        return self._state
+
+    @property
+    def holds_lease(self) -> bool:
+        """Whether this client may write, as far as it knows."""
+        lease = self._state.lease
+        return lease is not None and lease.client == self.client
+
+    def latest(self, stream: str, after: int = -1) -> Sample | None:
+        """The newest entry of a stream, or ``None`` when there is none newer than ``after``."""
+        if not self._is_local:
+            return self._latest_over_network(stream, after)
+        segment = next((one.segment for one in self._state.streams if one.name == stream), None)
+        reader = self._readers.reader(stream, segment)
+        return None if reader is None else reader.latest(after)
+
+    def _latest_over_network(self, stream: str, after: int) -> Sample | None:
+        try:
+            head, data = self._ask(
+                ask.build_request(ask.GetLatestSample, client=self.client, stream=stream, after=after)
+            )
+        except ServerGone:
+            return None
+        if head is None:
+            return None
+        array = np.frombuffer(data, np.dtype(head["dtype"])).reshape(head["shape"])
+        return Sample(head["index"], head["exposed_ns"], head["arrived_ns"], array, head["meta"])
+
+    def geometry(self) -> Geometry:
+        """Where slopes and actuators stand; asked for again when the state says that it changed."""
+        state = self._state
+        key = (state.engine_pid, state.phase is Phase.STARTING, state.geometries)
+        known = self._geometry
+        if known is None or known[0] != key:
+            try:
+                answer, _ = self._ask(ask.GetGeometry(client=self.client))
+            except EscapeError:
+                return Geometry() if known is None else known[1]
+            known = self._geometry = (key, Geometry.model_validate(answer))
+        return known[1]
+
+    def log_after(self, number: int) -> Sequence[LogLine]:
+        """Log lines after a number."""
+        with self._changed:
+            return [line for line in self._log if line.number > number]
+
+    def procedures(self) -> Sequence[ProcedureEntry]:
+        """What can be started."""
+        if self._procedures is None:
+            answer, _ = self._ask(ask.GetProcedures(client=self.client), SLOW_TIMEOUT_S)
+            self._procedures = tuple(ProcedureEntry.model_validate(entry) for entry in answer)
+        return self._procedures
+
+    def check(self, procedure: str, arguments: Arguments | None = None) -> ProcedurePlan:
+        """What a procedure would do; nothing moves.
+
+        Raises
+        ------
+        ConfigError
+            An argument is wrong; says which and the way out.
+        """
+        request = ask.build_request(
+            ask.PlanProcedure, client=self.client, procedure=procedure, arguments=arguments or {}
+        )
+        answer, _ = self._ask(request, SLOW_TIMEOUT_S)
+        return ProcedurePlan.model_validate(answer)
+
+    def wait_for(self, run: int, timeout_s: float) -> FinishedRun | None:
+        """How a run ended, or ``None`` when it goes on; waits for news at most so long."""
+        with self._changed:
+            found = self._finished_run(run)
+            if found is None:
+                self._changed.wait(timeout_s)
+                found = self._finished_run(run)
+            return found
+
+    def _finished_run(self, run: int) -> FinishedRun | None:
+        last = self._state.last
+        return last if last is not None and last.id == run else self._ended.get(run)
+
+
+def _program() -> str:
+    """What other clients call this one: its script, or that it is a notebook."""
+    name = os.path.basename(sys.argv[0])
+    return "notebook" if name.startswith("ipykernel") else name or "python"
+
+
+class Connection(ReadOnlyConnection):
     """A connection to a server, see :func:`connect`: looks and, with the right to write, acts."""
 
     def close(self) -> None:
@@ -32,20 +410,20 @@ class Connection(Viewer):
         LeaseHeld
             Somebody else has it; says who.
         """
-        answer, _ = self._ask(ask.made(ask.Acquire, client=self.client, take_over=take_over))
+        answer, _ = self._ask(ask.build_request(ask.AcquireLease, client=self.client, take_over=take_over))
         lease = Lease.model_validate(answer)
-        self._became_holder(lease)
+        self._set_lease(lease)
         return lease
 
     def release(self) -> None:
         """Give the right to write back; does nothing when the server has gone."""
         try:
-            self._ask(ask.Release(client=self.client), 1.0)
+            self._ask(ask.ReleaseLease(client=self.client), 1.0)
         except ServerGone:
             return
-        self._became_holder(None)
+        self._set_lease(None)
 
-    def _became_holder(self, lease: Lease | None) -> None:
+    def _set_lease(self, lease: Lease | None) -> None:
         """Know it at once, not with the next state."""
         with self._changed:
             self._state = self._state.model_copy(update={"lease": lease})
@@ -53,18 +431,18 @@ class Connection(Viewer):
     # ------------------------------------------------------------ safety
     def open_loop(self) -> None:
         """Open the loop; returns when the mirror is flat. Anybody may."""
-        self._ask(ask.OpenLoop(client=self.client), SLOW_S)
+        self._ask(ask.OpenLoop(client=self.client), SLOW_TIMEOUT_S)
 
     def flatten(self) -> None:
         """Abort what runs, open the loop; returns when the mirror is flat. Anybody may."""
-        self._ask(ask.Flatten(client=self.client), SLOW_S)
+        self._ask(ask.Flatten(client=self.client), SLOW_TIMEOUT_S)
 
     def abort(self) -> None:
         """Stop the procedure, keeping what it measured; returns when the mirror is flat. Anybody may."""
-        self._ask(ask.Abort(client=self.client), SLOW_S)
+        self._ask(ask.AbortProcedure(client=self.client), SLOW_TIMEOUT_S)
 
     # ------------------------------------------------------------ to write
-    def start(self, procedure: str, **arguments: float | int | bool | str | None) -> Run:
+    def start(self, procedure: str, **arguments: float | int | bool | str | None) -> RemoteRun:
         """Start a procedure.
 
         Raises
@@ -76,9 +454,11 @@ class Connection(Viewer):
         RequestRefused
             Something else is going on.
         """
-        request = ask.made(ask.Start, client=self.client, procedure=procedure, arguments=arguments)
-        number, _ = self._ask(request, SLOW_S)
-        return Run(self, int(number), procedure)
+        request = ask.build_request(
+            ask.StartProcedure, client=self.client, procedure=procedure, arguments=arguments
+        )
+        number, _ = self._ask(request, SLOW_TIMEOUT_S)
+        return RemoteRun(self, int(number), procedure)
 
     def calibrate(self, method: str = "escape", *, progress: bool = False, **arguments: Any) -> Any:
         """Calibrate and wait for the result; arguments as for :meth:`start`."""
@@ -86,11 +466,11 @@ class Connection(Viewer):
 
     def pause(self) -> None:
         """Halt the running procedure between two steps, mirror flat."""
-        self._ask(ask.Pause(client=self.client))
+        self._ask(ask.PauseProcedure(client=self.client))
 
     def resume(self) -> None:
         """Go on with a halted procedure."""
-        self._ask(ask.Resume(client=self.client))
+        self._ask(ask.ResumeProcedure(client=self.client))
 
     def close_loop(
         self,
@@ -100,7 +480,7 @@ class Connection(Viewer):
         dropped_modes: int | None = None,
     ) -> None:
         """Close the loop on a matrix that the server holds, until it is opened."""
-        request = ask.made(
+        request = ask.build_request(
             ask.CloseLoop,
             client=self.client,
             matrix=matrix,
@@ -108,7 +488,7 @@ class Connection(Viewer):
             leak=leak,
             dropped_modes=dropped_modes,
         )  # fmt: skip
-        self._ask(request, SLOW_S)
+        self._ask(request, SLOW_TIMEOUT_S)
 
     def set_loop(
         self,
@@ -118,25 +498,25 @@ class Connection(Viewer):
         dropped_modes: int | None = None,
     ) -> None:
         """Other parameters for the loop, closed or not; what is absent stays."""
-        request = ask.made(
+        request = ask.build_request(
             ask.SetLoop, client=self.client, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
         )
-        self._ask(request, SLOW_S)
+        self._ask(request, SLOW_TIMEOUT_S)
 
-    def load_product(self, path: str | Path, name: str | None = None) -> Product:
+    def load_product(self, path: str | Path, name: str | None = None) -> ProductEntry:
         """Load a FITS product into the engine, under its file's name by default."""
         answer, _ = self._ask(
-            ask.made(ask.LoadProduct, client=self.client, path=str(path), name=name), SLOW_S
+            ask.build_request(ask.LoadProduct, client=self.client, path=str(path), name=name), SLOW_TIMEOUT_S
         )
-        return Product.model_validate(answer)
+        return ProductEntry.model_validate(answer)
 
     def record(self, on: bool) -> None:
         """Begin or end recording telemetry at full rate."""
-        self._ask(ask.made(ask.Record, client=self.client, on=on), SLOW_S)
+        self._ask(ask.build_request(ask.SetRecording, client=self.client, on=on), SLOW_TIMEOUT_S)
 
     def clear_fault(self) -> None:
         """End a fault's latch; closed devices are opened again."""
-        self._ask(ask.ClearFault(client=self.client), SLOW_S)
+        self._ask(ask.ClearFault(client=self.client), SLOW_TIMEOUT_S)
 
     def shutdown(self) -> None:
         """Make the mirror safe and end the server."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from escape_hw.api.thumbnail import table
-from escape_hw.remote.state import Plan, ProcedureEntry, State
+from escape_hw.api.representation import table_html
+from escape_hw.remote.state import ProcedureEntry, ProcedurePlan, State
 
 
 def state_html(state: State) -> str:
@@ -26,21 +26,21 @@ def state_html(state: State) -> str:
     rows["may write"] = "nobody" if lease is None else f"{lease.name} on {lease.host}"
     rows["devices"] = ", ".join(f"{one.name} {one.health.value}" for one in state.devices)
     rows["server"] = f"process {state.server_pid}, ESCAPE {state.version}"
-    return table(rows, "Server")
+    return table_html(rows, "Server")
 
 
-def plan_html(plan: Plan) -> str:
+def plan_html(plan: ProcedurePlan) -> str:
     """What a procedure would do."""
-    said = {key: value for key, value in plan.arguments.items() if value is not None}
+    given = {key: value for key, value in plan.arguments.items() if value is not None}
     rows: dict[str, object] = {
         "frames": plan.frames,
         "at the camera's rate": f"{plan.seconds:.1f} s",
         "largest poke": f"{100 * plan.stroke:.3g} % of the stroke" if plan.stroke else "none",
-        "arguments": ", ".join(f"{key} {value}" for key, value in said.items()),
+        "arguments": ", ".join(f"{key} {value}" for key, value in given.items()),
     }
     if plan.warnings:
         rows["mind"] = "; ".join(plan.warnings)
-    return table(rows, f"Plan of {plan.name}")
+    return table_html(rows, f"Plan of {plan.name}")
 
 
 def procedure_html(entry: ProcedureEntry) -> str:
@@ -49,4 +49,4 @@ def procedure_html(entry: ProcedureEntry) -> str:
         one.name: f"{one.help} {'' if one.default is None else f'Default: {one.default} {one.unit}'}".strip()
         for one in entry.parameters
     }
-    return table(rows, f"{entry.name}: {entry.help}")
+    return table_html(rows, f"{entry.name}: {entry.help}")

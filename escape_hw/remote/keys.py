@@ -68,7 +68,7 @@ def own_keys() -> KeyPair | None:
     try:
         if path.stat().st_mode & 0o077:
             raise StorageError(f"{path}: others may read it; make new keys with 'escape keys make --replace'")
-        return KeyPair(_checked(_read(keys_folder() / "own.public")), _checked(_read(path)))
+        return KeyPair(_check_key(_read(keys_folder() / "own.public")), _check_key(_read(path)))
     except FileNotFoundError:
         return None
 
@@ -81,7 +81,7 @@ def allow(name: str, key: str) -> None:
     ConfigError
         The name or the key means nothing.
     """
-    _write(_file(_ALLOWED, name), _checked(key.strip().encode()))
+    _write(_file(_ALLOWED, name), _check_key(key.strip().encode()))
 
 
 def trust(host: str, key: str) -> None:
@@ -92,7 +92,7 @@ def trust(host: str, key: str) -> None:
     ConfigError
         The name or the key means nothing.
     """
-    _write(_file(_TRUSTED, host), _checked(key.strip().encode()))
+    _write(_file(_TRUSTED, host), _check_key(key.strip().encode()))
 
 
 def forget(name: str) -> bool:
@@ -106,12 +106,12 @@ def forget(name: str) -> bool:
 
 def allowed_keys() -> dict[str, bytes]:
     """Public keys of the clients that are let in, by name; read again at every connection."""
-    return _all(_ALLOWED)
+    return _read_all(_ALLOWED)
 
 
 def trusted_keys() -> dict[str, bytes]:
     """Public keys of servers, by host."""
-    return _all(_TRUSTED)
+    return _read_all(_TRUSTED)
 
 
 def server_keys() -> KeyPair:
@@ -171,11 +171,11 @@ def _file(kind: str, name: str) -> Path:
     return keys_folder() / kind / f"{name}.key"
 
 
-def _all(kind: str) -> dict[str, bytes]:
-    return {path.stem: _checked(_read(path)) for path in sorted((keys_folder() / kind).glob("*.key"))}
+def _read_all(kind: str) -> dict[str, bytes]:
+    return {path.stem: _check_key(_read(path)) for path in sorted((keys_folder() / kind).glob("*.key"))}
 
 
-def _checked(key: bytes) -> bytes:
+def _check_key(key: bytes) -> bytes:
     try:
         if len(key) == 40 and len(z85.decode(key)) == 32:
             return key

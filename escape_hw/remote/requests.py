@@ -1,4 +1,4 @@
-"""What a client may ask of a server: a closed list, each request checked before anybody acts on it."""
+"""Requests that a client may send, validated before they are acted on, and the transfer of errors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from escape_hw.config.models import GAIN_MOST
+import escape_hw.errors as errors
+from escape_hw.config.system import MAX_GAIN
 from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Arguments
 
@@ -14,7 +15,7 @@ from escape_hw.remote.state import Arguments
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w .+@:-]+$")]
 ClientId = Annotated[str, Field(min_length=8, max_length=64, pattern=r"^[0-9a-f-]+$")]
 #: A loop's gain, in the range of the configuration.
-Gain = Annotated[float, Field(gt=0, le=GAIN_MOST, allow_inf_nan=False)]
+Gain = Annotated[float, Field(gt=0, le=MAX_GAIN, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
@@ -29,13 +30,13 @@ class Request(BaseModel):
 R = TypeVar("R", bound=Request)
 
 
-def complaint(error: ValidationError) -> str:
+def first_error(error: ValidationError) -> str:
     """The first thing that is wrong with a request: where, and what."""
     first = error.errors(include_url=False, include_input=False)[0]
     return f"{'.'.join(map(str, first['loc'])) or 'the text'}: {first['msg']}"
 
 
-def made(kind: type[R], **fields: Any) -> R:
+def build_request(kind: type[R], **fields: Any) -> R:
     """A request of what a caller said.
 
     Raises
@@ -46,11 +47,11 @@ def made(kind: type[R], **fields: Any) -> R:
     try:
         return kind(**fields)
     except ValidationError as error:
-        raise ConfigError(complaint(error)) from None
+        raise ConfigError(first_error(error)) from None
 
 
 # ---------------------------------------------------------------- to look
-class Hello(Request):
+class RegisterClient(Request):
     """The first word: who speaks, and in which version. Answered with the state."""
 
     verb: Literal["hello"] = "hello"
@@ -86,7 +87,7 @@ class GetLog(Request):
     count: Annotated[int, Field(ge=1, le=1000)] = 200
 
 
-class GetLatest(Request):
+class GetLatestSample(Request):
     """The newest sample of a stream, for clients on another host; answered with its bytes."""
 
     verb: Literal["latest"] = "latest"
@@ -95,7 +96,7 @@ class GetLatest(Request):
     after: int = -1
 
 
-class Check(Request):
+class PlanProcedure(Request):
     """What a procedure would do; answered with :class:`~escape_hw.remote.state.Plan`. Nothing moves."""
 
     verb: Literal["check"] = "check"
@@ -104,7 +105,7 @@ class Check(Request):
 
 
 # ---------------------------------------------------------------- the lease
-class Acquire(Request):
+class AcquireLease(Request):
     """Ask for the right to write; refused while somebody else holds it."""
 
     verb: Literal["acquire"] = "acquire"
@@ -112,13 +113,13 @@ class Acquire(Request):
     take_over: bool = False
 
 
-class Heartbeat(Request):
+class ClientHeartbeat(Request):
     """The holder lives."""
 
     verb: Literal["heartbeat"] = "heartbeat"
 
 
-class Release(Request):
+class ReleaseLease(Request):
     """Give the right to write back."""
 
     verb: Literal["release"] = "release"
@@ -137,14 +138,14 @@ class Flatten(Request):
     verb: Literal["flatten"] = "flatten"
 
 
-class Abort(Request):
+class AbortProcedure(Request):
     """Stop the running procedure; what was measured is kept."""
 
     verb: Literal["abort"] = "abort"
 
 
 # ---------------------------------------------------------------- to write: the lease's holder only
-class Start(Request):
+class StartProcedure(Request):
     """Start a procedure; answered with its number."""
 
     verb: Literal["start"] = "start"
@@ -152,13 +153,13 @@ class Start(Request):
     arguments: Arguments = Field(default_factory=dict)
 
 
-class Pause(Request):
+class PauseProcedure(Request):
     """Halt the running procedure between two steps, mirror flat or loop closed as before."""
 
     verb: Literal["pause"] = "pause"
 
 
-class Resume(Request):
+class ResumeProcedure(Request):
     """Go on with a halted procedure."""
 
     verb: Literal["resume"] = "resume"
@@ -192,7 +193,7 @@ class LoadProduct(Request):
     name: Name | None = None
 
 
-class Record(Request):
+class SetRecording(Request):
     """Begin or end recording telemetry at full rate."""
 
     verb: Literal["record"] = "record"
@@ -212,9 +213,9 @@ class Shutdown(Request):
 
 
 AnyRequest = Annotated[
-    Hello | GetState | GetGeometry | GetProcedures | GetLog | GetLatest | Check
-    | Acquire | Heartbeat | Release | OpenLoop | Flatten | Abort | Start
-    | Pause | Resume | CloseLoop | SetLoop | LoadProduct | Record | ClearFault
+    RegisterClient | GetState | GetGeometry | GetProcedures | GetLog | GetLatestSample | PlanProcedure
+    | AcquireLease | ClientHeartbeat | ReleaseLease | OpenLoop | Flatten | AbortProcedure | StartProcedure
+    | PauseProcedure | ResumeProcedure | CloseLoop | SetLoop | LoadProduct | SetRecording | ClearFault
     | Shutdown,
     Field(discriminator="verb"),
 ]  # fmt: skip
@@ -223,6 +224,51 @@ AnyRequest = Annotated[
 REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)
 
 #: Requests that need the lease.
-WRITING = (Start, Pause, Resume, CloseLoop, SetLoop, LoadProduct, Record, ClearFault, Shutdown)
+LEASE_REQUESTS = (
+    StartProcedure,
+    PauseProcedure,
+    ResumeProcedure,
+    CloseLoop,
+    SetLoop,
+    LoadProduct,
+    SetRecording,
+    ClearFault,
+    Shutdown,
+)
 #: Those after which the state is another one.
-CHANGING = (*(kind for kind in WRITING if kind is not Shutdown), Acquire, Release, OpenLoop, Flatten, Abort)
+STATE_CHANGING_REQUESTS = (
+    *(kind for kind in LEASE_REQUESTS if kind is not Shutdown),
+    AcquireLease,
+    ReleaseLease,
+    OpenLoop,
+    Flatten,
+    AbortProcedure,
+)
+
+
+#: The errors that keep their class across the wire, by name; whatever else is raised arrives as the root.
+_KNOWN = {
+    name: kind
+    for name, kind in vars(errors).items()
+    if isinstance(kind, type) and issubclass(kind, errors.EscapeError)
+}
+
+
+def error_to_document(error: BaseException) -> dict[str, str]:
+    """Type and message of an error; one that is not ESCAPE's own is called a defect."""
+    if isinstance(error, errors.EscapeError):
+        return {"type": type(error).__name__, "message": str(error)}
+    return {
+        "type": errors.EscapeError.__name__,
+        "message": f"{type(error).__name__}: {error} (this is a defect of ESCAPE; the server's log has more)",
+    }
+
+
+def error_from_document(document: dict[str, Any]) -> errors.EscapeError:
+    """The exception to raise here for an error that was raised there."""
+    kind = _KNOWN.get(str(document.get("type")), errors.EscapeError)
+    message = str(document.get("message", "the server gave no reason"))
+    if issubclass(kind, errors.DeviceError):
+        device, _, rest = message.partition(": ")
+        return kind(device, rest)
+    return kind(message)

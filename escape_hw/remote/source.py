@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from escape_hw.remote.state import Arguments, Geometry, LogLine, Plan, ProcedureEntry, State
-from escape_hw.streams.sample import Sample
+from escape_hw.remote.state import Arguments, Geometry, LogLine, ProcedureEntry, ProcedurePlan, State
+from escape_hw.streams.ring import Sample
 
-__all__ = ["STREAMS", "Sample", "Source"]
+__all__ = ["STREAMS", "Sample", "DataSource"]
 
 
-class Source(Protocol):
+class DataSource(Protocol):
     """What panels look at. No method waits longer than a moment; none raises when the other side is gone."""
 
     @property
@@ -40,7 +40,7 @@ class Source(Protocol):
         """What can be started."""
         ...
 
-    def check(self, procedure: str, arguments: Arguments) -> Plan:
+    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """What a procedure would do.
 
         Raises

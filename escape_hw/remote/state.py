@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 SCHEMA = 1
 
 
-class Part(BaseModel):
+class StateDocument(BaseModel):
     """A part of the state: immutable, and nothing unknown in it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -32,7 +32,7 @@ class Phase(StrEnum):
     STOPPED = "stopped"
 
 
-class Health(StrEnum):
+class DeviceHealth(StrEnum):
     """A device's condition."""
 
     OK = "ok"
@@ -43,7 +43,7 @@ class Health(StrEnum):
     CLOSED = "closed"
 
 
-class Fault(Part):
+class FaultState(StateDocument):
     """Why the mirror was made safe."""
 
     reason: str
@@ -52,7 +52,7 @@ class Fault(Part):
     way_out: str = ""
 
 
-class Lease(Part):
+class Lease(StateDocument):
     """Who may write."""
 
     client: str
@@ -62,7 +62,7 @@ class Lease(Part):
     since_utc: str
 
 
-class DeviceState(Part):
+class DeviceState(StateDocument):
     """One device."""
 
     #: Its key in ``[devices]``: ``dm``, ``wfs``, ``science``, ``screen``, ``modulator``.
@@ -71,13 +71,13 @@ class DeviceState(Part):
     model: str
     serial: str
     simulated: bool
-    health: Health
+    health: DeviceHealth
     #: Worth showing, units in the key: ``{"temperature_c": 31.2, "frame_rate_hz": 500.0}``.
     facts: dict[str, float | str] = Field(default_factory=dict)
     message: str = ""
 
 
-class Rates(Part):
+class FrameCounters(StateDocument):
     """Frames, counted."""
 
     frame_hz: float = 0.0
@@ -86,7 +86,7 @@ class Rates(Part):
     lost: int = 0
 
 
-class Light(Part):
+class Illumination(StateDocument):
     """What the sensor's camera sees."""
 
     #: Share of pixels at the top of their range, 0 to 1.
@@ -95,7 +95,7 @@ class Light(Part):
     peak: float = 0.0
 
 
-class Mirror(Part):
+class MirrorState(StateDocument):
     """Commands as fraction of full stroke."""
 
     rms: float = 0.0
@@ -106,7 +106,7 @@ class Mirror(Part):
     flattened: int = 0
 
 
-class Latency(Part):
+class LatencyState(StateDocument):
     """Microseconds from a frame in hand to its command sent, and between frames, last second."""
 
     p50: float = 0.0
@@ -116,7 +116,7 @@ class Latency(Part):
     jitter_p99: float = 0.0
 
 
-class LoopState(Part):
+class LoopState(StateDocument):
     """The loop and its parameters."""
 
     closed: bool = False
@@ -140,7 +140,7 @@ class Finish(StrEnum):
     FAILED = "failed"
 
 
-class Running(Part):
+class ActiveRun(StateDocument):
     """The procedure that runs."""
 
     id: int
@@ -158,7 +158,7 @@ class Running(Part):
     started_utc: str = ""
 
 
-class Ended(Part):
+class FinishedRun(StateDocument):
     """A procedure that ended."""
 
     id: int
@@ -173,7 +173,7 @@ class Ended(Part):
     document: dict[str, Any] = Field(default_factory=dict)
 
 
-class Product(Part):
+class ProductEntry(StateDocument):
     """A matrix or PSF that the engine holds, by name."""
 
     name: str
@@ -184,7 +184,7 @@ class Product(Part):
     summary: str = ""
 
 
-class Telemetry(Part):
+class RecordingState(StateDocument):
     """Recording at full rate."""
 
     recording: bool = False
@@ -196,14 +196,14 @@ class Telemetry(Part):
     fault: str = ""
 
 
-class Disk(Part):
+class DiskState(StateDocument):
     """Where runs go."""
 
     folder: str = ""
     free_gb: float = 0.0
 
 
-class StreamEntry(Part):
+class StreamEntry(StateDocument):
     """A stream and the shared memory it lies in."""
 
     name: str
@@ -211,7 +211,7 @@ class StreamEntry(Part):
     unit: str = ""
 
 
-class State(Part):
+class State(StateDocument):
     """Everything a screen shows, but for the pictures."""
 
     schema_version: int = SCHEMA
@@ -225,19 +225,19 @@ class State(Part):
     simulated: bool = True
     seed: int = 0
     phase: Phase = Phase.STARTING
-    fault: Fault | None = None
+    fault: FaultState | None = None
     lease: Lease | None = None
     devices: tuple[DeviceState, ...] = ()
-    rates: Rates = Rates()
-    light: Light = Light()
-    mirror: Mirror = Mirror()
-    latency: Latency = Latency()
+    rates: FrameCounters = FrameCounters()
+    light: Illumination = Illumination()
+    mirror: MirrorState = MirrorState()
+    latency: LatencyState = LatencyState()
     loop: LoopState = LoopState()
-    procedure: Running | None = None
-    last: Ended | None = None
-    products: tuple[Product, ...] = ()
-    telemetry: Telemetry = Telemetry()
-    disk: Disk = Disk()
+    procedure: ActiveRun | None = None
+    last: FinishedRun | None = None
+    products: tuple[ProductEntry, ...] = ()
+    telemetry: RecordingState = RecordingState()
+    disk: DiskState = DiskState()
     streams: tuple[StreamEntry, ...] = ()
     #: Counts up whenever the sensor's geometry changes: time to ask for it again.
     geometries: int = 0
@@ -253,7 +253,7 @@ class State(Part):
         return state_html(self)
 
 
-class LogLine(Part):
+class LogLine(StateDocument):
     """One line of the log."""
 
     number: int
@@ -263,7 +263,7 @@ class LogLine(Part):
     text: str
 
 
-class Geometry(Part):
+class Geometry(StateDocument):
     """Where slopes and actuators stand, for maps."""
 
     #: Valid sub-apertures, rows of 0 and 1; slopes run through them row by row, all x and then all y.
@@ -281,7 +281,7 @@ class Geometry(Part):
 Arguments = dict[str, Annotated[float, Field(allow_inf_nan=False)] | int | bool | str | None]
 
 
-class Plan(Part):
+class ProcedurePlan(StateDocument):
     """What a procedure would do, found out before anything moves."""
 
     name: str
@@ -299,7 +299,7 @@ class Plan(Part):
         return plan_html(self)
 
 
-class Parameter(Part):
+class ProcedureParameter(StateDocument):
     """One argument of a procedure, enough to make a form of it."""
 
     name: str
@@ -313,13 +313,13 @@ class Parameter(Part):
     high: float | None = None
 
 
-class ProcedureEntry(Part):
+class ProcedureEntry(StateDocument):
     """A procedure that a server offers."""
 
     name: str
     title: str
     help: str
-    parameters: tuple[Parameter, ...] = ()
+    parameters: tuple[ProcedureParameter, ...] = ()
 
     def _repr_html_(self) -> str:
         from escape_hw.remote.html import procedure_html

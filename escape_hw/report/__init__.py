@@ -1,1 +1,1 @@
-"""Figures and the report that a run leaves behind."""
+"""Tables, figures and report.html of one run folder. The paper's tables and figures are in paper/."""

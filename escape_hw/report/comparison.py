@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, UNITS
-from escape_hw.api.results import CalibrationResult, Measured
+from escape_hw.api.results import CalibrationResult, Estimate
 from escape_hw.errors import IncompatibleProduct
-from escape_hw.report.figures_matrix import representative_modes
-from escape_hw.report.tables import TITLES, Table, with_error
+from escape_hw.report.figures.matrix import representative_modes
+from escape_hw.report.tables import TITLES, Table, format_with_error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+class MatrixComparison:
     """Two matrices side by side, over the sub-apertures that both have.
 
     Parameters
@@ -44,9 +44,9 @@ class Comparison:
     total_relative_rms: float
     common: int
     elements: str
-    registration: dict[str, Measured]
+    registration: dict[str, Estimate]
 
-    def document(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {
             "common_sub_apertures": self.common,
@@ -59,7 +59,7 @@ class Comparison:
         }
 
 
-def compare(a: CalibrationResult, b: CalibrationResult) -> Comparison:
+def compare(a: CalibrationResult, b: CalibrationResult) -> MatrixComparison:
     """Compare two matrices of the same basis.
 
     Raises
@@ -88,17 +88,17 @@ def compare(a: CalibrationResult, b: CalibrationResult) -> Comparison:
         gain = cross / power_left
         relative = np.sqrt(np.sum((right - left) ** 2, axis=0) / power_left)
     total = math.sqrt(float(np.sum((right - left) ** 2)) / max(float(power_left.sum()), 1e-300))
-    return Comparison(
-        correlation, gain, relative, total, int(both.sum()), a.grid.elements, _registration(a, b)
+    return MatrixComparison(
+        correlation, gain, relative, total, int(both.sum()), a.grid.elements, _registration_difference(a, b)
     )
 
 
-def _registration(a: CalibrationResult, b: CalibrationResult) -> dict[str, Measured]:
+def _registration_difference(a: CalibrationResult, b: CalibrationResult) -> dict[str, Estimate]:
     if a.registration is None or b.registration is None:
         return {}
     first, second = a.registration.measured(), b.registration.measured()
     return {
-        name: Measured(
+        name: Estimate(
             second[name].value - first[name].value,
             math.hypot(first[name].sigma, second[name].sigma),
             UNITS[name],
@@ -107,7 +107,7 @@ def _registration(a: CalibrationResult, b: CalibrationResult) -> dict[str, Measu
     }
 
 
-def lines(result: Comparison) -> list[str]:
+def summary_lines(result: MatrixComparison) -> list[str]:
     """The comparison in a few lines."""
     return [
         f"{result.correlation.size} modes over {result.common} common {result.elements}",
@@ -118,7 +118,7 @@ def lines(result: Comparison) -> list[str]:
     ]
 
 
-def mode_table(result: Comparison, count: int = 12) -> Table:
+def mode_table(result: MatrixComparison, count: int = 12) -> Table:
     """Evenly spaced modes with correlation, gain ratio and relative difference."""
     rows = tuple(
         (
@@ -132,10 +132,10 @@ def mode_table(result: Comparison, count: int = 12) -> Table:
     return Table(("Mode", "correlation", "gain B / A", "relative rms difference"), rows)
 
 
-def registration_table(result: Comparison) -> Table:
+def registration_table(result: MatrixComparison) -> Table:
     """Difference of the registrations with combined errors."""
     rows = tuple(
-        (f"{TITLES[name][0]} [{TITLES[name][1]}]", with_error(value))
+        (f"{TITLES[name][0]} [{TITLES[name][1]}]", format_with_error(value))
         for name, value in result.registration.items()
     )
     return Table(("Component", "α(B) − α(A)"), rows)

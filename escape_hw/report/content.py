@@ -10,17 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.gains import GainsResult
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.optical_gains import GainsResult
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.errors import ProductError
-from escape_hw.io import documents, fits_file
-from escape_hw.io.fits import KIND_MATRIX, load_matrix
-from escape_hw.io.gains import KIND_GAINS, load_gains
-from escape_hw.io.psf import KIND_PSF, load_loop
+from escape_hw.io import documents
+from escape_hw.io.fits import file as fits_file
+from escape_hw.io.fits.gains import KIND_GAINS, load_gains
+from escape_hw.io.fits.loop import KIND_PSF, load_loop
+from escape_hw.io.fits.matrix import KIND_MATRIX, load_matrix
+from escape_hw.io.fits.telemetry import KIND_TELEMETRY
 from escape_hw.io.run_folder import read_result
-from escape_hw.io.telemetry import KIND_TELEMETRY
 from escape_hw.report.tables import METHOD_LABELS
 
 
@@ -71,8 +72,8 @@ class RunContent:
     @property
     def places_m(self) -> NDArray[np.float64] | None:
         """Where actuators without a grid stand ``(n_act, 2)``, in metres on the mirror."""
-        places = self.document.get("bench", {}).get("places_m")
-        return np.array(places, float).reshape(-1, 2) if places else None
+        positions = self.document.get("bench", {}).get("places_m")
+        return np.array(positions, float).reshape(-1, 2) if positions else None
 
     def matrices(self) -> dict[str, InteractionMatrix]:
         """All matrices by label: measured ones before what was computed from them."""
@@ -108,11 +109,13 @@ def read_run(folder: Path | str) -> RunContent:
     """
     document = read_result(folder)
     run = RunContent(Path(folder).absolute(), document)
-    run.config_text, run.log_text = (_text(run.folder / name) for name in ("config.toml", "run.log"))
+    run.config_text, run.log_text = (
+        _read_optional_text(run.folder / name) for name in ("config.toml", "run.log")
+    )
     labels: Mapping[str, Mapping[str, str]] = document.get("labels", {})
     for name, path in document["products"].items():
         if path.suffix == ".fits":
-            _add(run, name, path, labels.get(name, {}))
+            _add_product(run, name, path, labels.get(name, {}))
     return run
 
 
@@ -128,12 +131,14 @@ def read_product(path: Path | str) -> RunContent:
     hdus, _ = fits_file.read(file)
     header = fits_file.header_dict(hdus)
     document: dict[str, Any] = {
-        **documents.head("show", str(header["SYSTEM"]), bool(header["SIMULATE"]), header.get("SEED")),
+        **documents.header_fields(
+            "show", str(header["SYSTEM"]), bool(header["SIMULATE"]), header.get("SEED")
+        ),
         "started_utc": str(header.get("DATE-OBS", header["DATE"])),
         "products": {file.stem: file},
     }
     run = RunContent(file.parent, document, config_text=fits_file.read_text(file, hdus, "CONFIG"))
-    _add(run, file.stem, file, {})
+    _add_product(run, file.stem, file, {})
     for calibration in run.calibrations.values():
         document |= documents.calibration_document(calibration)
     for gains in run.gains.values():
@@ -143,22 +148,24 @@ def read_product(path: Path | str) -> RunContent:
     return run
 
 
-def _add(run: RunContent, name: str, path: Path, label: Mapping[str, str]) -> None:
+def _add_product(run: RunContent, name: str, path: Path, label: Mapping[str, str]) -> None:
     hdus, digest = fits_file.read(path)
     kind = hdus[0].header["KIND"]
     run.digests[name], run.kinds[name] = digest, str(kind)
     if kind == KIND_MATRIX:
         result = load_matrix(path).result
-        shown = _free(
+        unique = _unique_label(
             run.calibrations, label.get("label") or METHOD_LABELS.get(result.matrix.method, name), name
         )
-        run.calibrations[shown] = result
-        run.names[shown] = name
-        run.measured_labels[shown] = label.get("measured", METHOD_LABELS["docrime"])
-        run.columns[shown] = label.get("column", "" if shown == "ESCAPE" else shown)
+        run.calibrations[unique] = result
+        run.names[unique] = name
+        run.measured_labels[unique] = label.get("measured", METHOD_LABELS["docrime"])
+        run.columns[unique] = label.get("column", "" if unique == "ESCAPE" else unique)
     elif kind == KIND_PSF:
         loop = load_loop(path).result
-        run.loops[_free(run.loops, label.get("label") or METHOD_LABELS.get(loop.method, name), name)] = loop
+        run.loops[
+            _unique_label(run.loops, label.get("label") or METHOD_LABELS.get(loop.method, name), name)
+        ] = loop
     elif kind == KIND_GAINS:
         found = load_gains(path).result
         run.gains[label.get("label") or METHOD_LABELS.get(found.method, name)] = found
@@ -166,10 +173,10 @@ def _add(run: RunContent, name: str, path: Path, label: Mapping[str, str]) -> No
         raise ProductError(f"{path}: its kind is {kind!r}; this version knows IM, PSF, OG and TELEM")
 
 
-def _free(taken: Mapping[str, object], label: str, name: str) -> str:
-    return label if label not in taken else f"{label} ({name})"
+def _unique_label(used: Mapping[str, object], label: str, name: str) -> str:
+    return label if label not in used else f"{label} ({name})"
 
 
-def _text(path: Path) -> str:
+def _read_optional_text(path: Path) -> str:
     """A text file of the run; a run that ended early may lack one."""
     return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""

@@ -10,13 +10,13 @@ from urllib.parse import quote
 
 from matplotlib.figure import Figure
 
-from escape_hw.report import style
+from escape_hw.report.figures import style
 from escape_hw.report.tables import Table
 
 
-def page(title: str, bands: Sequence[tuple[str, str]], body: Sequence[str]) -> str:
-    """A whole page; ``bands`` are (class, text) pairs across the top."""
-    top = "".join(f'<div class="band {kind}" role="status">{escape(text)}</div>' for kind, text in bands)
+def page(title: str, banners: Sequence[tuple[str, str]], body: Sequence[str]) -> str:
+    """A whole page; ``banners`` are (class, text) pairs across the top."""
+    top = "".join(f'<div class="band {kind}" role="status">{escape(text)}</div>' for kind, text in banners)
     css = resources.files("escape_hw.report").joinpath("report.css").read_text(encoding="utf-8")
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -32,7 +32,7 @@ def section(title: str, *parts: str) -> str:
     return f"<section><h2>{escape(title)}</h2>\n{inside}</section>" if inside else ""
 
 
-def facts(values: Mapping[str, str]) -> str:
+def key_values(values: Mapping[str, str]) -> str:
     """Headline numbers."""
     cells = "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in values.items())
     return f'<dl class="facts">{cells}</dl>'
@@ -59,7 +59,7 @@ def figure(key: str, content: Figure, caption: str) -> str:
     return f'<figure>{drawing}<figcaption id="{key}-caption">{escape(caption)}</figcaption></figure>'
 
 
-def checks(criteria: Sequence[Mapping[str, Any]]) -> str:
+def criteria_list(criteria: Sequence[Mapping[str, Any]]) -> str:
     """Criteria with a tick or a cross; nothing without any."""
     items = "".join(
         f'<li class="{"good" if check["met"] else "bad"}">{"✓" if check["met"] else "✗"} '
@@ -74,18 +74,18 @@ def link(target: str, text: str) -> str:
     return f'<a href="{escape(quote(target))}">{escape(text)}</a>'
 
 
-def side_by_side(*parts: str) -> str:
+def figure_row(*parts: str) -> str:
     """Figures beside each other where the page is wide enough."""
     inside = "".join(part for part in parts if part)
     return f'<div class="two">{inside}</div>' if inside else ""
 
 
-def notes(lines: Sequence[str], kind: str = "") -> str:
+def note_list(lines: Sequence[str], kind: str = "") -> str:
     """A list of remarks."""
     items = "".join(f"<li>{escape(line)}</li>" for line in lines)
     return f'<ul class="notes {kind}">{items}</ul>' if lines else ""
 
 
-def folded(summary: str, text: str) -> str:
+def collapsible(summary: str, text: str) -> str:
     """Long text behind a heading that opens."""
     return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>" if text else ""

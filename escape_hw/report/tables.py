@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from escape_hw.api.gains import GainsResult
+from escape_hw.api.optical_gains import GainsResult
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import LoopResult, Measured, RegistrationEstimate
+from escape_hw.api.results import Estimate, LoopResult, RegistrationEstimate
 
 #: How methods are called in figures and tables.
 METHOD_LABELS = {
@@ -47,7 +47,7 @@ class Table:
     numeric: bool = True
 
 
-def with_error(value: Measured) -> str:
+def format_with_error(value: Estimate) -> str:
     """Value and standard error, both rounded to the error's second digit."""
     if not math.isfinite(value.value) or not math.isfinite(value.sigma):
         return f"{value.value:.4g} ± {value.sigma:.2g}".replace("-", "−")
@@ -60,7 +60,7 @@ def with_error(value: Measured) -> str:
     return f"{round(value.value, digits) + 0.0:.{digits}f} ± {value.sigma:.{digits}f}".replace("-", "−")
 
 
-def percent(value: Measured) -> str:
+def format_percent(value: Estimate) -> str:
     """A ratio and its error in percent; a question mark where the run was too short for an error."""
     if not math.isfinite(value.sigma):
         return f"{100 * value.value:5.1f} ± ? %"
@@ -84,7 +84,7 @@ def registration_table(
 
 
 def parameters_table(
-    estimates: Mapping[str, Mapping[str, Measured]], planted: Registration | None = None
+    estimates: Mapping[str, Mapping[str, Estimate]], planted: Registration | None = None
 ) -> Table:
     """As :func:`registration_table`, of parameters by name with their errors."""
     headings = ["Component"]
@@ -96,24 +96,24 @@ def parameters_table(
         headings.append("planted")
     truth: dict[str, float] = {}
     if planted is not None:
-        straight, shear = planted.along_axes
-        truth = {**straight.to_dict(), "anamorphosis": shear}
+        along, shear = planted.axis_scalings_and_shear
+        truth = {**along.to_dict(), "anamorphosis": shear}
     rows = []
     for name in (name for name in TITLES if any(name in estimate for estimate in estimates.values())):
         title, unit = TITLES[name]
         row = [f"{title} [{unit}]"]
         for estimate in estimates.values():
             value = estimate.get(name)
-            row.append("–" if value is None else with_error(value))
+            row.append("–" if value is None else format_with_error(value))
             if planted is not None:
-                row.append("–" if value is None or name not in truth else _pull(value, truth[name]))
+                row.append("–" if value is None or name not in truth else _format_pull(value, truth[name]))
         if planted is not None:
             row.append(f"{truth[name]:.4g}".replace("-", "−") if name in truth else "–")
         rows.append(tuple(row))
     return Table(tuple(headings), tuple(rows))
 
 
-def _pull(value: Measured, truth: float) -> str:
+def _format_pull(value: Estimate, truth: float) -> str:
     if not value.sigma > 0:
         return "–"
     return f"{(value.value - truth) / value.sigma:+.1f}".replace("-", "−")
@@ -136,7 +136,9 @@ def strehl_table(loops: Mapping[str, LoopResult]) -> Table:
         ratios = (
             ("–", "–", "–")
             if strehl is None
-            else tuple(percent(value).strip(" %") for value in (strehl.peak, strehl.otf, strehl.encircled))
+            else tuple(
+                format_percent(value).strip(" %") for value in (strehl.peak, strehl.otf, strehl.encircled)
+            )
         )
         state = f"stable {loop.frames / loop.rate_hz:.0f} s" if loop.stable else "UNSTABLE"
         if loop.partial:
@@ -166,10 +168,10 @@ def rounds_table(result: GainsResult) -> Table:
                 str(number),
                 f"{100 * one.poke:.3g}",
                 str(one.frames),
-                with_error(Measured(mean, math.hypot(own, mean * gains.common_sigma))),
+                format_with_error(Estimate(mean, math.hypot(own, mean * gains.common_sigma))),
                 f"{100 * one.change:.1f}",
                 f"{100 * one.strehl_loss:.2g}",
-                "–" if one.strehl is None else percent(one.strehl.peak).strip(" %"),
+                "–" if one.strehl is None else format_percent(one.strehl.peak).strip(" %"),
             )
         )
     return Table(headings, tuple(rows))

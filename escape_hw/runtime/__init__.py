@@ -1,1 +1,1 @@
-"""The system that scripts, procedures and the command line work on."""
+"""What runs on an open system: the System class of scripts, the procedures that command line and server share, sweeps, and tools for the computer and single devices. Numerics are in calibration/."""

@@ -12,9 +12,9 @@ from escape_hw.errors import CommandRejected
 from escape_hw.safety.limits import MirrorLimits
 
 #: Head-room for rounding, so that a command at a limit is not touched again.
-_ULP = 1e-12
+_ROUNDING = 1e-12
 #: Nothing this far beyond full stroke means anything; bounding it keeps sums and products finite.
-_ABSURD = 1e3
+_MAX_MAGNITUDE = 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +42,12 @@ class GuardReport:
     mean_removed: float = 0.0
 
     @property
-    def untouched(self) -> bool:
+    def is_unchanged(self) -> bool:
         """True when the mirror gets exactly what was asked for."""
-        return self == _UNTOUCHED
+        return self == _UNCHANGED
 
 
-_UNTOUCHED = GuardReport()
+_UNCHANGED = GuardReport()
 
 
 class CommandGuard:
@@ -90,28 +90,28 @@ class CommandGuard:
         pairs = np.empty((0, 2), dtype=np.intp) if pairs is None else pairs
         if len(pairs) and not (pairs.min() >= 0 and pairs.max() < n_act):
             raise ValueError(f"{device}: neighbour pairs name actuators outside 0..{n_act - 1}")
-        self._one, self._other = (np.ascontiguousarray(pairs[:, k]) for k in (0, 1))
+        self._first_of_pair, self._second_of_pair = (np.ascontiguousarray(pairs[:, k]) for k in (0, 1))
         self._disabled = np.array(sorted(set(limits.disabled)), dtype=np.intp)
         self._enabled = np.ones(n_act, dtype=bool)
         self._enabled[self._disabled] = False
         n_enabled = int(self._enabled.sum())
-        self._averaging = self._enabled / n_enabled if n_enabled else np.zeros(n_act)
-        self.last = _frozen(np.zeros(n_act))
+        self._mean_weights = self._enabled / n_enabled if n_enabled else np.zeros(n_act)
+        self.last = _read_only(np.zeros(n_act))
         # Imported here: it brings a compiler along, which those who only read a configuration do without.
-        from escape_hw.safety.legal import legal
+        from escape_hw.safety.limit_check import obeys_limits
 
-        self._legal = legal
+        self._obeys_limits = obeys_limits
         # Stroke holds exactly, the other rules to within rounding; what is off is infinite.
         off, mean = math.inf, limits.max_mean is not None
         neighbours = limits.max_neighbour is not None
         none = np.empty(0, dtype=np.intp)
         self._rules = (
             self._disabled,
-            self._averaging if mean else np.empty(0),
-            self._one if neighbours else none,
-            self._other if neighbours else none,
+            self._mean_weights if mean else np.empty(0),
+            self._first_of_pair if neighbours else none,
+            self._second_of_pair if neighbours else none,
             limits.max_stroke,
-            *(off if limit is None else limit + _ULP
+            *(off if limit is None else limit + _ROUNDING
               for limit in (limits.max_slew, limits.max_mean, limits.max_neighbour)),
         )  # fmt: skip
 
@@ -149,20 +149,20 @@ class CommandGuard:
         """
         with np.errstate(all="ignore"):
             wanted = self._validated(command)
-            if self.obeys(wanted):
-                return _frozen(wanted), _UNTOUCHED
-            legal, clipped, disabled, scale, removed = self._legalise(wanted)
-            safe, slewed = self._approach(legal)
-            return _frozen(safe), GuardReport(clipped, slewed, disabled, scale, removed)
+            if self.is_legal(wanted):
+                return _read_only(wanted), _UNCHANGED
+            legal, clipped, disabled, scale, removed = self._apply_static_limits(wanted)
+            safe, slewed = self._apply_slew_limit(legal)
+            return _read_only(safe), GuardReport(clipped, slewed, disabled, scale, removed)
 
-    def accept(self, shape: NDArray[np.float64]) -> None:
+    def set_last(self, shape: NDArray[np.float64]) -> None:
         """Remember a shape from :meth:`limit` as the one that the mirror has now."""
         self.last = shape
 
     def __call__(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
-        """:meth:`limit`, then :meth:`accept`."""
+        """:meth:`limit`, then :meth:`set_last`."""
         safe, report = self.limit(command)
-        self.accept(safe)
+        self.set_last(safe)
         return safe, report
 
     def reset(self, shape: ArrayLike | None = None) -> None:
@@ -173,13 +173,13 @@ class CommandGuard:
         CommandRejected
             The shape is malformed, see :meth:`validate`.
         """
-        self.last = _frozen(np.zeros(self.n_act) if shape is None else self.validate(shape))
+        self.last = _read_only(np.zeros(self.n_act) if shape is None else self.validate(shape))
 
-    def obeys(self, shape: NDArray[np.float64]) -> bool:
+    def is_legal(self, shape: NDArray[np.float64]) -> bool:
         """True when ``shape`` obeys every rule, counted from the last shape sent."""
-        return bool(self._legal(shape, self.last, *self._rules))
+        return bool(self._obeys_limits(shape, self.last, *self._rules))
 
-    def breach(self, shape: NDArray[np.float64]) -> str | None:
+    def find_violation(self, shape: NDArray[np.float64]) -> str | None:
         """The first rule that ``shape`` breaks by itself (slew apart), in words, or ``None``."""
         lim = self.limits
         peak = _peak(shape)
@@ -190,16 +190,16 @@ class CommandGuard:
             culprit = int(self._disabled[np.flatnonzero(shape[self._disabled])[0]])
             return f"actuator {culprit} is disabled and must stay at zero"
         if lim.max_mean is not None:
-            mean = float(shape.dot(self._averaging))
-            if abs(mean) > lim.max_mean + _ULP:
+            mean = float(shape.dot(self._mean_weights))
+            if abs(mean) > lim.max_mean + _ROUNDING:
                 return f"the mean exceeds max_mean = {lim.max_mean} ({mean:.6g})"
-        if lim.max_neighbour is not None and self._one.size:
+        if lim.max_neighbour is not None and self._first_of_pair.size:
             step = self._worst_step(shape)
-            if step > lim.max_neighbour + _ULP:
+            if step > lim.max_neighbour + _ROUNDING:
                 return f"two neighbours exceed max_neighbour = {lim.max_neighbour} ({step:.6g})"
         return None
 
-    def allowed_share(self, shape: ArrayLike) -> float:
+    def largest_legal_scale(self, shape: ArrayLike) -> float:
         """Largest factor, at most 1, with which a shape breaks no rule by itself (slew apart).
 
         A shape scaled by it keeps its form, where :meth:`limit` cuts single actuators off. Disabled
@@ -255,9 +255,11 @@ class CommandGuard:
             )
 
     def _worst_step(self, shape: NDArray[np.float64]) -> float:
-        return _peak(shape.take(self._one) - shape.take(self._other))
+        return _peak(shape.take(self._first_of_pair) - shape.take(self._second_of_pair))
 
-    def _legalise(self, wanted: NDArray[np.float64]) -> tuple[NDArray[np.float64], int, int, float, float]:
+    def _apply_static_limits(
+        self, wanted: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], int, int, float, float]:
         """Make a shape obey every rule but slew.
 
         Returns
@@ -266,12 +268,12 @@ class CommandGuard:
         """
         lim = self.limits
         disabled = int(np.count_nonzero(wanted[self._disabled]))
-        shape = _clamp(wanted, _ABSURD)
+        shape = _clamp(wanted, _MAX_MAGNITUDE)
         shape[self._disabled] = 0.0
         removed = 0.0
         if lim.max_mean is not None:
-            mean = float(shape.dot(self._averaging))
-            if abs(mean) > lim.max_mean + _ULP:
+            mean = float(shape.dot(self._mean_weights))
+            if abs(mean) > lim.max_mean + _ROUNDING:
                 removed = mean - math.copysign(lim.max_mean, mean)
                 shape[self._enabled] -= removed
         clipped = int(np.count_nonzero(np.abs(shape) > lim.max_stroke))
@@ -283,14 +285,14 @@ class CommandGuard:
         """Largest factor up to 1 that makes ``shape`` obey the neighbour and the mean rule."""
         lim, scale = self.limits, 1.0
         if lim.max_mean is not None:
-            mean = abs(float(shape.dot(self._averaging)))
-            scale = lim.max_mean / mean if mean > lim.max_mean + _ULP else scale
-        if lim.max_neighbour is not None and self._one.size:
+            mean = abs(float(shape.dot(self._mean_weights)))
+            scale = lim.max_mean / mean if mean > lim.max_mean + _ROUNDING else scale
+        if lim.max_neighbour is not None and self._first_of_pair.size:
             step = self._worst_step(shape)
-            scale = min(scale, lim.max_neighbour / step) if step > lim.max_neighbour + _ULP else scale
+            scale = min(scale, lim.max_neighbour / step) if step > lim.max_neighbour + _ROUNDING else scale
         return scale
 
-    def _approach(self, legal: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+    def _apply_slew_limit(self, legal: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
         """Go from the last shape towards a legal one as far as the slew rule allows.
 
         Each actuator goes as far as it may, so that one far away does not hold the others back.
@@ -302,11 +304,11 @@ class CommandGuard:
             return legal, 0
         move = legal - self.last
         far = np.abs(move)
-        slewed = int(np.count_nonzero(far > slew + _ULP))
+        slewed = int(np.count_nonzero(far > slew + _ROUNDING))
         if not slewed:
             return legal, 0
         each = self._within_stroke(self.last + _clamp(move, slew))
-        if self.obeys(each):
+        if self.is_legal(each):
             return each, slewed
         return self._within_stroke(self.last + move * (slew / far.max())), slewed
 
@@ -325,7 +327,7 @@ def _clamp(values: NDArray[np.float64], bound: float) -> NDArray[np.float64]:
     return np.minimum(np.maximum(values, -bound), bound)
 
 
-def _frozen(shape: NDArray[np.float64]) -> NDArray[np.float64]:
+def _read_only(shape: NDArray[np.float64]) -> NDArray[np.float64]:
     """Make an array read-only: caller, driver and guard share it, and none may change it."""
     shape.setflags(write=False)
     return shape

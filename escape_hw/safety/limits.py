@@ -86,7 +86,7 @@ def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.concatenate(pairs)
 
 
-def nearest_pairs(positions: NDArray[np.float64], reach: float = 1.3) -> NDArray[np.intp]:
+def nearest_pairs(positions: NDArray[np.float64], max_distance: float = 1.3) -> NDArray[np.intp]:
     """Pairs of adjacent actuators anywhere on a mirror, by their distance.
 
     On a square grid these are the pairs of :func:`neighbour_pairs`, for diagonals are 1.41 pitches.
@@ -119,4 +119,4 @@ def nearest_pairs(positions: NDArray[np.float64], reach: float = 1.3) -> NDArray
     if not nearest.min() > 0:
         one = int(nearest.argmin())
         raise ValueError(f"actuators {one} and {int(distance[one].argmin())} stand in the same place")
-    return np.argwhere(np.triu(distance <= reach * np.median(nearest))).astype(np.intp)
+    return np.argwhere(np.triu(distance <= max_distance * np.median(nearest))).astype(np.intp)

@@ -14,13 +14,13 @@ import struct
 
 import numpy as np
 
-from escape_hw.streams.histogram import BINS
+from escape_hw.streams.timing import BINS
 
 #: Slots and payload bytes of a slot, after the segment's identity.
 GEOMETRY = struct.Struct("=QQ")
 #: Places in the header, in words of eight bytes.
 WRITTEN, CLOSED = 16, 24
-#: Counts of the intervals between entries, see :mod:`escape_hw.streams.histogram`.
+#: Counts of the intervals between entries, see :mod:`escape_hw.streams.timing`.
 INTERVALS = 32
 HEADER_BYTES = 8192
 
@@ -35,7 +35,7 @@ SLOT_HEADER_BYTES = 384
 
 #: A dtype's number is its place here.
 DTYPES = tuple(np.dtype(code) for code in ("?", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"))
-MOST_DIMENSIONS = 4
+MAX_DIMENSIONS = 4
 
 if META_AT + META_BYTES > SLOT_HEADER_BYTES or 8 * (INTERVALS + BINS) > HEADER_BYTES:
     raise AssertionError("the layout of a ring does not fit its headers")

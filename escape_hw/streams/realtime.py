@@ -13,22 +13,24 @@ from pathlib import Path
 #: Above all that is usual, below the kernel's own threads.
 PRIORITY = 40
 #: Seconds after which another Python thread gives way: at most so long may one hold up the loop.
-SWITCH_S = 0.0005
+SWITCH_INTERVAL_S = 0.0005
 _LOCK_PRESENT = 1
 _ISOLATED = Path("/sys/devices/system/cpu/isolated")
 
 
-def isolated_cpus(listed: Path = _ISOLATED) -> tuple[int, ...]:
+def isolated_cpus(path: Path = _ISOLATED) -> tuple[int, ...]:
     """Processors that this machine keeps free of everything else (boot option ``isolcpus``)."""
     try:
-        parts = [part.split("-") for part in listed.read_text().strip().split(",") if part]
+        parts = [part.split("-") for part in path.read_text().strip().split(",") if part]
         return tuple(cpu for ends in parts for cpu in range(int(ends[0]), int(ends[-1]) + 1))
     except (OSError, ValueError):
         return ()
 
 
 @contextlib.contextmanager
-def prompt(cpus: Collection[int] | None = None, priority: int = PRIORITY) -> Iterator[tuple[str, ...]]:
+def realtime_thread(
+    cpus: Collection[int] | None = None, priority: int = PRIORITY
+) -> Iterator[tuple[str, ...]]:
     """Run this thread before others, as far as the machine allows, and give up all of it in the end.
 
     Threads and processes that it starts do not inherit the priority.
@@ -51,30 +53,30 @@ def prompt(cpus: Collection[int] | None = None, priority: int = PRIORITY) -> Ite
         gc.freeze()
         undo.callback(gc.unfreeze)
         interval = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH_S)
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         undo.callback(sys.setswitchinterval, interval)
         if cpus is not None:
-            _try(notes, "processors cannot be chosen", lambda: _hold_to(frozenset(cpus), undo))
+            _attempt(notes, "processors cannot be chosen", lambda: _pin_to_cpus(frozenset(cpus), undo))
         if priority:
-            _try(
+            _attempt(
                 notes, "no real-time priority (allow it with 'rtprio' in /etc/security/limits.d)",
                 lambda: _raise_priority(priority, undo),
             )  # fmt: skip
-            _try(
+            _attempt(
                 notes, "memory may be swapped out (allow 'memlock' in /etc/security/limits.d)",
                 lambda: _lock_memory(undo),
             )  # fmt: skip
         yield tuple(notes)
 
 
-def _try(notes: list[str], otherwise: str, step: Callable[[], None]) -> None:
+def _attempt(notes: list[str], message: str, step: Callable[[], None]) -> None:
     try:
         step()
     except (OSError, AttributeError) as error:
-        notes.append(f"{otherwise}: {error}")
+        notes.append(f"{message}: {error}")
 
 
-def _hold_to(cpus: frozenset[int], undo: contextlib.ExitStack) -> None:
+def _pin_to_cpus(cpus: frozenset[int], undo: contextlib.ExitStack) -> None:
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cpus)
     undo.callback(os.sched_setaffinity, 0, before)

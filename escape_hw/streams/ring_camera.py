@@ -1,15 +1,42 @@
-"""A camera whose frames another process writes into a ring."""
+"""Camera whose frames another process writes into a ring."""
 
 from __future__ import annotations
 
 import time
+from typing import Any
 
-from escape_hw.api.camera import Camera
-from escape_hw.api.frames import CameraInfo, CameraSettings, Frame
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+
+from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
 from escape_hw.errors import DeviceLost, FrameTimeout, SettingRejected
-from escape_hw.streams.ring import RingReader
-from escape_hw.streams.sample import Sample
-from escape_hw.streams.spin import LOOKS, changes
+from escape_hw.streams.ring import RingReader, Sample
+
+#: Looks between two of which the caller may see to the time: about ten microseconds.
+POLLS = 8000
+
+
+@intrinsic
+def _load_atomic(typing_context: Any, address: Any) -> Any:
+    """The word of 64 bits at an address, as it is now: a compiler would look once and believe it for ever."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        word = ir.IntType(64)
+        pointer = builder.inttoptr(arguments[0], word.as_pointer())
+        return builder.load_atomic(pointer, "acquire", 8)
+
+    return types.uint64(types.uint64), code
+
+
+@njit("b1(u8, u8, u8)", nogil=True)
+def wait_for_change(address, value, n_polls):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether the word at an address differs from a value, looking so many times at most."""
+    for _ in range(n_polls):
+        if _load_atomic(address) != value:  # type: ignore[call-arg]
+            return np.bool_(True)
+    return np.bool_(False)
 
 
 class RingCamera(Camera):
@@ -35,10 +62,10 @@ class RingCamera(Camera):
         self, name: str, segment: str, info: CameraInfo, settings: CameraSettings, *, spin_s: float = 0.0
     ) -> None:
         super().__init__(name)
-        self._spin_s, self._came = spin_s, 0.0
+        self._spin_s, self._last_arrival_s = spin_s, 0.0
         self._segment, self._info, self._settings = segment, info, settings
         self._reader: RingReader | None = None
-        self._seen = 0
+        self._next_number = 0
 
     @property
     def info(self) -> CameraInfo:
@@ -68,7 +95,7 @@ class RingCamera(Camera):
 
     def _start(self) -> None:
         self._ring.seek(self._ring.written)
-        self._seen = self._ring.position
+        self._next_number = self._ring.position
 
     def _stop(self) -> None:
         """Nothing to do: the frames are another process's."""
@@ -76,36 +103,36 @@ class RingCamera(Camera):
     def _next_frame(self, timeout_s: float) -> Frame:
         ring, until = self._ring, time.monotonic() + timeout_s
         while True:
-            if ring.written == self._seen and not self._awaited(ring, until - time.monotonic()):
+            if ring.written == self._next_number and not self._wait_for_entry(ring, until - time.monotonic()):
                 if not ring.alive:
                     raise DeviceLost(self.name, f"the process that wrote '{self._segment}' has ended")
                 raise FrameTimeout(self.name, f"no frame within {timeout_s:g} s in '{self._segment}'")
-            sample = self._taken(ring)
+            sample = self._take_entry(ring)
             if sample is not None:
                 sample.data.flags.writeable = False
                 return Frame(sample.data, sample.index, sample.exposed_ns, sample.arrived_ns)
 
-    def _awaited(self, ring: RingReader, timeout_s: float) -> bool:
+    def _wait_for_entry(self, ring: RingReader, timeout_s: float) -> bool:
         """Wait for an entry: asleep, and awake around the time when it is due."""
         if self._spin_s <= 0:
-            return ring.wait(self._seen, timeout_s)
-        due = self._came + 1 / self._settings.frame_rate_hz
+            return ring.wait(self._next_number, timeout_s)
+        due = self._last_arrival_s + 1 / self._settings.frame_rate_hz
         early = due - self._spin_s - time.monotonic()
-        if early > 0 and ring.wait(self._seen, min(early, timeout_s)):
+        if early > 0 and ring.wait(self._next_number, min(early, timeout_s)):
             return True
         while time.monotonic() < due + self._spin_s:
-            if changes(ring.written_at, self._seen, LOOKS):
+            if wait_for_change(ring.written_at, self._next_number, POLLS):
                 return True
-        return ring.wait(self._seen, max(timeout_s, 0.0))
+        return ring.wait(self._next_number, max(timeout_s, 0.0))
 
-    def _taken(self, ring: RingReader) -> Sample | None:
+    def _take_entry(self, ring: RingReader) -> Sample | None:
         """The next entry, or the newest when too many wait."""
-        if ring.written - self._seen > ring.slots - 2:
+        if ring.written - self._next_number > ring.slots - 2:
             ring.seek(ring.written - 1)
         sample = ring.next()
-        self._seen = ring.position
+        self._next_number = ring.position
         if sample is not None:
-            self._came = sample.arrived_ns * 1e-9
+            self._last_arrival_s = sample.arrived_ns * 1e-9
         return sample
 
     @property

@@ -31,7 +31,7 @@ IDENTITY = struct.Struct("=QQQQ")
 _NAME = re.compile(r"escape-(?P<uid>\d+)-(?P<system>[A-Za-z0-9._-]+)-(?P<pid>\d+)-(?P<stream>[A-Za-z0-9_]+)")
 
 
-class StreamGone(EscapeError):
+class StreamUnavailable(EscapeError):
     """A stream's memory is not there (any more), or is not what it should be."""
 
 
@@ -100,7 +100,7 @@ def create(name: str, size: int, fill: struct.Struct, *header: int) -> mmap.mmap
             memory = mmap.mmap(handle, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
             fill.pack_into(memory, IDENTITY.size, *header)
             IDENTITY.pack_into(memory, 0, MAGIC, SCHEMA, os.getpid(), process_start(os.getpid()) or 0)
-            _give_name(handle, path)
+            _link_name(handle, path)
         finally:
             os.close(handle)
     except OSError as error:
@@ -112,13 +112,13 @@ def create(name: str, size: int, fill: struct.Struct, *header: int) -> mmap.mmap
     return memory
 
 
-def _give_name(handle: int, path: Path) -> None:
+def _link_name(handle: int, path: Path) -> None:
     source = f"/proc/self/fd/{handle}"
     # With a folder given, which the whole path overrides, Python follows the link to the file itself.
     try:
         os.link(source, path, src_dir_fd=handle)
     except FileExistsError:
-        found = examine(path.name)
+        found = read_identity(path.name)
         if found is None or found.alive:
             raise
         path.unlink()
@@ -135,22 +135,24 @@ def attach(name: str) -> mmap.mmap:
     """
     path = SHARED / name
     if not _NAME.fullmatch(name):
-        raise StreamGone(f"'{name}' is no name of a stream's memory; 'escape streams' lists those there are")
+        raise StreamUnavailable(
+            f"'{name}' is no name of a stream's memory; 'escape streams' lists those there are"
+        )
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
             status = os.fstat(handle)
             if status.st_uid not in (os.getuid(), 0):
-                raise StreamGone(f"{path} belongs to user {status.st_uid}; it is not read")
+                raise StreamUnavailable(f"{path} belongs to user {status.st_uid}; it is not read")
             memory = mmap.mmap(handle, status.st_size, flags=mmap.MAP_SHARED, prot=mmap.PROT_READ)
         finally:
             os.close(handle)
     except (OSError, ValueError) as error:
-        raise StreamGone(f"{path}: no such stream ({error}); has its server ended?") from error
+        raise StreamUnavailable(f"{path}: no such stream ({error}); has its server ended?") from error
     magic, schema, *_ = IDENTITY.unpack_from(memory) if len(memory) >= IDENTITY.size else (0, 0)
     if (magic, schema) != (MAGIC, SCHEMA):
         memory.close()
-        raise StreamGone(
+        raise StreamUnavailable(
             f"{path} is of version {schema}, this program reads {SCHEMA}; "
             "use the same version of escape-hw as its server"
             if magic == MAGIC
@@ -165,7 +167,7 @@ def remove(name: str) -> None:
         (SHARED / name).unlink()
 
 
-def examine(name: str) -> Segment | None:
+def read_identity(name: str) -> Segment | None:
     """What a segment says of itself; ``None`` when it is none, or has gone."""
     parts = _NAME.fullmatch(name)
     if parts is None:
@@ -189,14 +191,14 @@ def _no_link(path: str, flags: int) -> int:
 def segments(system: str | None = None, pid: int | None = None) -> tuple[Segment, ...]:
     """The segments of this user, those of one system or one process where that is given."""
     mine = sorted(path.name for path in SHARED.glob(f"escape-{os.getuid()}-*"))
-    found = (examine(name) for name in mine)
+    found = (read_identity(name) for name in mine)
     return tuple(
         one for one in found
         if one is not None and system in (None, one.system) and pid in (None, one.pid)
     )  # fmt: skip
 
 
-def reap(pid: int | None = None) -> tuple[Segment, ...]:
+def remove_orphaned(pid: int | None = None) -> tuple[Segment, ...]:
     """Remove the segments whose owner is dead, of one process or of all; says which."""
     dead = tuple(one for one in segments(pid=pid) if not one.alive)
     for one in dead:
@@ -208,16 +210,16 @@ def readers(names: Iterable[str]) -> dict[str, tuple[int, ...]]:
     """Processes of this user that have each segment mapped, its owner apart."""
     users: dict[str, list[int]] = {name: [] for name in names}
     for pid in sorted(int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()):
-        for name in _mapped(pid) & users.keys():
+        for name in _mapped_segments(pid) & users.keys():
             users[name].append(pid)
-    owners = {name: examine(name) for name in users}
+    owners = {name: read_identity(name) for name in users}
     return {
         name: tuple(pid for pid in pids if (one := owners[name]) is None or pid != one.pid)
         for name, pids in users.items()
     }
 
 
-def _mapped(pid: int) -> set[str]:
+def _mapped_segments(pid: int) -> set[str]:
     """Names of the segments that a process has mapped."""
     try:
         lines = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace").splitlines()

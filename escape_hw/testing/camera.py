@@ -1,22 +1,208 @@
-"""What a camera promises about its settings and its acquisition."""
+"""Contract checks of cameras: settings, acquisition, frames and time-outs."""
 
 from __future__ import annotations
 
 import math
+import statistics
+import time
 from dataclasses import replace
+from itertools import pairwise
 
-from escape_hw.api.camera import Camera
-from escape_hw.api.frames import CameraInfo, CameraSettings, FrameStatus, Region
-from escape_hw.errors import SettingRejected
-from escape_hw.testing.camera_frames import FRAMES, patience_s
-from escape_hw.testing.checks import NORMAL, READS, Check, Factory, check, opened, refused, up_to
-from escape_hw.testing.common import COMMON
+import numpy as np
+
+from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, FrameStatus, Region
+from escape_hw.errors import FrameTimeout, SettingRejected
+from escape_hw.testing.checks import (
+    NORMAL,
+    READS,
+    Check,
+    Factory,
+    assert_refused,
+    check,
+    checks_up_to,
+    open_device,
+)
+from escape_hw.testing.device import COMMON_CHECKS
+
+#: A call with a time-out far below this must be back within it, in wall-clock seconds.
+_MAX_CALL_S = 10.0
+#: Calls that drain whatever a driver has buffered.
+_CALLS = 200
+
+
+def generous_timeout_s(camera: Camera) -> float:
+    """Give a time-out that a healthy camera never needs."""
+    now = camera.settings
+    return 2.0 + 20 * (now.exposure_s + 1 / now.frame_rate_hz)
+
+
+def _frames(camera: Camera, n: int) -> list[Frame]:
+    return [camera.next_frame(generous_timeout_s(camera)) for _ in range(n)]
+
+
+@check(READS)
+def check_camera_frames_are_well_formed(factory: Factory) -> None:
+    """Frames are read-only uint16 of the region's shape, within the bit depth, and timed."""
+    with open_device(factory) as camera:
+        region, top = camera.settings.region, camera.info.full_scale
+        for frame in _frames(camera, 3):
+            data = frame.data
+            assert isinstance(data, np.ndarray), f"data is {type(data).__name__}, not an array"
+            assert data.dtype == np.uint16, f"data has type {data.dtype}, not uint16"
+            assert data.shape == (region.height, region.width), (
+                f"data has shape {data.shape}; the region is {region.height} rows of {region.width}"
+            )
+            assert not data.flags.writeable, "data can be written to; several readers share it"
+            assert int(data.max()) <= top, f"a pixel has {data.max()} counts; the scale ends at {top}"
+            saturated = int(np.count_nonzero(data == top))
+            assert frame.n_saturated == saturated, (
+                f"n_saturated is {frame.n_saturated}, but {saturated} pixels are at the top of the scale"
+            )
+
+
+@check(READS)
+def check_camera_frames_are_not_overwritten(factory: Factory) -> None:
+    """Later frames do not overwrite the array of an earlier one."""
+    with open_device(factory) as camera:
+        first = camera.next_frame(generous_timeout_s(camera))
+        before = first.data.copy()
+        for later in _frames(camera, 8):
+            assert not np.shares_memory(first.data, later.data), "two frames share one buffer"
+        assert np.array_equal(first.data, before), "a frame changed after later ones had come"
+
+
+@check(READS)
+def check_camera_index_and_time_rise(factory: Factory) -> None:
+    """Index and times rise from frame to frame; a frame arrives after it was exposed."""
+    with open_device(factory) as camera:
+        frames = _frames(camera, 10)
+        now = camera.now_ns()
+        for one, next_one in pairwise(frames):
+            assert next_one.index > one.index, f"the index went from {one.index} to {next_one.index}"
+            assert next_one.exposed_ns > one.exposed_ns, "exposed_ns did not rise"
+            assert next_one.arrived_ns >= one.arrived_ns, "arrived_ns fell"
+        for frame in frames:
+            assert isinstance(frame.index, int), f"index is {type(frame.index).__name__}, not int"
+            assert frame.exposed_ns <= frame.arrived_ns, "a frame arrived before its exposure had ended"
+            assert frame.arrived_ns <= now, "a frame is said to arrive in the future of the camera's clock"
+
+
+@check(READS)
+def check_camera_rate_is_as_stated(factory: Factory) -> None:
+    """Frames come at ``settings.frame_rate_hz``, by their own times (10 % tolerance)."""
+    with open_device(factory) as camera:
+        frames = _frames(camera, 20)
+        periods = [(b.exposed_ns - a.exposed_ns) / (b.index - a.index) for a, b in pairwise(frames)]
+        rate, stated = 1e9 / statistics.median(periods), camera.settings.frame_rate_hz
+        assert abs(rate / stated - 1) < 0.1, (
+            f"settings says {stated:.6g} Hz, the frames come at {rate:.6g} Hz"
+        )
+
+
+@check(READS)
+def check_camera_counts_add_up(factory: Factory) -> None:
+    """Delivered and lost frames together account for every index."""
+    with open_device(factory) as camera:
+        camera.start()
+        frames = _frames(camera, 10)
+        status = camera.status()
+        assert status.delivered == 10, f"ten frames were delivered, status says {status}"
+        span = frames[-1].index - frames[0].index + 1
+        assert status.delivered + status.lost == span, f"{status} does not account for {span} indices"
+        assert status.timeouts == 0, f"{status}, but no call timed out"
+
+
+@check(READS)
+def check_camera_refuses_timeouts(factory: Factory) -> None:
+    """A time-out that is zero, negative, not a number or endless is refused."""
+    with open_device(factory) as camera:
+        for timeout_s in (0.0, -1.0, math.nan, math.inf):
+            what = f"next_frame(timeout_s={timeout_s})"
+            assert_refused(camera, SettingRejected, what, camera.next_frame, timeout_s)
+
+
+@check(NORMAL)
+def check_camera_raises_timeout(factory: Factory) -> None:
+    """With no frame in time ``next_frame`` raises ``FrameTimeout``, counts it, and goes on after it."""
+    with open_device(factory) as camera:
+        original = camera.settings
+        try:
+            _slow_down(camera)
+            _assert_times_out(camera)
+        finally:
+            camera.configure(original)
+
+
+@check(READS)
+def check_camera_polls_without_waiting(factory: Factory) -> None:
+    """``poll`` gives what is there or ``None``, takes no time, and counts no time-out."""
+    with open_device(factory) as camera:
+        camera.next_frame(generous_timeout_s(camera))
+        delivered, taken_ns = 1, []
+        for _ in range(11):
+            began = camera.now_ns()
+            frame = camera.poll()
+            taken_ns.append(camera.now_ns() - began)
+            assert frame is None or isinstance(frame, Frame), f"poll() gave {type(frame).__name__}"
+            delivered += frame is not None
+        status = camera.status()
+        assert status.timeouts == 0, f"{status}: an empty poll() is no time-out"
+        assert status.delivered == delivered, f"{status}, but {delivered} frames were delivered"
+        usual_s, period_s = statistics.median(taken_ns) * 1e-9, 1 / camera.settings.frame_rate_hz
+        assert usual_s < 0.5 * period_s, f"poll() took {usual_s:.3g} s; it must not wait for a frame"
+
+
+def _slow_down(camera: Camera) -> None:
+    try:
+        camera.configure(replace(camera.settings, frame_rate_hz=min(20.0, camera.settings.frame_rate_hz)))
+    except SettingRejected:
+        # It cannot go so slowly; then its own rate has to do.
+        return
+
+
+def _assert_times_out(camera: Camera) -> None:
+    short_timeout_s = 1e-3 / camera.settings.frame_rate_hz
+    last = camera.next_frame(generous_timeout_s(camera)).index
+    timeouts = 0
+    for _ in range(_CALLS):
+        began = time.monotonic()
+        try:
+            frame = camera.next_frame(short_timeout_s)
+            last = frame.index
+        except FrameTimeout as timeout:
+            timeouts += 1
+            assert camera.name in str(timeout), f"the time-out does not name the camera: {timeout}"
+        except Exception as other:
+            raise AssertionError(f"FrameTimeout was due, {type(other).__name__} came: {other}") from other
+        took = time.monotonic() - began
+        assert took < _MAX_CALL_S, f"next_frame({short_timeout_s:.3g} s) took {took:.1f} s"
+        if timeouts >= 3:
+            break
+    assert timeouts, (
+        f"{_CALLS} calls with a thousandth of the frame period ({short_timeout_s:.3g} s) never timed out"
+    )
+    counted = camera.status().timeouts
+    assert counted == timeouts, f"status says {counted} time-outs; there were {timeouts}"
+    after = camera.next_frame(generous_timeout_s(camera)).index
+    assert after > last, f"after a time-out the index went from {last} to {after}"
+
+
+FRAME_CHECKS: tuple[Check, ...] = (
+    check_camera_frames_are_well_formed,
+    check_camera_frames_are_not_overwritten,
+    check_camera_index_and_time_rise,
+    check_camera_rate_is_as_stated,
+    check_camera_counts_add_up,
+    check_camera_refuses_timeouts,
+    check_camera_raises_timeout,
+    check_camera_polls_without_waiting,
+)
 
 
 @check(READS)
 def check_camera_info_is_complete(factory: Factory) -> None:
     """Identity and fixed properties are there and make sense."""
-    with opened(factory) as camera:
+    with open_device(factory) as camera:
         info = camera.info
         assert isinstance(info, CameraInfo), f"info is {type(info).__name__}, not CameraInfo"
         assert info.model, "info.model is empty"
@@ -30,7 +216,7 @@ def check_camera_info_is_complete(factory: Factory) -> None:
 @check(READS)
 def check_camera_settings_are_achievable(factory: Factory) -> None:
     """The settings in force are settings that ``check`` answers with itself."""
-    with opened(factory) as camera:
+    with open_device(factory) as camera:
         settings = camera.settings
         assert isinstance(settings, CameraSettings), f"settings is {type(settings).__name__}"
         answer = camera.check(settings)
@@ -40,8 +226,8 @@ def check_camera_settings_are_achievable(factory: Factory) -> None:
 @check(READS)
 def check_camera_check_is_a_fixed_point(factory: Factory) -> None:
     """What ``check`` answers with is achievable: checked again, it stays."""
-    with opened(factory) as camera:
-        for want in _wishes(camera):
+    with open_device(factory) as camera:
+        for want in _trial_settings(camera):
             answer = camera.check(want)
             again = camera.check(answer)
             assert again == answer, f"check() made {answer} of {want}, and then {again} of its own answer"
@@ -50,12 +236,12 @@ def check_camera_check_is_a_fixed_point(factory: Factory) -> None:
 @check(READS)
 def check_camera_check_changes_nothing(factory: Factory) -> None:
     """``check`` changes no setting and does not disturb acquisition."""
-    with opened(factory) as camera:
+    with open_device(factory) as camera:
         for running in (False, True):
             if running:
-                camera.next_frame(patience_s(camera))
+                camera.next_frame(generous_timeout_s(camera))
             before = camera.settings, camera.is_running, camera.status()
-            for want in _wishes(camera):
+            for want in _trial_settings(camera):
                 camera.check(want)
                 after = camera.settings, camera.is_running, camera.status()
                 assert after == before, f"check({want}) changed the camera from {before} to {after}"
@@ -64,7 +250,7 @@ def check_camera_check_changes_nothing(factory: Factory) -> None:
 @check(READS)
 def check_camera_refuses_regions_off_the_sensor(factory: Factory) -> None:
     """A region that does not lie on the sensor is refused, by ``check`` and by ``configure``."""
-    with opened(factory) as camera:
+    with open_device(factory) as camera:
         before = camera.settings
         rows, columns = camera.info.sensor_shape
         wrong = {
@@ -78,34 +264,38 @@ def check_camera_refuses_regions_off_the_sensor(factory: Factory) -> None:
             "in fractions": Region(0, 0, columns / 2, rows / 2),
         }
         for what, region in wrong.items():
-            _stays(camera, before, replace(before, region=region), f"a region {what}")
+            _assert_settings_unchanged(camera, before, replace(before, region=region), f"a region {what}")
 
 
 @check(READS)
 def check_camera_refuses_meaningless_settings(factory: Factory) -> None:
     """Exposure, rate and gain that mean nothing are refused."""
-    with opened(factory) as camera:
+    with open_device(factory) as camera:
         before = camera.settings
         for name in ("exposure_s", "frame_rate_hz"):
             for value in (0.0, -1.0, math.nan, math.inf):
-                _stays(camera, before, replace(before, **{name: value}), f"{name} = {value}")
+                _assert_settings_unchanged(
+                    camera, before, replace(before, **{name: value}), f"{name} = {value}"
+                )
         for value in (math.nan, math.inf):
-            _stays(camera, before, replace(before, gain_db=value), f"gain_db = {value}")
+            _assert_settings_unchanged(camera, before, replace(before, gain_db=value), f"gain_db = {value}")
 
 
-def _stays(camera: Camera, before: CameraSettings, want: CameraSettings, what: str) -> None:
+def _assert_settings_unchanged(
+    camera: Camera, before: CameraSettings, want: CameraSettings, what: str
+) -> None:
     for verb in (camera.check, camera.configure):
-        refused(camera, SettingRejected, f"{verb.__name__}() with {what}", verb, want)
+        assert_refused(camera, SettingRejected, f"{verb.__name__}() with {what}", verb, want)
         assert camera.settings == before, f"{what}: refused, but the settings changed"
 
 
 @check(NORMAL)
-def check_camera_configure_tells_the_truth(factory: Factory) -> None:
+def check_camera_configure_reports_actual_settings(factory: Factory) -> None:
     """``configure`` answers with what is in force: ``settings`` and the frames bear it out."""
-    with opened(factory) as camera:
+    with open_device(factory) as camera:
         original = camera.settings
         try:
-            for want in _wishes(camera):
+            for want in _trial_settings(camera):
                 answer = camera.configure(want)
                 now = camera.settings
                 assert answer == now, f"configure() answered {answer}, but settings says {now}"
@@ -113,7 +303,7 @@ def check_camera_configure_tells_the_truth(factory: Factory) -> None:
                 assert answer.region == foreseen.region, (
                     f"check() foresaw {foreseen.region}, configure() made {answer.region}"
                 )
-                shape = camera.next_frame(patience_s(camera)).data.shape
+                shape = camera.next_frame(generous_timeout_s(camera)).data.shape
                 stated = (now.region.height, now.region.width)
                 assert shape == stated, f"settings says {stated}, but frames come as {shape}"
         finally:
@@ -123,16 +313,16 @@ def check_camera_configure_tells_the_truth(factory: Factory) -> None:
 @check(NORMAL)
 def check_camera_configures_while_running(factory: Factory) -> None:
     """Acquisition goes on after ``configure`` if it ran before, and stays off if it did not."""
-    with opened(factory) as camera:
+    with open_device(factory) as camera:
         original = camera.settings
         try:
-            camera.configure(_smaller(camera))
+            camera.configure(_half_region(camera))
             assert not camera.is_running, "configure() started acquisition"
             camera.start()
-            camera.next_frame(patience_s(camera))
+            camera.next_frame(generous_timeout_s(camera))
             camera.configure(original)
             assert camera.is_running, "acquisition did not go on after configure()"
-            camera.next_frame(patience_s(camera))
+            camera.next_frame(generous_timeout_s(camera))
         finally:
             camera.configure(original)
 
@@ -140,27 +330,27 @@ def check_camera_configures_while_running(factory: Factory) -> None:
 @check(READS)
 def check_camera_start_and_stop_repeat(factory: Factory) -> None:
     """``start`` and ``stop`` may be called any number of times; the first frame starts too."""
-    with opened(factory) as camera:
+    with open_device(factory) as camera:
         camera.stop()
         assert not camera.is_running, "running before start()"
         for _ in range(2):
             camera.start()
             camera.start()
             assert camera.is_running, "not running after start()"
-            camera.next_frame(patience_s(camera))
+            camera.next_frame(generous_timeout_s(camera))
             camera.stop()
             camera.stop()
             assert not camera.is_running, "still running after stop()"
-        camera.next_frame(patience_s(camera))
+        camera.next_frame(generous_timeout_s(camera))
         assert camera.is_running, "next_frame() did not start acquisition"
 
 
 @check(READS)
 def check_camera_restart_resets_counters(factory: Factory) -> None:
     """The counters count from ``start``; ``start`` of a running camera resets nothing."""
-    with opened(factory) as camera:
+    with open_device(factory) as camera:
         for _ in range(3):
-            camera.next_frame(patience_s(camera))
+            camera.next_frame(generous_timeout_s(camera))
         camera.start()
         assert camera.status().delivered == 3, f"{camera.status()} after three frames and a second start()"
         camera.stop()
@@ -172,44 +362,44 @@ def check_camera_restart_resets_counters(factory: Factory) -> None:
 @check(READS)
 def check_camera_closes_while_running(factory: Factory) -> None:
     """``close`` stops acquisition first, and the camera can be opened and used again."""
-    with opened(factory) as camera:
-        camera.next_frame(patience_s(camera))
+    with open_device(factory) as camera:
+        camera.next_frame(generous_timeout_s(camera))
         camera.close()
         assert not camera.is_open, "still open after close()"
         assert not camera.is_running, "still running after close()"
         camera.open()
         assert not camera.is_running, "running just after open()"
-        camera.next_frame(patience_s(camera))
+        camera.next_frame(generous_timeout_s(camera))
 
 
-def _smaller(camera: Camera) -> CameraSettings:
+def _half_region(camera: Camera) -> CameraSettings:
     now = camera.settings
     region = now.region
     half = Region(region.x, region.y, max(1, region.width // 2), max(1, region.height // 2))
     return replace(now, region=half)
 
 
-def _wishes(camera: Camera) -> list[CameraSettings]:
+def _trial_settings(camera: Camera) -> list[CameraSettings]:
     """Settings that any camera can come near to, none of them likely to be exactly achievable."""
     now = camera.settings
     longer = replace(now, exposure_s=now.exposure_s * 1.0137, frame_rate_hz=now.frame_rate_hz * 0.7731)
-    return [now, _smaller(camera), longer]
+    return [now, _half_region(camera), longer]
 
 
-CAMERA: tuple[Check, ...] = (
-    *COMMON,
+CAMERA_CHECKS: tuple[Check, ...] = (
+    *COMMON_CHECKS,
     check_camera_info_is_complete,
     check_camera_settings_are_achievable,
     check_camera_check_is_a_fixed_point,
     check_camera_check_changes_nothing,
     check_camera_refuses_regions_off_the_sensor,
     check_camera_refuses_meaningless_settings,
-    check_camera_configure_tells_the_truth,
+    check_camera_configure_reports_actual_settings,
     check_camera_configures_while_running,
     check_camera_start_and_stop_repeat,
     check_camera_restart_resets_counters,
     check_camera_closes_while_running,
-    *FRAMES,
+    *FRAME_CHECKS,
 )
 
 
@@ -221,4 +411,4 @@ def camera_checks(max_level: int = 3) -> list[Check]:
     max_level
         Leave out what changes more: 0 takes frames as it is set, 2 changes settings and back.
     """
-    return up_to(CAMERA, max_level)
+    return checks_up_to(CAMERA_CHECKS, max_level)

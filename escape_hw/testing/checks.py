@@ -41,20 +41,20 @@ class Check(Protocol):
 def check(level: int) -> Callable[[Callable[[Factory], None]], Check]:
     """Make a function a check of the given level."""
 
-    def mark(function: Callable[[Factory], None]) -> Check:
-        marked = cast(Check, function)
-        marked.level = level
-        return marked
+    def decorate(function: Callable[[Factory], None]) -> Check:
+        decorated = cast(Check, function)
+        decorated.level = level
+        return decorated
 
-    return mark
+    return decorate
 
 
-def up_to(checks: tuple[Check, ...], max_level: int) -> list[Check]:
+def checks_up_to(checks: tuple[Check, ...], max_level: int) -> list[Check]:
     """Those of ``checks`` that change no more than ``max_level`` allows."""
     return [one for one in checks if one.level <= max_level]
 
 
-def refused(device: Device, error: type[E], why: str, call: Callable[..., object], *args: object) -> E:
+def assert_refused(device: Device, error: type[E], why: str, call: Callable[..., object], *args: object) -> E:
     """Require that ``call(*args)`` raises ``error`` and that the message names the device.
 
     Parameters
@@ -76,9 +76,9 @@ def refused(device: Device, error: type[E], why: str, call: Callable[..., object
 
 
 @contextmanager
-def replaced(device: Device, hook: str, stand_in: Callable[..., Any]) -> Iterator[None]:
-    """Put ``stand_in`` in place of one of the driver's hooks, on this one device only."""
-    setattr(device, hook, stand_in)
+def replace_hook(device: Device, hook: str, replacement: Callable[..., Any]) -> Iterator[None]:
+    """Put ``replacement`` in place of one of the driver's hooks, on this one device only."""
+    setattr(device, hook, replacement)
     try:
         yield
     finally:
@@ -86,7 +86,7 @@ def replaced(device: Device, hook: str, stand_in: Callable[..., Any]) -> Iterato
 
 
 @contextmanager
-def opened(factory: Factory) -> Iterator[Any]:
+def open_device(factory: Factory) -> Iterator[Any]:
     """Give a fresh device, open; close it afterwards without hiding a failure of the check."""
     device = factory()
     device.open()

@@ -1,7 +1,10 @@
-"""What a deformable mirror promises about commands, copies, counters and clocks."""
+"""Contract checks of deformable mirrors: commands, limits, counters and flattening."""
 
 from __future__ import annotations
 
+import unittest
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -9,18 +12,255 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.mirror import DeformableMirror, DMInfo
-from escape_hw.errors import CommandRejected
-from escape_hw.safety.limits import MirrorLimits
-from escape_hw.testing.checks import READS, TINY, Check, Factory, check, opened, refused, up_to
-from escape_hw.testing.common import COMMON
-from escape_hw.testing.mirror_safety import SAFETY
-from escape_hw.testing.mirror_tools import gentle
+from escape_hw.errors import CommandRejected, DeviceError, DeviceLost
+from escape_hw.safety.limits import MirrorLimits, nearest_pairs, neighbour_pairs
+from escape_hw.testing.checks import (
+    FULL,
+    READS,
+    TINY,
+    Check,
+    Factory,
+    assert_refused,
+    check,
+    checks_up_to,
+    open_device,
+    replace_hook,
+)
+from escape_hw.testing.device import COMMON_CHECKS
+
+#: Largest breach that counts as rounding, fraction of full stroke.
+ROUNDING = 1e-9
+
+
+def small_poke(dm: DeformableMirror, amplitude: float = 0.01) -> NDArray[np.float64]:
+    """Give the flat shape with one enabled actuator poked: legal from flat under any limits."""
+    lim, flat = dm.limits, dm.flat
+    enabled = np.setdiff1d(np.arange(flat.size), lim.disabled)
+    if not enabled.size:
+        raise unittest.SkipTest(f"{dm.name}: every actuator is disabled")
+    bounds = (lim.max_stroke, lim.max_slew, lim.max_neighbour, lim.max_mean)
+    size = min(amplitude, *(0.5 * bound for bound in bounds if bound is not None))
+    chosen = enabled[np.abs(flat[enabled]).argmin()]
+    flat[chosen] += -size if flat[chosen] > 0 else size
+    return flat
+
+
+@contextmanager
+def record_transfers(dm: DeformableMirror) -> Iterator[list[NDArray[np.float64]]]:
+    """Record every command that the device took, in order."""
+    reached: list[NDArray[np.float64]] = []
+    transfer = dm._send
+
+    def record(command: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        assert command.dtype == np.float64, f"the driver got {command.dtype}, not float64"
+        assert command.flags.c_contiguous, "the driver got a command that is not contiguous"
+        assert command.shape == (dm.info.n_act,), f"the driver got shape {command.shape}"
+        kept = transfer(command)
+        if kept is None:
+            reached.append(command.copy())
+        return kept
+
+    with replace_hook(dm, "_send", record):
+        yield reached
+
+
+def limit_violations(
+    dm: DeformableMirror, before: NDArray[np.float64], after: NDArray[np.float64]
+) -> list[str]:
+    """Every limit that going from one shape to the next breaks (written anew, not asked of the guard)."""
+    lim, found = dm.limits, []
+    if not np.isfinite(after).all():
+        found.append("a value is not finite")
+    if np.abs(after).max() > lim.max_stroke:
+        found.append(f"stroke {np.abs(after).max():.6g} > {lim.max_stroke}")
+    if any(after[i] != 0 for i in lim.disabled):
+        found.append(f"a disabled actuator of {lim.disabled} moved")
+    if lim.max_slew is not None and np.abs(after - before).max() > lim.max_slew + ROUNDING:
+        found.append(f"slew {np.abs(after - before).max():.6g} > {lim.max_slew}")
+    enabled = np.setdiff1d(np.arange(after.size), lim.disabled)
+    if lim.max_mean is not None and enabled.size and abs(after[enabled].mean()) > lim.max_mean + ROUNDING:
+        found.append(f"mean {after[enabled].mean():.6g} > {lim.max_mean}")
+    if lim.max_neighbour is not None:
+        layout = dm.info.layout
+        pairs = nearest_pairs(dm.info.positions_m) if layout is None else neighbour_pairs(layout)
+        steps = [abs(after[a] - after[b]) for a, b in pairs]
+        if max(steps, default=0.0) > lim.max_neighbour + ROUNDING:
+            found.append(f"neighbours differ by {max(steps):.6g} > {lim.max_neighbour}")
+    return found
+
+
+@check(FULL)
+def check_mirror_obeys_its_limits(factory: Factory) -> None:
+    """Whatever is asked for, what reaches the device obeys every limit at once."""
+    rng = np.random.default_rng(1)
+    with open_device(factory) as dm:
+        n, start = dm.info.n_act, dm.shape
+        wild = [size * rng.standard_normal(n) for size in (0.01, 0.3, 1.0, 10.0, 1e300) for _ in range(8)]
+        level = [np.full(n, value) for value in (5.0, -5.0, 1.0, -1e308)]
+        checkers = [np.where(np.arange(n) % 2, value, -value) for value in (1.0, -2.0)]
+        with record_transfers(dm) as reached:
+            for command in (*wild, *level, *checkers):
+                report = dm.send(command)
+                assert np.array_equal(reached[-1], report.sent), "report.sent is not what reached the device"
+        for before, after in pairwise([start, *reached]):
+            broken = limit_violations(dm, before, after)
+            assert not broken, f"what reached the device breaks its limits: {'; '.join(broken)}"
+
+
+@check(FULL)
+def check_mirror_reports_clipping(factory: Factory) -> None:
+    """A command beyond the stroke is clipped, and the report and the counter say so."""
+    with open_device(factory) as dm:
+        dm.flatten()
+        command = np.zeros(dm.info.n_act)
+        poked = int(np.flatnonzero(small_poke(dm) != dm.flat)[0])
+        command[poked] = 5.0
+        report = dm.send(command)
+        assert report.guard.clipped == 1, (
+            f"one actuator was beyond the stroke, the report says {report.guard}"
+        )
+        assert not report.guard.is_unchanged, "the report says that nothing was changed"
+        assert dm.clipped_count == 1, f"clipped_count is {dm.clipped_count} after one clipped actuator"
+
+
+@check(TINY)
+def check_mirror_failed_transfer_keeps_shape(factory: Factory) -> None:
+    """When a transfer fails, the error comes out and the last good shape stays the last."""
+    with open_device(factory) as dm:
+        dm.flatten()
+        shape, sent, command = dm.shape, dm.sent_count, small_poke(dm)
+        with replace_hook(dm, "_send", _failing_transfer(dm)):
+            assert_refused(dm, DeviceLost, "a transfer that fails", dm.send, command)
+            assert np.array_equal(dm.shape, shape), "the transfer failed, but the shape changed"
+            assert dm.sent_count == sent, "the transfer failed, but sent_count rose"
+        dm.send(command)
+        assert np.array_equal(dm.shape, command), "no command passes after one failed transfer"
+
+
+@check(TINY)
+def check_mirror_flattens(factory: Factory) -> None:
+    """``flatten`` works just after ``open``, after a poke and after a rejected command."""
+    with open_device(factory) as dm, record_transfers(dm) as reached:
+        dm.flatten()
+        known = dm._present_shape() is not None
+        assert reached or known, "flatten() after open() sent nothing; the mirror may have any shape"
+        assert np.array_equal(dm.shape, dm.flat), "flatten() after open() did not end at flat"
+        for rejected in (False, True):
+            dm.send(small_poke(dm))
+            if rejected:
+                command = np.full(dm.info.n_act, np.nan)
+                assert_refused(dm, CommandRejected, "a command of NaN", dm.send, command)
+            dm.flatten()
+            assert np.array_equal(reached[-1], dm.flat), "flatten() did not end at flat"
+            assert np.array_equal(dm.shape, dm.flat), "shape is not flat after flatten()"
+
+
+@check(TINY)
+def check_mirror_flat_can_be_set(factory: Factory) -> None:
+    """A legal flat is kept and reached; an illegal one is refused and changes nothing."""
+    with open_device(factory) as dm:
+        dm.flatten()
+        chosen = small_poke(dm)
+        dm.set_flat(chosen)
+        too_far = np.full(dm.info.n_act, 1.5)
+        for what, command in (("NaN", np.full(dm.info.n_act, np.nan)), ("1.5 full strokes", too_far)):
+            assert_refused(dm, CommandRejected, f"a flat of {what}", dm.set_flat, command)
+        assert np.array_equal(dm.flat, chosen), "flat is not what set_flat() was given"
+        assert not np.array_equal(dm.shape, chosen), "set_flat() moved the mirror; flatten() does that"
+        dm.flatten()
+        assert np.array_equal(dm.shape, chosen), "flatten() did not go to the flat that was set"
+
+
+@check(FULL)
+def check_mirror_ramps_to_flat(factory: Factory) -> None:
+    """``flatten`` comes back from the end of the range in small steps, each legal."""
+    with open_device(factory) as dm:
+        small_poke(dm)  # skips when no actuator may move
+        shape = _drive_to_limit(dm)
+        with record_transfers(dm) as reached:
+            dm.flatten()
+            assert np.array_equal(reached[-1], dm.flat), "flatten() did not end at flat"
+            for before, after in pairwise([shape, *reached]):
+                step = float(np.abs(after - before).max())
+                assert step <= dm.RAMP_STEP + ROUNDING, (
+                    f"flatten() jumped by {step:.3g} of full stroke; RAMP_STEP is {dm.RAMP_STEP}"
+                )
+                broken = limit_violations(dm, before, after)
+                assert not broken, f"flatten() broke the limits on its way: {'; '.join(broken)}"
+
+
+@check(TINY)
+def check_mirror_is_flat_when_closed(factory: Factory) -> None:
+    """The last thing that reaches the device before it is disconnected is flat."""
+    with open_device(factory) as dm:
+        dm.send(small_poke(dm))
+        flat = dm.flat
+        with record_transfers(dm) as reached:
+            disconnect, state_at_close = dm._close, []
+
+            def record_and_close() -> None:
+                state_at_close.extend(reached[-1:])
+                disconnect()
+
+            with replace_hook(dm, "_close", record_and_close):
+                dm.close()
+        assert state_at_close, "close() sent nothing; the mirror was left poked"
+        assert np.array_equal(state_at_close[0], flat), "the mirror was not flat when it was disconnected"
+
+
+@check(TINY)
+def check_mirror_closes_when_lost(factory: Factory) -> None:
+    """A mirror that cannot be flattened any more is closed all the same, and the cause comes out."""
+    with open_device(factory) as dm:
+        dm.send(small_poke(dm))
+        with replace_hook(dm, "_send", _failing_transfer(dm)):
+            assert_refused(dm, DeviceLost, "close() of a mirror that was lost", dm.close)
+        assert not dm.is_open, "still open after close()"
+        dm.open()
+        dm.flatten()
+        assert np.array_equal(dm.shape, dm.flat), "it cannot be used again once it is back"
+        dm.send(small_poke(dm))
+        try:
+            with replace_hook(dm, "_send", _failing_transfer(dm)), dm:
+                raise DeviceError(dm.name, "the first cause")
+        except DeviceError as error:
+            assert "the first cause" in str(error), f"close() hid the first cause behind: {error}"
+
+
+def _failing_transfer(dm: DeformableMirror) -> Callable[[NDArray[np.float64]], None]:
+    def transfer(command: NDArray[np.float64]) -> None:
+        raise DeviceLost(dm.name, "unplugged by the check")
+
+    return transfer
+
+
+def _drive_to_limit(dm: DeformableMirror) -> NDArray[np.float64]:
+    """Send a smooth shape again and again until the mirror is as far out as it will go."""
+    target = np.linspace(-1.0, 1.0, dm.info.n_act)
+    for _ in range(1000):
+        before = dm.shape
+        dm.send(target)
+        if np.allclose(dm.shape, before, atol=ROUNDING):
+            break
+    return dm.shape
+
+
+SAFETY_CHECKS: tuple[Check, ...] = (
+    check_mirror_obeys_its_limits,
+    check_mirror_reports_clipping,
+    check_mirror_failed_transfer_keeps_shape,
+    check_mirror_flattens,
+    check_mirror_flat_can_be_set,
+    check_mirror_ramps_to_flat,
+    check_mirror_is_flat_when_closed,
+    check_mirror_closes_when_lost,
+)
 
 
 @check(READS)
 def check_mirror_info_is_complete(factory: Factory) -> None:
     """Identity and geometry are there, and agree with each other."""
-    with opened(factory) as dm:
+    with open_device(factory) as dm:
         info = dm.info
         assert isinstance(info, DMInfo), f"info is {type(info).__name__}, not DMInfo"
         assert info.model, "info.model is empty"
@@ -53,28 +293,28 @@ def _require_geometry(info: DMInfo) -> None:
 @check(READS)
 def check_mirror_refuses_not_finite(factory: Factory) -> None:
     """One NaN or infinity rejects the whole command and names its index."""
-    with opened(factory) as dm:
+    with open_device(factory) as dm:
         n_act = dm.info.n_act
         for value, index in ((np.nan, n_act - 1), (np.inf, 0), (-np.inf, n_act // 2)):
             command = np.zeros(n_act)
             command[index] = value
-            refusal = _nothing_happens(dm, command, f"a command with {value} at actuator {index}")
+            refusal = _assert_rejected(dm, command, f"a command with {value} at actuator {index}")
             assert f"actuator {index} " in f"{refusal} ", f"the index {index} is not named: {refusal}"
 
 
 @check(READS)
 def check_mirror_refuses_wrong_shape(factory: Factory) -> None:
     """A command of any shape but ``(n_act,)`` is rejected."""
-    with opened(factory) as dm:
+    with open_device(factory) as dm:
         n = dm.info.n_act
         for shape in ((n + 1,), (n - 1,), (n, 1), (1, n), (0,), ()):
-            _nothing_happens(dm, np.zeros(shape), f"a command of shape {shape}")
+            _assert_rejected(dm, np.zeros(shape), f"a command of shape {shape}")
 
 
 @check(READS)
 def check_mirror_refuses_wrong_type(factory: Factory) -> None:
     """Anything but real numbers is rejected, and never with an error of numpy's."""
-    with opened(factory) as dm:
+    with open_device(factory) as dm:
         n = dm.info.n_act
         wrong: dict[str, Any] = {
             "bool": np.zeros(n, dtype=bool),
@@ -87,13 +327,13 @@ def check_mirror_refuses_wrong_type(factory: Factory) -> None:
             "masked": np.ma.masked_array(np.zeros(n), mask=True),
         }
         for kind, command in wrong.items():
-            _nothing_happens(dm, command, f"a command of kind {kind}")
+            _assert_rejected(dm, command, f"a command of kind {kind}")
 
 
-def _nothing_happens(dm: DeformableMirror, command: Any, what: str) -> CommandRejected:
+def _assert_rejected(dm: DeformableMirror, command: Any, what: str) -> CommandRejected:
     """Require that ``command`` is rejected, counted, and leaves everything else as it was."""
     shape, sent, rejected = dm.shape, dm.sent_count, dm.rejected_count
-    refusal = refused(dm, CommandRejected, what, dm.send, command)
+    refusal = assert_refused(dm, CommandRejected, what, dm.send, command)
     assert np.array_equal(dm.shape, shape), f"{what}: it was rejected, but the shape changed"
     assert dm.sent_count == sent, f"{what}: it was rejected, but sent_count rose"
     assert dm.rejected_count == rejected + 1, (
@@ -105,11 +345,11 @@ def _nothing_happens(dm: DeformableMirror, command: Any, what: str) -> CommandRe
 @check(TINY)
 def check_mirror_sends_legal_commands_unchanged(factory: Factory) -> None:
     """What obeys every limit arrives bit for bit."""
-    with opened(factory) as dm:
+    with open_device(factory) as dm:
         dm.flatten()
-        command = gentle(dm)
+        command = small_poke(dm)
         report = dm.send(command)
-        assert report.guard.untouched, f"a legal command was changed: {report.guard}"
+        assert report.guard.is_unchanged, f"a legal command was changed: {report.guard}"
         assert np.array_equal(report.sent, command), "report.sent is not what was asked for"
         assert np.array_equal(dm.shape, command), "shape is not what was sent"
 
@@ -117,9 +357,9 @@ def check_mirror_sends_legal_commands_unchanged(factory: Factory) -> None:
 @check(TINY)
 def check_mirror_takes_any_real_array(factory: Factory) -> None:
     """Lists, float32, integers, strided and read-only arrays are commands too."""
-    with opened(factory) as dm:
+    with open_device(factory) as dm:
         dm.flatten()
-        plain = gentle(dm)
+        plain = small_poke(dm)
         strided = np.repeat(plain, 2)[::2]
         read_only = plain.copy()
         read_only.setflags(write=False)
@@ -142,9 +382,9 @@ def check_mirror_takes_any_real_array(factory: Factory) -> None:
 @check(TINY)
 def check_mirror_shares_no_memory(factory: Factory) -> None:
     """Neither the caller's array nor an answer's can change what the mirror holds."""
-    with opened(factory) as dm:
+    with open_device(factory) as dm:
         dm.flatten()
-        command = gentle(dm)
+        command = small_poke(dm)
         kept = command.copy()
         report = dm.send(command)
         assert np.array_equal(command, kept), "send() wrote into the caller's array"
@@ -160,10 +400,10 @@ def check_mirror_shares_no_memory(factory: Factory) -> None:
 @check(TINY)
 def check_mirror_counts(factory: Factory) -> None:
     """The counters count from ``open``, each send once."""
-    with opened(factory) as dm:
+    with open_device(factory) as dm:
         counts = (dm.sent_count, dm.clipped_count, dm.rejected_count)
         assert counts == (0, 0, 0), f"the counters are {counts} after open(); they count from there"
-        command = gentle(dm)
+        command = small_poke(dm)
         for n in range(1, 4):
             dm.send(command)
             assert dm.sent_count == n, f"sent_count is {dm.sent_count} after {n} sends"
@@ -174,8 +414,8 @@ def check_mirror_counts(factory: Factory) -> None:
 @check(TINY)
 def check_mirror_times_its_sends(factory: Factory) -> None:
     """``sent_ns`` is on the mirror's own clock, between before and after."""
-    with opened(factory) as dm:
-        command = gentle(dm)
+    with open_device(factory) as dm:
+        command = small_poke(dm)
         for _ in range(3):
             before = dm.now_ns()
             sent_ns = dm.send(command).sent_ns
@@ -183,8 +423,8 @@ def check_mirror_times_its_sends(factory: Factory) -> None:
             assert before <= sent_ns <= after, f"sent at {sent_ns} ns, but between {before} and {after} ns"
 
 
-MIRROR: tuple[Check, ...] = (
-    *COMMON,
+MIRROR_CHECKS: tuple[Check, ...] = (
+    *COMMON_CHECKS,
     check_mirror_info_is_complete,
     check_mirror_refuses_not_finite,
     check_mirror_refuses_wrong_shape,
@@ -194,7 +434,7 @@ MIRROR: tuple[Check, ...] = (
     check_mirror_shares_no_memory,
     check_mirror_counts,
     check_mirror_times_its_sends,
-    *SAFETY,
+    *SAFETY_CHECKS,
 )
 
 
@@ -206,4 +446,4 @@ def mirror_checks(max_level: int = 3) -> list[Check]:
     max_level
         Leave out what moves the mirror more: 0 rests, 1 pokes by a percent, 3 uses the full range.
     """
-    return up_to(MIRROR, max_level)
+    return checks_up_to(MIRROR_CHECKS, max_level)

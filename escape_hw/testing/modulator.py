@@ -7,14 +7,24 @@ from dataclasses import replace
 
 from escape_hw.api.modulator import Modulation, ModulatorInfo, ModulatorStatus, TipTiltModulator
 from escape_hw.errors import SettingRejected
-from escape_hw.testing.checks import READS, TINY, Check, Factory, check, opened, refused, replaced, up_to
-from escape_hw.testing.common import COMMON
+from escape_hw.testing.checks import (
+    READS,
+    TINY,
+    Check,
+    Factory,
+    assert_refused,
+    check,
+    checks_up_to,
+    open_device,
+    replace_hook,
+)
+from escape_hw.testing.device import COMMON_CHECKS
 
 #: A tilt that any stage for a pyramid sensor can do, in radians.
 _SMALL_RAD = 1e-6
 
 
-def _wish(modulator: TipTiltModulator) -> Modulation:
+def _trial_modulation(modulator: TipTiltModulator) -> Modulation:
     """A small circle at a rate the stage can do, unlikely to be exactly achievable."""
     for rate in (97.3, 9.73, 0.973, 973.0):
         want = Modulation(_SMALL_RAD, rate)
@@ -29,22 +39,22 @@ def _wish(modulator: TipTiltModulator) -> Modulation:
 @check(READS)
 def check_modulator_info(factory: Factory) -> None:
     """``info`` says what the stage is and how far it tilts, and that is what ``check`` holds it to."""
-    with opened(factory) as modulator:
+    with open_device(factory) as modulator:
         info = modulator.info
         assert isinstance(info, ModulatorInfo), f"info is {type(info).__name__}, not ModulatorInfo"
         assert info.model.strip(), "info.model is empty; products could not say which stage it was"
         assert type(info.simulated) is bool, f"info.simulated is {info.simulated!r}, neither true nor false"
         limit = info.max_tilt_rad
         assert 0 < limit < math.inf, f"info.max_tilt_rad is {limit}; it must be positive and finite"
-        wide = replace(_wish(modulator), radius_rad=1.01 * limit)
-        refused(modulator, SettingRejected, "a radius beyond info.max_tilt_rad", modulator.check, wide)
+        wide = replace(_trial_modulation(modulator), radius_rad=1.01 * limit)
+        assert_refused(modulator, SettingRejected, "a radius beyond info.max_tilt_rad", modulator.check, wide)
 
 
 @check(READS)
 def check_modulator_check_changes_nothing(factory: Factory) -> None:
     """``check`` moves nothing, and its own answer is achievable."""
-    with opened(factory) as modulator:
-        before, want = modulator.modulation, _wish(modulator)
+    with open_device(factory) as modulator:
+        before, want = modulator.modulation, _trial_modulation(modulator)
         answer = modulator.check(want)
         assert isinstance(answer, Modulation), f"check() gave {type(answer).__name__}"
         again = modulator.check(answer)
@@ -56,22 +66,22 @@ def check_modulator_check_changes_nothing(factory: Factory) -> None:
 @check(READS)
 def check_modulator_refuses_meaningless(factory: Factory) -> None:
     """Radius, frequency and centre that mean nothing are refused and move nothing."""
-    with opened(factory) as modulator:
-        before, good = modulator.modulation, _wish(modulator)
+    with open_device(factory) as modulator:
+        before, good = modulator.modulation, _trial_modulation(modulator)
         wrong = [replace(good, radius_rad=r) for r in (-1e-6, math.nan, math.inf)]
         wrong += [replace(good, frequency_hz=f) for f in (0.0, -1.0, math.nan, math.inf)]
         wrong += [replace(good, centre_rad=c) for c in ((math.nan, 0.0), (0.0, math.inf))]
         for want in wrong:
             for verb in (modulator.check, modulator.modulate):
-                refused(modulator, SettingRejected, f"{verb.__name__}({want})", verb, want)
+                assert_refused(modulator, SettingRejected, f"{verb.__name__}({want})", verb, want)
             assert modulator.modulation == before, f"{want} was refused, but the modulation changed"
 
 
 @check(TINY)
-def check_modulator_tells_the_truth(factory: Factory) -> None:
+def check_modulator_reports_actual_modulation(factory: Factory) -> None:
     """``modulate`` answers with what the stage says it does, which ``check`` had foreseen."""
-    with opened(factory) as modulator:
-        want = _wish(modulator)
+    with open_device(factory) as modulator:
+        want = _trial_modulation(modulator)
         foreseen = modulator.check(want)
         answer, now = modulator.modulate(want), modulator.modulation
         assert answer == now, f"modulate() answered {answer}, but modulation says {now}"
@@ -86,10 +96,10 @@ def check_modulator_tells_the_truth(factory: Factory) -> None:
 @check(TINY)
 def check_modulator_parks(factory: Factory) -> None:
     """``park`` stops the modulation, may be repeated, and is where the stage is on opening."""
-    with opened(factory) as modulator:
+    with open_device(factory) as modulator:
         assert modulator.modulation is None, f"modulating on opening: {modulator.modulation}"
         modulator.park()
-        modulator.modulate(_wish(modulator))
+        modulator.modulate(_trial_modulation(modulator))
         for _ in range(2):
             modulator.park()
             assert modulator.modulation is None, f"after park(): {modulator.modulation}"
@@ -98,26 +108,26 @@ def check_modulator_parks(factory: Factory) -> None:
 @check(TINY)
 def check_modulator_is_parked_when_closed(factory: Factory) -> None:
     """``close`` parks before it disconnects."""
-    with opened(factory) as modulator:
-        modulator.modulate(_wish(modulator))
-        disconnect, at_the_end = modulator._close, []  # noqa: SLF001 - see the state by then
+    with open_device(factory) as modulator:
+        modulator.modulate(_trial_modulation(modulator))
+        disconnect, state_at_close = modulator._close, []
 
-        def closing() -> None:
-            at_the_end.append(modulator.modulation)
+        def record_and_close() -> None:
+            state_at_close.append(modulator.modulation)
             disconnect()
 
-        with replaced(modulator, "_close", closing):
+        with replace_hook(modulator, "_close", record_and_close):
             modulator.close()
-        assert at_the_end == [None], f"the stage was left at {at_the_end} when it was disconnected"
+        assert state_at_close == [None], f"the stage was left at {state_at_close} when it was disconnected"
 
 
 @check(TINY)
 def check_modulator_status_moves_nothing(factory: Factory) -> None:
     """``status`` says what the stage does, turning, parked and closed, and leaves it so."""
-    with opened(factory) as modulator:
+    with open_device(factory) as modulator:
         for turning in (False, True):
             if turning:
-                modulator.modulate(_wish(modulator))
+                modulator.modulate(_trial_modulation(modulator))
             now = modulator.modulation
             status = modulator.status()
             assert isinstance(status, ModulatorStatus), f"status() gave {type(status).__name__}"
@@ -130,12 +140,12 @@ def check_modulator_status_moves_nothing(factory: Factory) -> None:
         assert not modulator.is_open, "status() left a stage open that was closed"
 
 
-MODULATOR: tuple[Check, ...] = (
-    *COMMON,
+MODULATOR_CHECKS: tuple[Check, ...] = (
+    *COMMON_CHECKS,
     check_modulator_info,
     check_modulator_check_changes_nothing,
     check_modulator_refuses_meaningless,
-    check_modulator_tells_the_truth,
+    check_modulator_reports_actual_modulation,
     check_modulator_parks,
     check_modulator_is_parked_when_closed,
     check_modulator_status_moves_nothing,
@@ -150,4 +160,4 @@ def modulator_checks(max_level: int = 3) -> list[Check]:
     max_level
         Leave out what moves the stage more: 0 rests, 1 modulates by a microradian.
     """
-    return up_to(MODULATOR, max_level)
+    return checks_up_to(MODULATOR_CHECKS, max_level)

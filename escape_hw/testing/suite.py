@@ -12,14 +12,14 @@ from escape_hw.api.camera import Camera
 from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror
 from escape_hw.api.modulator import TipTiltModulator
-from escape_hw.api.screen import PhaseScreen
+from escape_hw.api.phase_screen import PhaseScreen
+from escape_hw.testing.adaptive_secondary import secondary_checks
 from escape_hw.testing.camera import camera_checks
-from escape_hw.testing.checks import Check, Factory, up_to
-from escape_hw.testing.common import COMMON
+from escape_hw.testing.checks import Check, Factory, checks_up_to
+from escape_hw.testing.device import COMMON_CHECKS
 from escape_hw.testing.mirror import mirror_checks
 from escape_hw.testing.modulator import modulator_checks
-from escape_hw.testing.screen import screen_checks
-from escape_hw.testing.secondary import secondary_checks
+from escape_hw.testing.phase_screen import screen_checks
 
 if TYPE_CHECKING:
     import pytest
@@ -47,7 +47,7 @@ def checks_for(device: Device, max_level: int = 3) -> list[Check]:
         return modulator_checks(max_level)
     if isinstance(device, PhaseScreen):
         return screen_checks(max_level)
-    return up_to(COMMON, max_level)
+    return checks_up_to(COMMON_CHECKS, max_level)
 
 
 def run_checks(factory: Factory, max_level: int = 3) -> list[CheckResult]:
@@ -74,8 +74,10 @@ def _outcome(check: Check, factory: Factory) -> CheckResult:
     except unittest.SkipTest as reason:
         return CheckResult(check.__name__, check.level, "skipped", str(reason))
     except Exception as failure:
-        told = str(failure) if isinstance(failure, AssertionError) else f"{type(failure).__name__}: {failure}"
-        return CheckResult(check.__name__, check.level, "failed", told)
+        failure_text = (
+            str(failure) if isinstance(failure, AssertionError) else f"{type(failure).__name__}: {failure}"
+        )
+        return CheckResult(check.__name__, check.level, "failed", failure_text)
     return CheckResult(check.__name__, check.level, "passed")
 
 

@@ -13,8 +13,8 @@ from escape_hw.api.camera import Camera
 from escape_hw.api.device import Device
 from escape_hw.errors import DeviceError, FrameTimeout
 from escape_hw.testing import camera_checks
-from escape_hw.testing.common import COMMON
-from escape_hw.testing.reference import SyntheticCamera
+from escape_hw.testing.device import COMMON_CHECKS
+from escape_hw.testing.reference_devices import SyntheticCamera
 
 Broken = tuple[str, type[Device], str, dict[str, Any]]
 Catches = Callable[[Callable[[], Device], str], None]
@@ -210,6 +210,6 @@ def test_check_catches(catches: Catches, base: type[Device], expected: str, defe
 
 
 def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in set(camera_checks()) - set(COMMON)} == {
+    assert {check.__name__ for check in set(camera_checks()) - set(COMMON_CHECKS)} == {
         f"check_{case[2]}" for case in BROKEN
     }

@@ -10,15 +10,15 @@ import pytest
 
 from escape_hw.api.device import Device
 from escape_hw.errors import DeviceError, NotOpen
-from escape_hw.testing.common import COMMON
-from escape_hw.testing.reference import RecordingMirror, SteadyScreen
+from escape_hw.testing.device import COMMON_CHECKS
+from escape_hw.testing.reference_devices import IdealPhaseScreen, RecordingMirror
 
 Broken = tuple[str, type[Device], str, dict[str, Any]]
 Catches = Callable[[Callable[[], Device], str], None]
 
 
 def opens_itself(self: Any) -> None:
-    SteadyScreen.__init__(self)
+    IdealPhaseScreen.__init__(self)
     self._is_open = True
 
 
@@ -34,7 +34,7 @@ def swallows(self: Any, *error: Any) -> bool:
 
 
 def sets_anyway(self: Any, **change: Any) -> Any:
-    return self._state if not self.is_open else SteadyScreen.set(self, **change)
+    return self._state if not self.is_open else IdealPhaseScreen.set(self, **change)
 
 
 def unnamed_not_open(self: Any) -> None:
@@ -47,23 +47,23 @@ def falling_clock(self: Any) -> int:
 
 
 BROKEN: list[Broken] = [
-    ("opens itself", SteadyScreen, "construction_is_passive", {"__init__": opens_itself}),
-    ("finaliser", SteadyScreen, "construction_is_passive", {"__del__": lambda self: None}),
+    ("opens itself", IdealPhaseScreen, "construction_is_passive", {"__init__": opens_itself}),
+    ("finaliser", IdealPhaseScreen, "construction_is_passive", {"__del__": lambda self: None}),
     (
         "no name",
-        SteadyScreen,
+        IdealPhaseScreen,
         "construction_is_passive",
-        {"__init__": lambda self: SteadyScreen.__init__(self, "")},
+        {"__init__": lambda self: IdealPhaseScreen.__init__(self, "")},
     ),
     ("overrides send", RecordingMirror, "final_methods_are_kept", {"send": lambda self, c: self._send(c)}),
-    ("opens once", SteadyScreen, "open_and_close_repeat", {"_open": refuses_to_reopen}),
-    ("swallows errors", SteadyScreen, "context_manager", {"__exit__": swallows}),
-    ("works while closed", SteadyScreen, "refuses_use_unless_open", {"set": sets_anyway}),
-    ("does not say who", SteadyScreen, "refuses_use_unless_open", {"require_open": unnamed_not_open}),
-    ("clock runs backwards", SteadyScreen, "clock_never_runs_backwards", {"now_ns": falling_clock}),
+    ("opens once", IdealPhaseScreen, "open_and_close_repeat", {"_open": refuses_to_reopen}),
+    ("swallows errors", IdealPhaseScreen, "context_manager", {"__exit__": swallows}),
+    ("works while closed", IdealPhaseScreen, "refuses_use_unless_open", {"set": sets_anyway}),
+    ("does not say who", IdealPhaseScreen, "refuses_use_unless_open", {"require_open": unnamed_not_open}),
+    ("clock runs backwards", IdealPhaseScreen, "clock_never_runs_backwards", {"now_ns": falling_clock}),
     (
         "clock in seconds",
-        SteadyScreen,
+        IdealPhaseScreen,
         "clock_never_runs_backwards",
         {"now_ns": lambda self: time.monotonic()},
     ),
@@ -78,4 +78,4 @@ def test_check_catches(catches: Catches, base: type[Device], expected: str, defe
 
 
 def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in COMMON} == {f"check_{case[2]}" for case in BROKEN}
+    assert {check.__name__ for check in COMMON_CHECKS} == {f"check_{case[2]}" for case in BROKEN}

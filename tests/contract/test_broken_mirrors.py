@@ -15,8 +15,8 @@ from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
 from escape_hw.errors import CommandRejected
 from escape_hw.safety.guard import GuardReport
 from escape_hw.testing import mirror_checks
-from escape_hw.testing.common import COMMON
-from escape_hw.testing.reference import RecordingMirror
+from escape_hw.testing.device import COMMON_CHECKS
+from escape_hw.testing.reference_devices import RecordingMirror
 
 Broken = tuple[str, type[Device], str, dict[str, Any]]
 Catches = Callable[[Callable[[], Device], str], None]
@@ -99,7 +99,7 @@ def on_another_clock(self: Any, command: Any) -> Any:
 
 def beyond_the_guard(self: Any) -> None:
     DeformableMirror._after_open(self)
-    self._guard.obeys = lambda shape: True
+    self._guard.is_legal = lambda shape: True
 
 
 def keeps_quiet(self: Any, command: Any) -> Any:
@@ -108,7 +108,7 @@ def keeps_quiet(self: Any, command: Any) -> Any:
 
 
 def accepts_first(self: Any, command: Any) -> Any:
-    safe, _ = self._checked()(command)
+    safe, _ = self._guard_when_open()(command)
     self._guard.reset(self._guard.last)
     return DeformableMirror.send(self, safe)
 
@@ -184,6 +184,6 @@ def test_check_catches(catches: Catches, base: type[Device], expected: str, defe
 
 
 def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in set(mirror_checks()) - set(COMMON)} == {
+    assert {check.__name__ for check in set(mirror_checks()) - set(COMMON_CHECKS)} == {
         f"check_{case[2]}" for case in BROKEN
     }

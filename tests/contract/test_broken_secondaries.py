@@ -15,24 +15,24 @@ from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror
 from escape_hw.errors import DeviceError
 from escape_hw.testing import mirror_checks, secondary_checks
-from escape_hw.testing.reference import ObedientSecondary
+from escape_hw.testing.reference_devices import IdealSecondary
 
 Catches = Callable[[Callable[[], Device], str], None]
 
 
 def sticks_on_the_way_down(self: Any, state: ShellState) -> None:
     if state is not ShellState.OFF:
-        ObedientSecondary._step(self, state)
+        IdealSecondary._step(self, state)
 
 
 def health_of_another_state(self: Any) -> Any:
-    return replace(ObedientSecondary._health(self), state=ShellState.RUNNING)
+    return replace(IdealSecondary._health(self), state=ShellState.RUNNING)
 
 
 def always_follows(self: Any, command: Any) -> Any:
     with contextlib.suppress(DeviceError):
         return DeformableMirror.send(self, command)
-    self._guard.accept(np.asarray(command, dtype=float))
+    self._guard.set_last(np.asarray(command, dtype=float))
     return None
 
 
@@ -45,7 +45,7 @@ def keeps_its_shape(self: Any, state: ShellState) -> None:
 
 def goes_anywhere(self: Any, state: ShellState) -> None:
     if state is not ShellState.FAULT:
-        AdaptiveSecondary.go(self, state)
+        AdaptiveSecondary.go_to(self, state)
 
 
 def half_of_them(self: Any) -> Any:
@@ -58,11 +58,11 @@ def in_metres_per_stroke(self: Any) -> Any:
 
 
 def no_gap(self: Any) -> Any:
-    return replace(ObedientSecondary._health(self), gap_m=float("nan"))
+    return replace(IdealSecondary._health(self), gap_m=float("nan"))
 
 
 def drives_regardless(self: Any, command: Any) -> Any:
-    return self._drive(command)
+    return self._send_to_shell(command)
 
 
 def hides_the_way_out(self: Any, fault: str) -> DeviceError:
@@ -96,7 +96,7 @@ BROKEN: list[tuple[str, str, dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
 def test_check_catches(catches: Catches, expected: str, defects: dict[str, Any]) -> None:
-    catches(type("Broken", (ObedientSecondary,), defects), expected)
+    catches(type("Broken", (IdealSecondary,), defects), expected)
 
 
 def test_every_check_is_tested() -> None:

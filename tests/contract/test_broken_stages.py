@@ -11,11 +11,11 @@ import pytest
 
 from escape_hw.api.device import Device
 from escape_hw.api.modulator import ModulatorInfo, ModulatorStatus
-from escape_hw.api.screen import ScreenInfo
+from escape_hw.api.phase_screen import ScreenInfo
 from escape_hw.errors import SettingRejected
 from escape_hw.testing import modulator_checks, screen_checks
-from escape_hw.testing.common import COMMON
-from escape_hw.testing.reference import QuantisedModulator, SteadyScreen
+from escape_hw.testing.device import COMMON_CHECKS
+from escape_hw.testing.reference_devices import IdealPhaseScreen, QuantisedModulator
 
 Broken = tuple[str, type[Device], str, dict[str, Any]]
 Catches = Callable[[Callable[[], Device], str], None]
@@ -38,11 +38,11 @@ def modulates_as_asked(self: Any, want: Any) -> Any:
 
 def forgets_the_rest(self: Any, **change: Any) -> Any:
     self.require_open()
-    return SteadyScreen.set(self, **{"screen": 0, **change})
+    return IdealPhaseScreen.set(self, **{"screen": 0, **change})
 
 
 def answers_blindly(self: Any, **change: Any) -> Any:
-    return replace(SteadyScreen.set(self, **change), speed_m_s=1.0)
+    return replace(IdealPhaseScreen.set(self, **change), speed_m_s=1.0)
 
 
 def sticks(self: Any, want: Any) -> None:
@@ -51,7 +51,7 @@ def sticks(self: Any, want: Any) -> None:
 
 def repairs_screen(self: Any, **change: Any) -> Any:
     try:
-        return SteadyScreen.set(self, **change)
+        return IdealPhaseScreen.set(self, **change)
     except SettingRejected:
         return self._state
 
@@ -79,12 +79,17 @@ BROKEN: list[Broken] = [
         {"_before_close": lambda self: None},
     ),
     ("status lies", QuantisedModulator, "modulator_status_moves_nothing", {"_status": tells_of_rest}),
-    ("nobody's", SteadyScreen, "screen_info", {"info": ScreenInfo(" ", "1", True)}),
-    ("counts from one", SteadyScreen, "screen_state_makes_sense", {"n_screens": property(lambda self: 1)}),
-    ("takes anything", SteadyScreen, "screen_refuses_meaningless", {"set": repairs_screen}),
-    ("forgets the rest", SteadyScreen, "screen_set_keeps_the_rest", {"set": forgets_the_rest}),
-    ("answers blindly", SteadyScreen, "screen_set_keeps_the_rest", {"set": answers_blindly}),
-    ("sticks", SteadyScreen, "screen_reaches_every_screen", {"_set": sticks}),
+    ("nobody's", IdealPhaseScreen, "screen_info", {"info": ScreenInfo(" ", "1", True)}),
+    (
+        "counts from one",
+        IdealPhaseScreen,
+        "screen_state_makes_sense",
+        {"n_screens": property(lambda self: 1)},
+    ),
+    ("takes anything", IdealPhaseScreen, "screen_refuses_meaningless", {"set": repairs_screen}),
+    ("forgets the rest", IdealPhaseScreen, "screen_set_keeps_the_rest", {"set": forgets_the_rest}),
+    ("answers blindly", IdealPhaseScreen, "screen_set_keeps_the_rest", {"set": answers_blindly}),
+    ("sticks", IdealPhaseScreen, "screen_reaches_every_screen", {"_set": sticks}),
 ]
 
 
@@ -96,6 +101,6 @@ def test_check_catches(catches: Catches, base: type[Device], expected: str, defe
 
 
 def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in {*modulator_checks(), *screen_checks()} - set(COMMON)} == {
+    assert {check.__name__ for check in {*modulator_checks(), *screen_checks()} - set(COMMON_CHECKS)} == {
         f"check_{case[2]}" for case in BROKEN
     }

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from escape_drivers.pi_modulator import PiModulator, make_modulator
-from escape_drivers.pi_transports import SerialTransport
-from escape_drivers.pi_usb import UsbTransport
-from escape_hw.config.load import load_system
-from escape_hw.config.models import SystemConfig
+from escape_drivers.pi.modulator import PiModulator, make_modulator
+from escape_drivers.pi.transports import SerialTransport, UsbTransport
+from escape_hw.config.loader import load_system
+from escape_hw.config.system import SystemConfig
 from escape_hw.testing import Check, Factory, parametrize_device_checks
-from escape_sim.emulators.e727_controller import Controller
-from escape_sim.emulators.e727_state import Make
-from escape_sim.emulators.e727_usb import VENDOR, UsbBackend
-from escape_sim.emulators.e727_wires import PtyServer, UsbPipe
-from escape_sim.emulators.faults import FaultyWire
+from escape_sim.emulators.e727.controller import E727Controller
+from escape_sim.emulators.e727.state import ControllerSettings
+from escape_sim.emulators.e727.transports import FaultInjector, PtyServer, UsbPipe
+from escape_sim.emulators.e727.usb_backend import VENDOR, UsbBackend
 
-MAKE = Make(serial="SIMMOD", zeroed=True)
+MAKE = ControllerSettings(serial="SIMMOD", zeroed=True)
 
 
 @cache
@@ -31,7 +29,7 @@ class PtyTransport(SerialTransport):
 
     def __init__(self) -> None:
         super().__init__("not yet", 115200, 1.0)
-        self._server = PtyServer(Controller(MAKE), FaultyWire())
+        self._server = PtyServer(E727Controller(MAKE), FaultInjector())
 
     def open(self) -> None:
         self.where = self._server.start().removeprefix("pty ")
@@ -58,7 +56,7 @@ def over_serial() -> PiModulator:
 
 def over_usb() -> PiModulator:
     def connect() -> UsbTransport:
-        bus = UsbBackend(UsbPipe(Controller(MAKE), FaultyWire()), busy=True)
+        bus = UsbBackend(UsbPipe(E727Controller(MAKE), FaultInjector()), busy=True)
         return UsbTransport(VENDOR, None, "SIMMOD", 1.0, bus)
 
     return with_wire(connect)

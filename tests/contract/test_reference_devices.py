@@ -14,11 +14,11 @@ from escape_hw.testing import (
     parametrize_device_checks,
     run_checks,
 )
-from escape_hw.testing.reference import (
-    ObedientSecondary,
+from escape_hw.testing.reference_devices import (
+    IdealPhaseScreen,
+    IdealSecondary,
     QuantisedModulator,
     RecordingMirror,
-    SteadyScreen,
     SyntheticCamera,
 )
 
@@ -39,11 +39,11 @@ FACTORIES: dict[str, Factory] = {
     "mirror-biased": biased_mirror,
     "mirror-wrapped": lambda: FaultyMirror(RecordingMirror("tight", TIGHT)),
     "mirror-biased-wrapped": lambda: FaultyMirror(biased_mirror()),
-    "secondary": ObedientSecondary,
+    "secondary": IdealSecondary,
     "camera": SyntheticCamera,
     "camera-wrapped": lambda: FaultyCamera(SyntheticCamera()),
     "modulator": QuantisedModulator,
-    "screen": SteadyScreen,
+    "screen": IdealPhaseScreen,
 }
 
 

@@ -6,10 +6,12 @@ from functools import cache, partial
 from typing import Any
 
 from escape_hw.api.modulator import Modulation
-from escape_hw.config.load import load_system
-from escape_hw.config.models import SystemConfig
+from escape_hw.config.loader import load_system
+from escape_hw.config.system import SystemConfig
 from escape_hw.testing import Check, Factory, parametrize_device_checks
-from escape_sim import devices, sim_modulator, sim_secondary
+from escape_sim.devices import twins as devices
+from escape_sim.devices import twins as sim_modulator
+from escape_sim.devices import twins as sim_secondary
 
 
 @cache
@@ -29,7 +31,7 @@ def slaved_camera() -> Any:
     with sim_modulator.make_modulator("modulator", config, shared) as stage:
         turning = stage.modulate(Modulation(1.4e-4, 303.0))
     bench = devices.shared_bench(config, shared)
-    bench.beam_circle.modulation = turning
+    bench.beam_path.modulation = turning
     bench.plates.inserted = False
     return devices.make_wfs_camera("wfs", config, shared)
 

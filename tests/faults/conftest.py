@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from small_bench import small
 
-from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.model import SyntheticModel
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.calibration.docrime import DocrimeRun, docrime_run
-from escape_hw.calibration.model_psf import measure_model_psf
-from escape_hw.runtime.records import without_turbulence
-from escape_hw.runtime.system import System
-from escape_sim.screen import von_karman_screen
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.calibration.acquisition.model_psf import measure_model_psf
+from escape_hw.calibration.docrime.open_loop import DocrimeRun, docrime_run
+from escape_hw.runtime.session.record import without_turbulence
+from escape_hw.runtime.session.system import System
+from escape_sim.atmosphere.phase_plates import von_karman_screen
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -31,8 +31,8 @@ def _quick_benches() -> Iterator[None]:
         return plates[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("escape_sim.phase_plates.von_karman_screen", remembered)
-        patch.setattr("escape_sim.detector.Detector.POOL", 1 << 19)
+        patch.setattr("escape_sim.atmosphere.phase_plates.von_karman_screen", remembered)
+        patch.setattr("escape_sim.optics.detector.Detector.POOL", 1 << 19)
         yield
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import time
 
-from escape_drivers.pi_modulator import PiModulator
-from escape_drivers.pi_transports import WireLost
-from escape_hw.config.load import load_system
-from escape_sim.emulators.e727_controller import Controller
-from escape_sim.emulators.e727_state import Make
-from escape_sim.emulators.e727_wires import UsbPipe
-from escape_sim.emulators.faults import Fault, FaultyWire
+from escape_drivers.pi.modulator import PiModulator
+from escape_drivers.pi.transports import TransportLost
+from escape_hw.config.loader import load_system
+from escape_sim.emulators.e727.controller import E727Controller
+from escape_sim.emulators.e727.state import ControllerSettings
+from escape_sim.emulators.e727.transports import FaultInjector, UsbPipe, WireFault
 
 #: How many times faster than real the emulated stage lives; the longest wait for a reply.
 HURRY, TIMEOUT_S = 40.0, 0.03
@@ -21,39 +20,39 @@ class Pipe:
 
     where = "pipe"
 
-    def __init__(self, controller: Controller, wire: FaultyWire) -> None:
+    def __init__(self, controller: E727Controller, wire: FaultInjector) -> None:
         self._usb, self._held = UsbPipe(controller, wire), b""
         self.is_open = False
 
     def open(self) -> None:
-        self.is_open = self._usb.plugged = True
+        self.is_open = self._usb.is_plugged = True
 
     def close(self) -> None:
-        if self.is_open and self._usb.plugged:
-            self._usb.conversation.ended()
+        if self.is_open and self._usb.is_plugged:
+            self._usb.client_session.finish()
         self.is_open = False
 
     def write(self, data: bytes) -> None:
         if not self.is_open:
-            raise WireLost("the pipe to the controller is closed; open it again")
+            raise TransportLost("the pipe to the controller is closed; open it again")
         try:
             self._usb.write(data + b"\0" * (len(data) % 2))
         except ConnectionError:
-            raise WireLost("the pipe to the controller broke; join it and open again") from None
+            raise TransportLost("the pipe to the controller broke; join it and open again") from None
 
     def read(self, timeout_s: float) -> bytes:
-        if not self._usb.plugged:
-            raise WireLost("the pipe to the controller broke; join it and open again")
+        if not self._usb.is_plugged:
+            raise TransportLost("the pipe to the controller broke; join it and open again")
         return self._usb.read(65536, timeout_s)
 
 
 class Peers:
     """The emulated controller, and drivers for it."""
 
-    def __init__(self, *faults: Fault, zeroed: bool = True, correct: str = "none") -> None:
-        make = Make(serial="SIMMOD", zeroed=zeroed, auto_zero_s=2.0)
-        self.controller = Controller(make, lambda: HURRY * time.monotonic())
-        self.wire = FaultyWire(faults)
+    def __init__(self, *faults: WireFault, zeroed: bool = True, correct: str = "none") -> None:
+        make = ControllerSettings(serial="SIMMOD", zeroed=zeroed, auto_zero_s=2.0)
+        self.controller = E727Controller(make, lambda: HURRY * time.monotonic())
+        self.wire = FaultInjector(faults)
         overrides = [f'devices.modulator.stage.correct="{correct}"', "devices.modulator.stage.settle_s=0.5"]
         overrides.append(f"devices.modulator.wire.timeout_s={TIMEOUT_S}")
         section = load_system("razor-pywfs", overrides=overrides).devices.modulator

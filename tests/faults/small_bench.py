@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from small_system import configuration
 
-from escape_hw.runtime.system import System
+from escape_hw.runtime.session.system import System
 from escape_hw.testing import FaultyCamera, FaultyMirror
 
 PLANTED = np.array([-16.0, -71.0, -0.77, 2.9, 0.0])

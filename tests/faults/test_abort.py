@@ -11,17 +11,17 @@ import pytest
 from small_bench import assert_flat, small
 
 from escape_hw.api.procedure import Progress
-from escape_hw.calibration.closed_loop import closed_loop
-from escape_hw.calibration.docrime import docrime
-from escape_hw.calibration.escape import escape
-from escape_hw.calibration.gain_search import best_gain
-from escape_hw.calibration.model_psf import measure_model_psf
-from escape_hw.calibration.push_pull import push_pull
-from escape_hw.calibration.sensor_setup import find_sensor, measure_dark
+from escape_hw.calibration.acquisition.model_psf import measure_model_psf
+from escape_hw.calibration.acquisition.sensor_setup import find_sensor, measure_dark
+from escape_hw.calibration.docrime.open_loop import docrime
+from escape_hw.calibration.escape.method import escape
+from escape_hw.calibration.loop.gain_search import best_gain
+from escape_hw.calibration.loop.performance import close_loop
+from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.errors import Aborted
-from escape_hw.runtime.procedures import model_psf
-from escape_hw.runtime.records import without_turbulence
-from escape_hw.runtime.reproduce import reproduce_shwfs, reproduce_table1
+from escape_hw.paper.experiments import reproduce_shwfs, reproduce_table1
+from escape_hw.runtime.procedures.calibration import model_psf
+from escape_hw.runtime.session.record import without_turbulence
 
 
 def calm(bench, procedure):
@@ -45,9 +45,9 @@ PLACES = {
     "ESCAPE, SPRINT": (lambda b, g: escape(b, frames=400), "SPRINT", 0.05),
     "model PSF": (lambda b, g: model_psf(b, frames=500), "model PSF", 0.01),
     "best gain": (lambda b, g: best_gain(b, g.matrix, g.grid, frames=50_000), "loop at gain", 0.006),
-    "closed loop": (lambda b, g: closed_loop(b, g.matrix, g.grid, frames=100_000), "closed loop", 0.003),
+    "closed loop": (lambda b, g: close_loop(b, g.matrix, g.grid, frames=100_000), "closed loop", 0.003),
     "closed loop with Strehl": (
-        lambda b, g: closed_loop(b, g.matrix, g.grid, frames=100_000, model_psf=g.psf),
+        lambda b, g: close_loop(b, g.matrix, g.grid, frames=100_000, model_psf=g.psf),
         "closed loop",
         0.004,
     ),
@@ -166,11 +166,11 @@ def test_a_loop_stopped_and_started_again(good):
     with small() as bench:
         with pytest.raises(Aborted):
             bench.run(
-                closed_loop(bench, good.matrix, good.grid, frames=100_000),
+                close_loop(bench, good.matrix, good.grid, frames=100_000),
                 observers=(stop,),
                 abort=stop.abort,
             )
-        result = bench.run(closed_loop(bench, good.matrix, good.grid, frames=300))
+        result = bench.run(close_loop(bench, good.matrix, good.grid, frames=300))
         assert result.stable
         assert result.frames == 300
         assert_flat(bench)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from small_bench import assert_flat
 
-from escape_hw.calibration.closed_loop import closed_loop
-from escape_hw.calibration.docrime import docrime
-from escape_hw.calibration.escape import escape
-from escape_hw.calibration.gain_search import best_gain
-from escape_hw.calibration.model_psf import measure_model_psf
-from escape_hw.calibration.push_pull import push_pull
-from escape_hw.calibration.sensor_setup import find_sensor, measure_dark
+from escape_hw.calibration.acquisition.model_psf import measure_model_psf
+from escape_hw.calibration.acquisition.sensor_setup import find_sensor, measure_dark
+from escape_hw.calibration.docrime.open_loop import docrime
+from escape_hw.calibration.escape.method import escape
+from escape_hw.calibration.loop.gain_search import best_gain
+from escape_hw.calibration.loop.performance import close_loop
+from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.errors import (
     CalibrationError,
     CommandRejected,
@@ -24,7 +24,7 @@ from escape_hw.errors import (
     IncompatibleProduct,
     TooFewFrames,
 )
-from escape_hw.pipeline.slopes import SlopeExtractor
+from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
 
 
 def refuse(bench, procedure, error: type[EscapeError], match: str) -> None:
@@ -89,7 +89,7 @@ def test_an_unknown_estimator(shared):
     ],
 )
 def test_loop_settings_that_mean_nothing(shared, good, options, error, match):
-    refuse(shared, closed_loop(shared, good.matrix, good.grid, **options), error, match)
+    refuse(shared, close_loop(shared, good.matrix, good.grid, **options), error, match)
 
 
 def test_a_gain_that_means_nothing_in_the_search(shared, good):
@@ -101,30 +101,30 @@ def test_a_gain_that_means_nothing_in_the_search(shared, good):
 )
 def test_a_matrix_that_cannot_be_inverted(shared, good, value, match):
     spoilt = replace(good.matrix, data=np.full_like(good.matrix.data, value))
-    refuse(shared, closed_loop(shared, spoilt, good.grid), CalibrationError, match)
+    refuse(shared, close_loop(shared, spoilt, good.grid), CalibrationError, match)
 
 
 def test_matrix_and_grid_that_do_not_belong_together(shared, good):
     other = np.zeros_like(good.grid.valid)
     other.flat[: good.grid.n_valid] = True
     grid = replace(good.grid, valid=other)
-    refuse(shared, closed_loop(shared, good.matrix, grid), IncompatibleProduct, "different sub-apertures")
+    refuse(shared, close_loop(shared, good.matrix, grid), IncompatibleProduct, "different sub-apertures")
     fewer = good.grid.valid.copy()
     fewer[tuple(np.argwhere(fewer)[0])] = False
     grid = replace(good.grid, valid=fewer, references_px=good.grid.references_px[1:])
-    refuse(shared, closed_loop(shared, good.matrix, grid), IncompatibleProduct, "slopes; this bench has")
+    refuse(shared, close_loop(shared, good.matrix, grid), IncompatibleProduct, "slopes; this bench has")
     short = replace(good.matrix, m2c=good.matrix.m2c[:-1])
-    refuse(shared, closed_loop(shared, short, good.grid), IncompatibleProduct, "36 actuators")
+    refuse(shared, close_loop(shared, short, good.grid), IncompatibleProduct, "36 actuators")
 
 
 def test_a_grid_of_another_camera_region(shared, good):
     moved = replace(good.grid, origin_px=(good.grid.origin_px[0] + 120, good.grid.origin_px[1]))
-    refuse(shared, closed_loop(shared, good.matrix, moved), IncompatibleProduct, "beyond the camera's region")
+    refuse(shared, close_loop(shared, good.matrix, moved), IncompatibleProduct, "beyond the camera's region")
 
 
 def test_a_dark_frame_of_another_region(bench, good):
     bench.dark = np.zeros((100, 100), np.float32)
-    refuse(bench, closed_loop(bench, good.matrix, good.grid), CalibrationError, "dark frame has shape")
+    refuse(bench, close_loop(bench, good.matrix, good.grid), CalibrationError, "dark frame has shape")
 
 
 def test_one_nan_in_a_command_keeps_the_last_shape(bench):
@@ -152,19 +152,19 @@ def test_a_procedure_that_computes_nan_ends_flat(bench, good, monkeypatch):
         def __call__(self, slopes: np.ndarray) -> np.ndarray:
             return np.full(good.matrix.n_modes, np.nan if next(calls) > 40 else 1e-3)
 
-    monkeypatch.setattr("escape_hw.calibration.closed_loop.LeakyIntegrator", Broken)
+    monkeypatch.setattr("escape_hw.calibration.loop.performance.LeakyIntegrator", Broken)
     with pytest.raises(CommandRejected, match="is nan"):
-        bench.run(closed_loop(bench, good.matrix, good.grid, frames=200))
+        bench.run(close_loop(bench, good.matrix, good.grid, frames=200))
     assert bench.dm.sent_count > 40
     assert_flat(bench)
 
 
 def test_nan_slopes_never_become_a_matrix(bench, good, monkeypatch):
-    def broken(self: SlopeExtractor, frame: np.ndarray) -> np.ndarray:
+    def broken(self: ShackHartmannSlopes, frame: np.ndarray) -> np.ndarray:
         self.flux[:] = 1e6
         return np.full(self.grid.n_slopes, np.nan, np.float32)
 
-    monkeypatch.setattr(SlopeExtractor, "__call__", broken)
+    monkeypatch.setattr(ShackHartmannSlopes, "__call__", broken)
     with pytest.raises(ValueError, match="slopes or pokes are not finite"):
         bench.run(docrime(bench, frames=300, grid=good.grid))
     assert_flat(bench)

@@ -9,11 +9,11 @@ import pytest
 from small_bench import PLANTED, assert_flat, dead, small
 
 from escape_hw.api.results import CalibrationResult
-from escape_hw.calibration.docrime import docrime
-from escape_hw.calibration.docrime_closed import docrime_closed_loop
-from escape_hw.calibration.escape import escape
-from escape_hw.calibration.poke_patterns import PushPullPokes
-from escape_hw.calibration.stopping import Target
+from escape_hw.calibration.acquisition.pokes import PushPullPokes
+from escape_hw.calibration.acquisition.stopping import Target
+from escape_hw.calibration.docrime.closed_loop import docrime_closed_loop
+from escape_hw.calibration.docrime.open_loop import docrime
+from escape_hw.calibration.escape.method import escape
 from escape_hw.errors import CalibrationError, ConfigError, TooFewFrames
 
 NO_LOSS = "twin.loss_probability=0"
@@ -21,7 +21,7 @@ NO_LOSS = "twin.loss_probability=0"
 SMALL_POKE = 0.002
 
 
-def measure(closing, *more, seed=None, prepare=None, **options):
+def measure(closed_loop, *more, seed=None, prepare=None, **options):
     """A closed-loop run on a bench of its own."""
     with small(NO_LOSS, *more) as bench:
         if seed is not None:
@@ -30,7 +30,7 @@ def measure(closing, *more, seed=None, prepare=None, **options):
             prepare(bench)
         options = {"frames": 2000, "poke": 0.01, **options}
         try:
-            return bench.run(docrime_closed_loop(bench, closing, **options))
+            return bench.run(docrime_closed_loop(bench, closed_loop, **options))
         finally:
             assert_flat(bench)
 
@@ -44,20 +44,20 @@ def compare(one, other):
 
 
 @pytest.fixture(scope="module")
-def closing(good) -> CalibrationResult:
+def closed_loop(good) -> CalibrationResult:
     return good.run.result
 
 
 @pytest.fixture(scope="module")
-def truth(closing):
+def truth(closed_loop):
     """The matrix of the closed loop, from larger pokes."""
-    return measure(closing, frames=4000, poke=0.02)
+    return measure(closed_loop, frames=4000, poke=0.02)
 
 
-def test_a_tiny_poke_gives_the_same_matrix_as_a_large_one(closing, truth):
+def test_a_tiny_poke_gives_the_same_matrix_as_a_large_one(closed_loop, truth):
     gains = []
     for seed in (1, 2):
-        found = measure(closing, seed=seed, frames=2500, poke=SMALL_POKE)
+        found = measure(closed_loop, seed=seed, frames=2500, poke=SMALL_POKE)
         assert found.matrix.method == "docrime-closed"
         assert found.frames == 2500
         gain, chi2 = compare(found, truth)
@@ -70,9 +70,9 @@ def test_a_tiny_poke_gives_the_same_matrix_as_a_large_one(closing, truth):
     assert np.mean(gains) == pytest.approx(1, abs=0.015)
 
 
-def test_registration_from_tiny_pokes_in_closed_loop(closing):
+def test_registration_from_tiny_pokes_in_closed_loop(closed_loop):
     with small(NO_LOSS) as bench:
-        found = bench.run(escape(bench, frames=2500, poke=SMALL_POKE, closing=closing))
+        found = bench.run(escape(bench, frames=2500, poke=SMALL_POKE, closed_loop=closed_loop))
         assert_flat(bench)
     estimate = found.registration
     assert estimate.converged, estimate.warnings
@@ -81,8 +81,8 @@ def test_registration_from_tiny_pokes_in_closed_loop(closing):
     assert (estimate.sigma < [0.6, 0.6, 0.03, 0.2, 0.2]).all()
 
 
-def test_fast_push_pull_in_closed_loop(closing, truth):
-    found = measure(closing, frames=3000, pattern=PushPullPokes)
+def test_fast_push_pull_in_closed_loop(closed_loop, truth):
+    found = measure(closed_loop, frames=3000, pattern=PushPullPokes)
     gain, chi2 = compare(found, truth)
     assert found.matrix.method == "push-pull-fast-closed"
     assert gain == pytest.approx(1, abs=0.03)
@@ -110,8 +110,8 @@ def test_fast_push_pull_under_turbulence_in_open_loop(good):
     ],
     ids=["lost frames", "vibration", "clipped by the stroke", "clipped by the slew"],
 )
-def test_faults_that_bias_nothing(closing, truth, more, allowed):
-    found = measure(closing, *more, frames=3000)
+def test_faults_that_bias_nothing(closed_loop, truth, more, allowed):
+    found = measure(closed_loop, *more, frames=3000)
     gain, chi2 = compare(found, truth)
     assert gain == pytest.approx(1, abs=allowed)
     assert chi2 < 2
@@ -122,13 +122,13 @@ def test_faults_that_bias_nothing(closing, truth, more, allowed):
         assert any("limits shortened" in note for note in found.notes)
 
 
-def test_dead_actuators_that_nobody_knows_show_in_the_matrix(closing, truth):
+def test_dead_actuators_that_nobody_knows_show_in_the_matrix(closed_loop, truth):
     """What the mirror no longer does is missing from the matrix, as in open loop, and the rest is right."""
     broken = (18, 25)
-    found = measure(closing, prepare=lambda bench: dead(bench, *broken), frames=2500)
+    found = measure(closed_loop, prepare=lambda bench: dead(bench, *broken), frames=2500)
     with small(NO_LOSS) as bench:
         dead(bench, *broken)
-        open_loop = bench.run(docrime(bench, frames=2000, poke=0.02, grid=closing.grid))
+        open_loop = bench.run(docrime(bench, frames=2000, poke=0.02, grid=closed_loop.grid))
     gain, chi2 = compare(found, open_loop)
     assert gain == pytest.approx(1, abs=0.04)
     assert chi2 < 3
@@ -157,38 +157,40 @@ def test_disabled_actuators(good):
     ],
     ids=["wrong matrix", "wrong delay"],
 )
-def test_a_loop_that_diverges_is_opened_and_told(closing, more, factor):
-    spoilt = replace(closing, matrix=replace(closing.matrix, data=closing.matrix.data * np.float32(factor)))
+def test_a_loop_that_diverges_is_opened_and_told(closed_loop, more, factor):
+    spoilt = replace(
+        closed_loop, matrix=replace(closed_loop.matrix, data=closed_loop.matrix.data * np.float32(factor))
+    )
     with pytest.raises(CalibrationError, match=r"diverged after \d+ frames and was opened.*loop\.gain"):
         measure(spoilt, *more)
 
 
-def test_a_delay_beyond_the_lags_is_told(closing):
+def test_a_delay_beyond_the_lags_is_told(closed_loop):
     with pytest.raises(CalibrationError, match=r"later than calibration\.lags = 3 frames can tell"):
-        measure(closing, "twin.latency_s=0.006", "loop.gain=0.1", "calibration.lags=3")
+        measure(closed_loop, "twin.latency_s=0.006", "loop.gain=0.1", "calibration.lags=3")
 
 
-def test_a_mirror_that_does_not_answer(closing):
+def test_a_mirror_that_does_not_answer(closed_loop):
     with pytest.raises(CalibrationError, match="does not respond"):
-        measure(closing, "devices.dm.stroke_m=1e-12")
+        measure(closed_loop, "devices.dm.stroke_m=1e-12")
 
 
-def test_the_light_goes(closing):
+def test_the_light_goes(closed_loop):
     with pytest.raises(CalibrationError, match="no light"):
-        measure(closing, prepare=lambda bench: bench.screen.set(blocked=True))
+        measure(closed_loop, prepare=lambda bench: bench.screen.set(blocked=True))
 
 
-def test_it_stops_at_the_ratio_asked_for(closing):
-    found = measure(closing, frames=20_000, until=Target(snr=20.0))
+def test_it_stops_at_the_ratio_asked_for(closed_loop):
+    found = measure(closed_loop, frames=20_000, until=Target(snr=20.0))
     assert found.matrix.snr().min() >= 20
     assert found.frames < 10_000
     assert not found.partial
 
 
 @pytest.mark.parametrize("in_loop", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_escape_stops_at_the_accuracy_asked_for(closing, in_loop):
+def test_escape_stops_at_the_accuracy_asked_for(closed_loop, in_loop):
     with small(NO_LOSS) as bench:
-        options = {"closing": closing} if in_loop else {}
+        options = {"closing": closed_loop} if in_loop else {}
         found = bench.run(escape(bench, frames=8000, until=Target(accuracy=0.2), **options))
         assert_flat(bench)
     assert found.registration.converged
@@ -200,7 +202,7 @@ def test_escape_stops_at_the_accuracy_asked_for(closing, in_loop):
     )
 
 
-def test_what_is_refused_before_anything_moves(closing):
+def test_what_is_refused_before_anything_moves(closed_loop):
     for more, options, error, match in (
         ((), {"frames": 50}, TooFewFrames, "at least 82"),
         ((), {"poke": 2.0}, ConfigError, "poke is 2"),
@@ -209,5 +211,5 @@ def test_what_is_refused_before_anything_moves(closing):
     ):
         with small(NO_LOSS, *more) as bench:
             with pytest.raises(error, match=match):
-                bench.run(docrime_closed_loop(bench, closing, **options))
+                bench.run(docrime_closed_loop(bench, closed_loop, **options))
             assert bench.dm.sent_count == 0

@@ -12,17 +12,17 @@ from small_system import SMALL, configuration
 from escape_hw import register_device
 from escape_hw.cli import main
 from escape_hw.config import registry
-from escape_hw.io.fits import load_matrix, save_matrix
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
 from escape_hw.io.provenance import Provenance
 from escape_hw.testing import FaultyCamera, FaultyMirror
-from escape_sim import devices
+from escape_sim.devices import twins as devices
 
 
 @pytest.fixture
 def run(capsys, monkeypatch, tmp_path):
     """Run a command with ``--json``: exit code, document, standard error."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.setattr("escape_hw.runtime.keep.write_report", lambda folder: folder)
+    monkeypatch.setattr("escape_hw.runtime.procedures.products.write_report", lambda folder: folder)
 
     def call(*words: object) -> tuple[int, dict, str]:
         capsys.readouterr()

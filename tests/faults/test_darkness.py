@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from small_bench import assert_flat, small
 
-from escape_hw.calibration.closed_loop import closed_loop
-from escape_hw.calibration.docrime import docrime
-from escape_hw.calibration.escape import escape
-from escape_hw.calibration.gain_search import best_gain
-from escape_hw.calibration.model_psf import measure_model_psf
-from escape_hw.calibration.push_pull import push_pull
-from escape_hw.calibration.sensor_setup import find_sensor
+from escape_hw.calibration.acquisition.model_psf import measure_model_psf
+from escape_hw.calibration.acquisition.sensor_setup import find_sensor
+from escape_hw.calibration.docrime.open_loop import docrime
+from escape_hw.calibration.escape.method import escape
+from escape_hw.calibration.loop.gain_search import best_gain
+from escape_hw.calibration.loop.performance import close_loop
+from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.errors import CalibrationError
 
 #: What finds the grid says the one, what knows it the other.
@@ -33,7 +33,7 @@ BLOCKED = {
     ),
     "docrime on a grid": (lambda bench, good: docrime(bench, frames=400, grid=good.grid), NO_LIGHT),
     "escape on a grid": (lambda bench, good: escape(bench, frames=400, grid=good.grid), NO_LIGHT),
-    "closed_loop": (lambda bench, good: closed_loop(bench, good.matrix, good.grid, frames=300), NO_LIGHT),
+    "closed_loop": (lambda bench, good: close_loop(bench, good.matrix, good.grid, frames=300), NO_LIGHT),
     "best_gain": (lambda bench, good: best_gain(bench, good.matrix, good.grid, frames=100), NO_LIGHT),
     "model PSF": (lambda bench, good: measure_model_psf(bench), r"^science: no light"),
 }
@@ -72,7 +72,7 @@ def test_a_blink_of_the_light_is_survived(good):
             return take(timeout_s)
 
         bench.wfs._next_frame = blinking
-        result = bench.run(closed_loop(bench, good.matrix, good.grid, frames=600))
+        result = bench.run(close_loop(bench, good.matrix, good.grid, frames=600))
         assert result.stable
         assert_flat(bench)
 
@@ -118,7 +118,7 @@ def test_a_faint_response_is_told_by_its_errors():
 
 @pytest.mark.slow
 def test_the_full_bench_in_the_dark_and_without_response():
-    from escape_hw.runtime.system import open_system
+    from escape_hw.runtime.session.system import open_system
 
     with open_system("razor-shwfs") as bench:
         bench.screen.set(blocked=True)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from small_bench import assert_flat, faulty, settled_shape
 
-from escape_hw.calibration.closed_loop import closed_loop
-from escape_hw.calibration.docrime import docrime
-from escape_hw.calibration.escape import escape
-from escape_hw.calibration.gain_search import best_gain
-from escape_hw.calibration.model_psf import measure_model_psf
-from escape_hw.calibration.push_pull import push_pull
-from escape_hw.calibration.sensor_setup import find_sensor, measure_dark
+from escape_hw.calibration.acquisition.model_psf import measure_model_psf
+from escape_hw.calibration.acquisition.sensor_setup import find_sensor, measure_dark
+from escape_hw.calibration.docrime.open_loop import docrime
+from escape_hw.calibration.escape.method import escape
+from escape_hw.calibration.loop.gain_search import best_gain
+from escape_hw.calibration.loop.performance import close_loop
+from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout
-from escape_hw.runtime.records import without_turbulence
+from escape_hw.runtime.session.record import without_turbulence
 
 
 def calm_push_pull(bench, good):
@@ -29,7 +29,7 @@ PROCEDURES = {
     "docrime": lambda bench, good: docrime(bench, frames=400),
     "docrime on a known grid": lambda bench, good: docrime(bench, frames=400, grid=good.grid),
     "escape": lambda bench, good: escape(bench, frames=400),
-    "closed_loop": lambda bench, good: closed_loop(bench, good.matrix, good.grid, frames=300),
+    "closed_loop": lambda bench, good: close_loop(bench, good.matrix, good.grid, frames=300),
     "best_gain": lambda bench, good: best_gain(bench, good.matrix, good.grid, frames=200),
 }
 MOVING = [name for name in PROCEDURES if name not in ("find_sensor", "measure_dark")]
@@ -97,7 +97,7 @@ def test_a_science_camera_that_fails_while_the_model_psf_is_taken(fault):
 
 def test_a_science_camera_lost_under_the_loop_opens_it(good):
     with faulty(science={"lost_from": 3}) as bench:
-        loop = closed_loop(bench, good.matrix, good.grid, frames=400, model_psf=good.psf)
+        loop = close_loop(bench, good.matrix, good.grid, frames=400, model_psf=good.psf)
         with pytest.raises(DeviceLost, match=r"^science: "):
             bench.run(loop)
         assert_flat(bench)
@@ -105,12 +105,12 @@ def test_a_science_camera_lost_under_the_loop_opens_it(good):
 
 def test_a_science_camera_that_stalls_under_the_loop_is_told(good):
     with faulty(science={"stall_from": 5}) as bench:
-        result = bench.run(closed_loop(bench, good.matrix, good.grid, frames=1000, model_psf=good.psf))
+        result = bench.run(close_loop(bench, good.matrix, good.grid, frames=1000, model_psf=good.psf))
         assert result.stable
         assert any("frames came from science" in note for note in result.notes), result.notes
         assert_flat(bench)
     with faulty() as bench:
-        result = bench.run(closed_loop(bench, good.matrix, good.grid, frames=1000, model_psf=good.psf))
+        result = bench.run(close_loop(bench, good.matrix, good.grid, frames=1000, model_psf=good.psf))
         assert result.notes == ()
         assert result.strehl is not None
 

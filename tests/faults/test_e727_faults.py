@@ -10,7 +10,7 @@ from pipe import TIMEOUT_S, Peers
 
 from escape_hw.api.modulator import Modulation
 from escape_hw.errors import DeviceError
-from escape_sim.emulators.faults import KINDS, Fault
+from escape_sim.emulators.e727.transports import FAULT_KINDS, WireFault
 
 CIRCLE = Modulation(1.41e-4, 303.03)
 #: What a message tells the operator to do.
@@ -52,18 +52,18 @@ def commands_of_a_session() -> int:
     peers = Peers()
     assert session(peers) == []
     assert peers.controller.state.complaints == []
-    return len(peers.controller.seen)
+    return len(peers.controller.received_commands)
 
 
 def check(kind: str, at: int) -> None:
-    peers = Peers(Fault(kind, at))
+    peers = Peers(WireFault(kind, at))
     failures = session(peers)
     if kind in ("late", "double", "garbage") or (kind in ("drop", "truncate", "lose") and not failures):
         assert peers.condition == "at rest", (kind, at, failures)
     if kind in ("close", "reset", "power", "stall"):
         assert failures, (kind, at, "a lost link must be told")
     # Whatever happened: the next opening finds everything in order, and leaves it at rest.
-    peers.wire.stalled = False
+    peers.wire.is_stalled = False
     with peers.driver() as again:
         assert peers.condition == "servo on"
         again.modulate(CIRCLE)
@@ -74,14 +74,14 @@ def check(kind: str, at: int) -> None:
 STRIDE = 12
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_a_fault_now_and_then(kind: str) -> None:
-    for at in range(KINDS.index(kind) % STRIDE, commands_of_a_session(), STRIDE):
+    for at in range(FAULT_KINDS.index(kind) % STRIDE, commands_of_a_session(), STRIDE):
         check(kind, at)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_a_fault_at_every_command(kind: str) -> None:
     for at in range(commands_of_a_session()):
         check(kind, at)

@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from escape_drivers.pi_modulator import PiModulator, make_modulator
+from escape_drivers.pi.modulator import PiModulator, make_modulator
 from escape_hw.api.modulator import Modulation
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceLost
 
 ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")

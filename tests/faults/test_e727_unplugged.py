@@ -8,17 +8,15 @@ import time
 import pytest
 import usb.core
 
-from escape_drivers.pi_modulator import PiModulator
-from escape_drivers.pi_transports import SerialTransport, WireLost
-from escape_drivers.pi_usb import UsbTransport
+from escape_drivers.pi.modulator import PiModulator
+from escape_drivers.pi.transports import SerialTransport, TransportLost, UsbTransport
 from escape_hw.api.modulator import Modulation
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceLost
-from escape_sim.emulators.e727_controller import Controller
-from escape_sim.emulators.e727_state import Make
-from escape_sim.emulators.e727_usb import VENDOR, UsbBackend
-from escape_sim.emulators.e727_wires import PtyServer, UsbPipe
-from escape_sim.emulators.faults import FaultyWire
+from escape_sim.emulators.e727.controller import E727Controller
+from escape_sim.emulators.e727.state import ControllerSettings
+from escape_sim.emulators.e727.transports import FaultInjector, PtyServer, UsbPipe
+from escape_sim.emulators.e727.usb_backend import VENDOR, UsbBackend
 
 CIRCLE = Modulation(1.41e-4, 303.03)
 LONGEST_S = 10.0
@@ -30,12 +28,12 @@ def stage(transport) -> PiModulator:
     return PiModulator("stage", section, lambda: transport)
 
 
-def controller() -> Controller:
-    return Controller(Make(serial="SIMMOD", zeroed=True))
+def controller() -> E727Controller:
+    return E727Controller(ControllerSettings(serial="SIMMOD", zeroed=True))
 
 
 def bus(**options) -> UsbBackend:
-    return UsbBackend(UsbPipe(controller(), FaultyWire()), **options)
+    return UsbBackend(UsbPipe(controller(), FaultInjector()), **options)
 
 
 def lost_in_time(call, says: str) -> None:
@@ -46,7 +44,7 @@ def lost_in_time(call, says: str) -> None:
 
 
 def test_a_serial_cable_pulled_out_in_the_middle():
-    server = PtyServer(controller(), FaultyWire())
+    server = PtyServer(controller(), FaultInjector())
     device = stage(SerialTransport(server.start().removeprefix("pty "), 115200, 0.2)).open()
     device.modulate(CIRCLE)
     server.stop()
@@ -64,7 +62,7 @@ def test_a_serial_line_that_is_not_there():
 
 
 def test_a_serial_line_that_somebody_else_holds():
-    server = PtyServer(controller(), FaultyWire())
+    server = PtyServer(controller(), FaultInjector())
     port = server.start().removeprefix("pty ")
     try:
         with stage(SerialTransport(port, 115200, 0.2)):
@@ -77,10 +75,10 @@ def test_usb_pulled_out_in_the_middle():
     here = bus()
     device = stage(UsbTransport(VENDOR, None, "SIMMOD", 0.2, here)).open()
     device.modulate(CIRCLE)
-    here._pipe.plugged = False
+    here._pipe.is_plugged = False
     lost_in_time(lambda: device.modulate(CIRCLE), r"lost USB 1a72:\* SIMMOD .*; is the cable plugged in")
     lost_in_time(device.close, r"lost|does not answer")
-    here._pipe.plugged = True
+    here._pipe.is_plugged = True
     with device:
         assert device.modulation is None
 
@@ -128,6 +126,6 @@ def test_usb_without_permission(monkeypatch):
 )
 def test_a_wire_that_is_not_open_says_so(transport):
     for call in (lambda: transport.write(b"x"), lambda: transport.read(0.0)):
-        with pytest.raises(WireLost, match="is not open"):
+        with pytest.raises(TransportLost, match="is not open"):
             call()
     transport.close()

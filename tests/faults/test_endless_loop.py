@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from small_bench import assert_flat, faulty
 
-from escape_hw.calibration import endless_loop
-from escape_hw.calibration.docrime_closed import docrime_closed_loop
-from escape_hw.calibration.endless_loop import keep_closed
-from escape_hw.calibration.loop_orders import LoopOrders
+from escape_hw.calibration.docrime.closed_loop import docrime_closed_loop
+from escape_hw.calibration.loop import operation as endless_loop
+from escape_hw.calibration.loop.control import LoopControl
+from escape_hw.calibration.loop.operation import run_until_opened
 from escape_hw.errors import Aborted, ConfigError, DeviceLost, FrameTimeout, IncompatibleProduct
-from escape_hw.pipeline.standard_error import LEAST
-from escape_hw.streams.histogram import BINS
+from escape_hw.pipeline.statistics import MIN_SAMPLES
+from escape_hw.streams.timing import BINS
 
 
 class Operator:
     """Does things at certain frames, and opens the loop in the end."""
 
-    def __init__(self, bench, orders, *steps, end=600):
-        self.bench, self.orders, self.steps, self.end = bench, orders, list(steps), end
+    def __init__(self, bench, loop_control, *steps, end=600):
+        self.bench, self.loop_control, self.steps, self.end = bench, loop_control, list(steps), end
         self.metrics, self.arrays, self.shapes = [], {}, []
 
     def __call__(self, progress):
@@ -30,9 +30,9 @@ class Operator:
         self.metrics.append(dict(progress.metrics))
         self.arrays |= progress.arrays
         while self.steps and progress.done >= self.steps[0][0]:
-            self.steps.pop(0)[1](self.orders)
+            self.steps.pop(0)[1](self.loop_control)
         if progress.done >= self.end:
-            self.orders.open()
+            self.loop_control.open()
 
 
 @pytest.fixture(autouse=True)
@@ -43,10 +43,10 @@ def _often(monkeypatch):
 
 def kept(bench, good, *steps, end=600, psf=None, **settings):
     """Run the loop; its end, what the operator saw, and all that the mirror got."""
-    orders = LoopOrders(bench, good.run.result, **settings)
-    operator, sent = Operator(bench, orders, *steps, end=end), []
-    bench.dm.tap = lambda shape: sent.append(shape.copy())
-    found = bench.run(keep_closed(bench, orders, model_psf=psf), observers=(operator,))
+    loop_control = LoopControl(bench, good.run.result, **settings)
+    operator, sent = Operator(bench, loop_control, *steps, end=end), []
+    bench.dm.callback = lambda shape: sent.append(shape.copy())
+    found = bench.run(run_until_opened(bench, loop_control, model_psf=psf), observers=(operator,))
     assert_flat(bench)
     return found, operator, np.array(sent)
 
@@ -74,7 +74,7 @@ def test_it_stays_closed_until_told_and_tells_how_it_is(bench, good):
 
 def test_the_strehl_ratio_is_followed(bench, good):
     rate = bench.config.devices.wfs.frame_rate_hz / bench.config.devices.science.frame_rate_hz
-    found, operator, _ = kept(bench, good, psf=good.psf, end=int(4 * LEAST * rate) + 400)
+    found, operator, _ = kept(bench, good, psf=good.psf, end=int(4 * MIN_SAMPLES * rate) + 400)
     ratios = [m["strehl"] for m in operator.metrics if np.isfinite(m.get("strehl", np.nan))]
     assert ratios
     assert 0.3 < ratios[-1] < 1.05
@@ -84,12 +84,12 @@ def test_the_strehl_ratio_is_followed(bench, good):
 def test_settings_change_without_a_bump(bench, good):
     other = replace(good.run.result, matrix=replace(good.matrix, data=good.matrix.data * 1.02))
     steps = (
-        (400, lambda orders: orders.change(gain=0.2)),
-        (600, lambda orders: orders.change(leak=0.05)),
-        (800, lambda orders: orders.change(closing=other, gain=0.3)),
+        (400, lambda loop_control: loop_control.change(gain=0.2)),
+        (600, lambda loop_control: loop_control.change(leak=0.05)),
+        (800, lambda loop_control: loop_control.change(calibration=other, gain=0.3)),
     )
     found, operator, sent = kept(bench, good, *steps, end=1000)
-    assert found.settings.closing is other
+    assert found.settings.calibration is other
     assert (found.settings.gain, found.settings.leak) == (0.3, 0.05)
     assert operator.metrics[-1]["gain"] == 0.3
     steps_of = largest_step(sent)
@@ -99,13 +99,18 @@ def test_settings_change_without_a_bump(bench, good):
 
 def test_dropped_modes_fade_from_the_mirror(bench, good):
     found, _, sent = kept(
-        bench, good, (500, lambda orders: orders.change(dropped_modes=12)), end=1000, leak=0.0, gain=0.3
+        bench,
+        good,
+        (500, lambda loop_control: loop_control.change(dropped_modes=12)),
+        end=1000,
+        leak=0.0,
+        gain=0.3,
     )
     assert found.fault == ""
     steps_of = largest_step(sent)
     assert steps_of[480:].max() < 1.5 * steps_of[150:480].max()
     # What twelve eigenmodes span is empty in the end, also without a leak.
-    control = LoopOrders(bench, good.run.result, dropped_modes=12).take()
+    control = LoopControl(bench, good.run.result, dropped_modes=12).take()
     modes = np.linalg.lstsq(good.matrix.m2c, sent[-40 - 20], rcond=None)[0]
     before = np.linalg.lstsq(good.matrix.m2c, sent[480], rcond=None)[0]
     idle = control.outside.T
@@ -115,35 +120,35 @@ def test_dropped_modes_fade_from_the_mirror(bench, good):
 
 
 def test_what_makes_no_sense_is_refused_and_changes_nothing(bench, good):
-    orders = LoopOrders(bench, good.run.result)
-    first = orders.take()
+    loop_control = LoopControl(bench, good.run.result)
+    first = loop_control.take()
     with pytest.raises(ConfigError, match="gain is -1"):
-        orders.change(gain=-1)
+        loop_control.change(gain=-1)
     with pytest.raises(ConfigError, match="leak 2"):
-        orders.change(leak=2.0)
+        loop_control.change(leak=2.0)
     fewer = replace(good.matrix, data=good.matrix.data[:, :9], sigma=good.matrix.sigma[:, :9],
                     m2c=good.matrix.m2c[:, :9])  # fmt: skip
     with pytest.raises(ConfigError, match="open the loop"):
-        orders.change(closing=replace(good.run.result, matrix=fewer))
-    assert orders.take() is None
-    assert orders.settings == first.settings
+        loop_control.change(calibration=replace(good.run.result, matrix=fewer))
+    assert loop_control.take() is None
+    assert loop_control.settings == first.settings
     with pytest.raises(IncompatibleProduct):
-        LoopOrders(bench, replace(good.run.result, matrix=replace(good.matrix, m2c=good.matrix.m2c[:9])))
+        LoopControl(bench, replace(good.run.result, matrix=replace(good.matrix, m2c=good.matrix.m2c[:9])))
 
 
 @pytest.mark.parametrize("sign", [-1.0])
 def test_a_loop_of_the_wrong_sign_is_opened(bench, good, sign):
     wrong = replace(good.run.result, matrix=replace(good.matrix, data=sign * good.matrix.data))
-    orders = LoopOrders(bench, wrong)
-    operator = Operator(bench, orders, end=100_000)
-    found = bench.run(keep_closed(bench, orders), observers=(operator,))
+    loop_control = LoopControl(bench, wrong)
+    operator = Operator(bench, loop_control, end=100_000)
+    found = bench.run(run_until_opened(bench, loop_control), observers=(operator,))
     assert_flat(bench)
     assert "lower the gain" in found.fault
     assert found.frames < 2000
 
 
 def test_a_loop_that_goes_dark_is_opened(bench, good):
-    def dark(orders):
+    def dark(loop_control):
         bench.screen.set(blocked=True)
 
     found, _, _ = kept(bench, good, (300, dark), end=100_000)
@@ -183,23 +188,25 @@ def test_a_lost_mirror_is_an_error(good):
 def test_an_abort_opens_it(bench, good):
     from threading import Event
 
-    orders, abort = LoopOrders(bench, good.run.result), Event()
+    loop_control, abort = LoopControl(bench, good.run.result), Event()
 
     def stop(progress):
         if progress.done > 100:
             abort.set()
 
     with pytest.raises(Aborted) as caught:
-        bench.run(keep_closed(bench, orders), observers=(stop,), abort=abort)
+        bench.run(run_until_opened(bench, loop_control), observers=(stop,), abort=abort)
     assert_flat(bench)
     assert caught.value.partial.fault == ""
     assert caught.value.partial.frames > 100
 
 
 def test_a_measurement_goes_on_from_the_loops_own_matrix(bench, good):
-    orders = LoopOrders(bench, good.run.result)
-    found = bench.run(keep_closed(bench, orders), observers=(Operator(bench, orders, end=300),))
-    result = bench.run(docrime_closed_loop(bench, found.settings.closing, frames=1200, poke=0.01))
+    loop_control = LoopControl(bench, good.run.result)
+    found = bench.run(
+        run_until_opened(bench, loop_control), observers=(Operator(bench, loop_control, end=300),)
+    )
+    result = bench.run(docrime_closed_loop(bench, found.settings.calibration, frames=1200, poke=0.01))
     assert_flat(bench)
     assert result.grid.n_valid == good.grid.n_valid
     assert np.array_equal(result.matrix.m2c, good.matrix.m2c)
@@ -214,13 +221,13 @@ def test_a_real_loop_asks_for_priority_and_says_what_was_refused(bench, good, mo
         yield ("no real-time priority: Operation not permitted",) if priority else ()
         asked.append("out")
 
-    monkeypatch.setattr(endless_loop, "prompt", refusing)
+    monkeypatch.setattr(endless_loop, "realtime_thread", refusing)
     kept(bench, good, end=30)
     assert asked == [0, "out"]
     asked.clear()
     monkeypatch.setattr(type(bench), "simulated", False)
-    found = bench.run(keep_closed(bench, orders := LoopOrders(bench, good.run.result)),
-                      observers=(Operator(bench, orders, end=30),))  # fmt: skip
+    found = bench.run(run_until_opened(bench, loop_control := LoopControl(bench, good.run.result)),
+                      observers=(Operator(bench, loop_control, end=30),))  # fmt: skip
     assert found.fault == ""
     assert asked == [1, "out"]
     assert "frames may be answered late: no real-time priority" in caplog.text

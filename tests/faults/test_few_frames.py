@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from small_bench import PLANTED, assert_flat, small
 
-from escape_hw.calibration.docrime import docrime_run
-from escape_hw.calibration.sprint import sprint
+from escape_hw.calibration.docrime.open_loop import docrime_run
+from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.errors import TooFewFrames
-from escape_hw.runtime.reproduce import reproduce_shwfs
+from escape_hw.paper.experiments import reproduce_shwfs
 
 #: Fewest frames that 30 modes with a filter of 6 and 5 lags may start with, and a few more.
 JUST_ENOUGH = (82, 130)
@@ -70,7 +70,7 @@ def test_the_registration_is_right_within_its_errors_or_says_that_it_is_not(good
 
 
 def test_the_full_bench_at_its_limit():
-    from escape_hw.runtime.system import open_system
+    from escape_hw.runtime.session.system import open_system
 
     with open_system("razor-shwfs") as bench:
         with pytest.raises(TooFewFrames, match=r"209 frames cannot constrain 94 modes.* at least 210"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_bench import PLANTED, assert_flat, small
 
-from escape_hw.calibration.escape import escape
+from escape_hw.calibration.escape.method import escape
 from escape_hw.errors import Aborted, CalibrationError, TooFewFrames
 
 SEEDS = range(4)
@@ -16,17 +16,17 @@ SEEDS = range(4)
 FRAMES = 50
 
 
-def measured(closing, *more, seed=1, frames=FRAMES, poke=0.02, **options):
+def measured(closed_loop, *more, seed=1, frames=FRAMES, poke=0.02, **options):
     with small(*more) as bench:
         bench.rng = np.random.default_rng(seed)
         try:
-            return bench.run(escape(bench, frames=frames, poke=poke, closing=closing, **options))
+            return bench.run(escape(bench, frames=frames, poke=poke, closed_loop=closed_loop, **options))
         finally:
             assert_flat(bench)
 
 
 @pytest.fixture(scope="module")
-def closing(good):
+def closed_loop(good):
     return good.run.result
 
 
@@ -37,17 +37,19 @@ def pull(found) -> np.ndarray:
 @pytest.mark.parametrize(
     "name", ["as it is", "lost frames", "vibration", "a matrix half as large", "commands cut by the limits"]
 )
-def test_right_within_its_errors_whatever_the_loop_does(closing, name):
+def test_right_within_its_errors_whatever_the_loop_does(closed_loop, name):
     more = {
         "lost frames": ["twin.loss_probability=0.03"],
         "vibration": ["twin.vibration.amplitude_rad=[6e-5]", "twin.vibration.frequency_hz=[31.0]"],
         "commands cut by the limits": ["devices.dm.limits.max_stroke=0.2"],
     }.get(name, [])
     if name == "a matrix half as large":
-        closing = replace(closing, matrix=replace(closing.matrix, data=closing.matrix.data / 2))
+        closed_loop = replace(
+            closed_loop, matrix=replace(closed_loop.matrix, data=closed_loop.matrix.data / 2)
+        )
     pulls = []
     for seed in SEEDS:
-        found = measured(closing, *more, seed=seed)
+        found = measured(closed_loop, *more, seed=seed)
         assert found.registration.converged, found.registration.warnings
         assert found.measured is None
         assert found.matrix.metrics["frames"] == FRAMES
@@ -62,36 +64,38 @@ def test_right_within_its_errors_whatever_the_loop_does(closing, name):
     assert np.mean(np.square(pulls)) < 3
 
 
-def test_smaller_pokes_and_more_frames_give_larger_errors_and_smaller_ones(closing):
-    strong, weak = measured(closing), measured(closing, poke=0.004)
+def test_smaller_pokes_and_more_frames_give_larger_errors_and_smaller_ones(closed_loop):
+    strong, weak = measured(closed_loop), measured(closed_loop, poke=0.004)
     assert (weak.registration.sigma[:3] > 1.5 * strong.registration.sigma[:3]).all()
     assert np.abs(pull(weak)).max() < 5
 
 
-def test_it_is_the_answer_of_the_frames_and_not_of_the_matrix_that_closes_the_loop(closing, good):
+def test_it_is_the_answer_of_the_frames_and_not_of_the_matrix_that_closes_the_loop(closed_loop, good):
     """A closing matrix for a mirror that stands elsewhere, and says so: the answer is the same."""
     from escape_hw.api.registration import Registration
-    from escape_hw.calibration.derivatives import modal_matrix
+    from escape_hw.calibration.modes.derivatives import modal_matrix
 
     moved = PLANTED + np.array([15.0, -15.0, 0.3, 0.5, -0.5])
-    m2c = closing.matrix.m2c
-    gain = np.linalg.norm(closing.matrix.data) / np.linalg.norm(
+    m2c = closed_loop.matrix.m2c
+    gain = np.linalg.norm(closed_loop.matrix.data) / np.linalg.norm(
         modal_matrix(good.model, Registration.from_array(PLANTED), m2c)
     )
     wrong = gain * modal_matrix(good.model, Registration.from_array(moved), m2c)
-    found = measured(replace(closing, matrix=replace(closing.matrix, data=wrong.astype(np.float32))))
+    found = measured(replace(closed_loop, matrix=replace(closed_loop.matrix, data=wrong.astype(np.float32))))
     assert np.abs(pull(found)).max() < 4.5
 
 
-def test_what_is_refused_and_what_ends_it(closing):
+def test_what_is_refused_and_what_ends_it(closed_loop):
     with small() as bench:
         with pytest.raises(TooFewFrames, match="at least 13 frames"):
-            bench.run(escape(bench, frames=12, closing=closing))
+            bench.run(escape(bench, frames=12, closed_loop=closed_loop))
         assert bench.dm.sent_count == 0
     with pytest.raises(CalibrationError, match="diverged"):
-        measured(replace(closing, matrix=replace(closing.matrix, data=-closing.matrix.data)), frames=80)
+        measured(
+            replace(closed_loop, matrix=replace(closed_loop.matrix, data=-closed_loop.matrix.data)), frames=80
+        )
     with small() as bench:
-        running = escape(bench, frames=60, closing=closing)
+        running = escape(bench, frames=60, closed_loop=closed_loop)
         for _ in range(3):
             next(running)
         with pytest.raises(Aborted, match="too few for a registration"):

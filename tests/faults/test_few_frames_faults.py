@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_bench import PLANTED, assert_flat, dead, small
 
-from escape_hw.calibration.escape import escape
+from escape_hw.calibration.escape.method import escape
 from escape_hw.errors import CalibrationError
 
 FRAMES, SEEDS = 50, (1, 2, 3)

@@ -8,9 +8,9 @@ import pytest
 from small_bench import assert_flat
 
 from escape_hw.api.procedure import Progress
-from escape_hw.calibration.gain_bootstrap import bootstrap_gains
+from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
 from escape_hw.errors import Aborted
-from escape_hw.io.gains import load_gains, save_gains
+from escape_hw.io.fits.gains import load_gains, save_gains
 
 
 class StopAt:
@@ -40,7 +40,7 @@ def test_stopped(bench, good, tmp_path, stage, frames, rounds):
     assert run.result.partial
     assert not run.result.converged
     assert len(run.result.rounds) == rounds
-    assert run.rescaled.partial == bool(rounds)
+    assert run.rescaled_calibration.partial == bool(rounds)
     path = save_gains(tmp_path / "gains.fits", run.result, "razor-shwfs", True)
     assert path.name == "gains.partial.fits"
     found = load_gains(path).result

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from small_bench import PLANTED, assert_flat, faulty, small
 
-from escape_hw.calibration.docrime import docrime_run
-from escape_hw.calibration.push_pull import push_pull
-from escape_hw.calibration.sensor_setup import modal_basis
-from escape_hw.calibration.sprint import sprint
+from escape_hw.calibration.acquisition.sensor_setup import build_modal_basis
+from escape_hw.calibration.docrime.open_loop import docrime_run
+from escape_hw.calibration.push_pull.procedure import push_pull
+from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.errors import CalibrationError, ConfigError, ProductError
 
 LIMITS = {
@@ -72,7 +72,7 @@ def test_disabled_actuators(disabled):
         run = bench.run(docrime_run(bench, frames=800))
         reached = np.array(bench.dm.reached)
         model = bench.model(run.result.grid)
-        m2c = modal_basis(bench)
+        m2c = build_modal_basis(bench)
         assert_flat(bench)
     assert not reached[:, numbers].any()
     assert not m2c[numbers].any()
@@ -92,17 +92,17 @@ def test_more_modes_than_working_actuators_make():
 
 
 def test_a_stored_basis_that_moves_a_disabled_actuator(good, tmp_path):
-    from escape_hw.io.fits import save_matrix
+    from escape_hw.io.fits.matrix import save_matrix
 
     path = save_matrix(tmp_path / "basis.fits", good.run.result)
     basis = ("basis.kind=file", f"basis.file={path}")
     with small(*basis) as bench:
-        np.testing.assert_allclose(modal_basis(bench), good.matrix.m2c, rtol=1e-9)
+        np.testing.assert_allclose(build_modal_basis(bench), good.matrix.m2c, rtol=1e-9)
     with (
         small(*basis, "devices.dm.limits.disabled=[3]") as bench,
         pytest.raises(ConfigError, match="disabled"),
     ):
-        modal_basis(bench)
+        build_modal_basis(bench)
 
 
 def test_a_basis_in_a_plain_fits_file(good, tmp_path):
@@ -111,7 +111,7 @@ def test_a_basis_in_a_plain_fits_file(good, tmp_path):
     # Any scale will do: columns are brought to unit rms surface.
     fits.writeto(tmp_path / "plain.fits", 3.0 * good.matrix.m2c)
     with small("basis.kind=file", f"basis.file={tmp_path / 'plain.fits'}") as bench:
-        np.testing.assert_allclose(modal_basis(bench), good.matrix.m2c, rtol=1e-9)
+        np.testing.assert_allclose(build_modal_basis(bench), good.matrix.m2c, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_a_fits_file_that_is_no_basis(tmp_path, data, message):
         small("basis.kind=file", f"basis.file={tmp_path / 'odd.fits'}") as bench,
         pytest.raises(ProductError, match=message),
     ):
-        modal_basis(bench)
+        build_modal_basis(bench)
 
 
 def test_a_basis_file_that_is_not_there(tmp_path):
@@ -134,4 +134,4 @@ def test_a_basis_file_that_is_not_there(tmp_path):
         small("basis.kind=file", f"basis.file={tmp_path / 'none.fits'}") as bench,
         pytest.raises(ProductError, match=r"none\.fits"),
     ):
-        modal_basis(bench)
+        build_modal_basis(bench)

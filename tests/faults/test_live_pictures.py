@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from small_bench import small
 
-from escape_hw.api.registration import TO_PLAIN
-from escape_hw.calibration import preview
-from escape_hw.calibration.docrime import docrime_run
-from escape_hw.calibration.docrime_closed import docrime_closed_loop
-from escape_hw.calibration.gain_bootstrap import bootstrap_gains
-from escape_hw.calibration.modulated import modulated
-from escape_hw.calibration.preview import Preview
-from escape_hw.calibration.push_pull import push_pull
-from escape_hw.calibration.sprint import sprint_steps
-from escape_hw.calibration.track import track
-from escape_hw.runtime.records import without_turbulence
+from escape_hw.api.registration import TO_STREAM_UNITS
+from escape_hw.calibration.acquisition import preview
+from escape_hw.calibration.acquisition.preview import MatrixPreview
+from escape_hw.calibration.docrime.closed_loop import docrime_closed_loop
+from escape_hw.calibration.docrime.open_loop import docrime_run
+from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
+from escape_hw.calibration.push_pull.modulation import modulation_demodulation
+from escape_hw.calibration.push_pull.procedure import push_pull
+from escape_hw.calibration.sprint.fit import estimate_registration
+from escape_hw.calibration.tracking.tracker import track
+from escape_hw.runtime.session.record import without_turbulence
 
 QUIET = "twin.loss_probability=0"
 
@@ -25,7 +25,7 @@ QUIET = "twin.loss_probability=0"
 def often(monkeypatch):
     """Pictures as often as the procedures offer them."""
     monkeypatch.setattr(preview, "PERIOD_S", 0.0)
-    monkeypatch.setattr(preview, "SHARE", 1.0)
+    monkeypatch.setattr(preview, "MAX_TIME_FRACTION", 1.0)
 
 
 def watched(bench, procedure):
@@ -68,7 +68,7 @@ def test_closed_loop_matrix_fills_in(bench, good, often):
     assert (shown["residual"][-1] > 0).all()
 
 
-@pytest.mark.parametrize("procedure", [push_pull, modulated])
+@pytest.mark.parametrize("procedure", [push_pull, modulation_demodulation])
 def test_modes_not_measured_yet_are_nan(bench, often, procedure):
     frames = {"frames": 3} if procedure is push_pull else {"frames": 40}
     with without_turbulence(bench):
@@ -85,17 +85,17 @@ def test_modes_not_measured_yet_are_nan(bench, often, procedure):
 
 @pytest.mark.parametrize("solver", ["effects", "light", "batches"])
 def test_sprint_shows_every_iteration(bench, good, solver):
-    found, shown = watched(bench, sprint_steps(good.matrix, good.model, solver=solver))
+    found, shown = watched(bench, estimate_registration(good.matrix, good.model, solver=solver))
     course = shown["registration"][-1]
     assert course.shape == (len(found.iterations), 5)
     assert shown["step_norm"][-1].shape == (len(found.iterations),)
-    expected = [step.registration.to_array() * TO_PLAIN for step in found.iterations]
+    expected = [step.registration.to_array() * TO_STREAM_UNITS for step in found.iterations]
     np.testing.assert_allclose(course, expected, rtol=1e-6)
-    np.testing.assert_allclose(shown["registration_sigma"][-1], found.sigma * TO_PLAIN, rtol=1e-6)
+    np.testing.assert_allclose(shown["registration_sigma"][-1], found.sigma * TO_STREAM_UNITS, rtol=1e-6)
     if solver == "batches":  # whose answer is a mean of many iterations
         return
     # The last step was taken after it was recorded: it is below what the eye sees.
-    np.testing.assert_allclose(course[-1], found.registration.to_array() * TO_PLAIN, atol=1e-3)
+    np.testing.assert_allclose(course[-1], found.registration.to_array() * TO_STREAM_UNITS, atol=1e-3)
 
 
 def test_gains_show_every_round(bench, good):
@@ -137,7 +137,7 @@ def test_pictures_take_a_small_share_of_the_time(monkeypatch):
         return np.ones((4, 2)), np.ones((4, 2))
 
     monkeypatch.setattr(preview.time, "monotonic", lambda: clock[0])
-    pictures = Preview(3, lambda: None)
+    pictures = MatrixPreview(3, lambda: None)
     for _ in range(100_000):
         clock[0] += 0.001
         if pictures.due():

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from small_bench import PLANTED, assert_flat, faulty, small
 
-from escape_hw.calibration.closed_loop import closed_loop
-from escape_hw.calibration.docrime import docrime_run
-from escape_hw.calibration.docrime_estimator import DocrimeEstimator
-from escape_hw.calibration.push_pull import push_pull
-from escape_hw.calibration.sprint import sprint
+from escape_hw.calibration.docrime.estimator import DocrimeEstimator
+from escape_hw.calibration.docrime.open_loop import docrime_run
+from escape_hw.calibration.loop.performance import close_loop
+from escape_hw.calibration.push_pull.procedure import push_pull
+from escape_hw.calibration.sprint.fit import sprint
 
 FRAMES = 800
 
@@ -112,7 +112,7 @@ def test_the_loop_survives_loss_and_counts_it(good):
     residual = []
     for loss in (0.0, 0.01, 0.1):
         with small(f"twin.loss_probability={loss}") as bench:
-            result = bench.run(closed_loop(bench, good.matrix, good.grid, frames=600))
+            result = bench.run(close_loop(bench, good.matrix, good.grid, frames=600))
             assert result.stable
             assert_flat(bench)
         assert abs(result.lost_frames - 600 * loss / (1 - loss)) < 5 * np.sqrt(600 * loss) + 1

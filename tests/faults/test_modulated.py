@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from small_bench import assert_flat, small
 
-from escape_hw.calibration.modulated import modulated
+from escape_hw.calibration.push_pull.modulation import modulation_demodulation
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
 
 
 def test_the_same_matrix_as_docrime(good):
     with small("twin.loss_probability=0.002") as bench:
-        result = bench.run(modulated(bench, grid=good.grid))
+        result = bench.run(modulation_demodulation(bench, grid=good.grid))
         assert_flat(bench)
     truth, found = good.matrix, result.matrix
     assert found.method == "modulated"
@@ -28,7 +28,7 @@ def test_the_same_matrix_as_docrime(good):
 
 
 def test_more_modes_than_lines_take_more_batches(bench):
-    result = bench.run(modulated(bench, frames=200))
+    result = bench.run(modulation_demodulation(bench, frames=200))
     assert result.matrix.metrics["batches"] == 2
     assert result.matrix.n_modes == 30
     assert np.median(result.matrix.snr()) > 3
@@ -45,7 +45,7 @@ def test_stopped_after_the_first_batch_it_keeps_that():
     # In real time, so that reports come often enough: the second batch takes half a second.
     with small("twin.loss_probability=0", "twin.paced=true") as bench:
         with pytest.raises(Aborted) as caught:
-            bench.run(modulated(bench, frames=200), observers=(watch,), abort=stop)
+            bench.run(modulation_demodulation(bench, frames=200), observers=(watch,), abort=stop)
         assert_flat(bench)
     partial = caught.value.partial
     assert partial.partial
@@ -55,7 +55,7 @@ def test_stopped_after_the_first_batch_it_keeps_that():
 def test_a_mirror_that_does_not_move_is_told():
     with small("devices.dm.stroke_m=1e-12") as bench:
         with pytest.raises(CalibrationError, match="does not respond"):
-            bench.run(modulated(bench, frames=200))
+            bench.run(modulation_demodulation(bench, frames=200))
         assert_flat(bench)
 
 
@@ -64,5 +64,5 @@ def test_numbers_that_mean_nothing_move_nothing(bench):
     wrong = ({"frames": 0}, ConfigError), ({"poke": 0.0}, ConfigError), ({"frames": 20}, TooFewFrames)
     for words, error in wrong:
         with pytest.raises(error):
-            bench.run(modulated(bench, **words))
+            bench.run(modulation_demodulation(bench, **words))
     assert bench.dm.sent_count == sent

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from small_bench import small
 
-from escape_hw.calibration.closed_loop import closed_loop
-from escape_hw.calibration.escape import escape
-from escape_hw.calibration.model_psf import measure_model_psf
-from escape_hw.calibration.push_pull import push_pull
+from escape_hw.calibration.acquisition.model_psf import measure_model_psf
+from escape_hw.calibration.escape.method import escape
+from escape_hw.calibration.loop.performance import close_loop
+from escape_hw.calibration.push_pull.procedure import push_pull
 
 
 def everything(seed: int):
@@ -22,7 +22,7 @@ def everything(seed: int):
         bench.screen.set(inserted=True)
         found = bench.run(escape(bench, frames=300))
         psf = bench.run(measure_model_psf(bench, frames=3))
-        loop = bench.run(closed_loop(bench, found.matrix, found.grid, frames=250, model_psf=psf))
+        loop = bench.run(close_loop(bench, found.matrix, found.grid, frames=250, model_psf=psf))
         return baseline, found, loop, bench.wfs.now_ns()
 
 

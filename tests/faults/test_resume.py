@@ -10,10 +10,10 @@ import pytest
 from small_bench import assert_flat, small
 
 from escape_hw.api.procedure import run as run_procedure
-from escape_hw.calibration.checkpoint import Checkpoint
+from escape_hw.calibration.acquisition.checkpoint import Checkpoint
 from escape_hw.errors import Aborted, IncompatibleProduct, ProductError
-from escape_hw.io.state_file import load_state
-from escape_hw.runtime.procedures import calibrate_by
+from escape_hw.io.fits.run_state import load_state
+from escape_hw.runtime.procedures.calibration import calibrate_with_method
 
 #: States now and then; the last is that of the moment it was broken off.
 OFTEN = ("twin.loss_probability=0.002", "calibration.checkpoint_s=0.2")
@@ -31,7 +31,7 @@ CASES = {
 def measure(good, name, path, *, resume=None, stop=True, more=()):
     """Run a case, broken off in the middle if asked."""
     method, options, stage, share = CASES[name]
-    closing = good.run.result if "closed" in name else None
+    closed_loop = good.run.result if "closed" in name else None
     abort = threading.Event()
 
     def watch(progress):
@@ -39,8 +39,10 @@ def measure(good, name, path, *, resume=None, stop=True, more=()):
             abort.set()
 
     with small(*OFTEN, *more) as bench:
-        keep = Checkpoint(path, resume)
-        procedure = calibrate_by(bench, method, grid=good.grid, closing=closing, keep=keep, **options)
+        checkpoint = Checkpoint(path, resume)
+        procedure = calibrate_with_method(
+            bench, method, grid=good.grid, closed_loop=closed_loop, checkpoint=checkpoint, **options
+        )
         try:
             return run_procedure(procedure, observers=(watch,), abort=abort)
         finally:
@@ -102,19 +104,21 @@ def kept(good, tmp_path_factory):
 def test_what_does_not_fit_is_refused_before_anything_moves(kept, tmp_path, more, options, match):
     with small(*OFTEN, *more) as bench:
         before = bench.dm.sent_count
-        keep = Checkpoint(tmp_path / "new.state", kept)
+        checkpoint = Checkpoint(tmp_path / "new.state", kept)
         with pytest.raises(IncompatibleProduct, match=match):
-            run_procedure(calibrate_by(bench, "docrime", frames=3000, keep=keep, **options))
+            run_procedure(
+                calibrate_with_method(bench, "docrime", frames=3000, checkpoint=checkpoint, **options)
+            )
         assert bench.dm.sent_count == before
 
 
 def test_another_method_or_loop_is_refused(good, kept, tmp_path):
-    closing = good.run.result
+    closed_loop = good.run.result
     with small(*OFTEN) as bench:
-        for options in ({"method": "push-pull-fast"}, {"method": "docrime", "closing": closing}):
-            keep = Checkpoint(tmp_path / "new.state", kept)
+        for options in ({"method": "push-pull-fast"}, {"method": "docrime", "closing": closed_loop}):
+            checkpoint = Checkpoint(tmp_path / "new.state", kept)
             with pytest.raises(IncompatibleProduct, match="its method is 'docrime'"):
-                run_procedure(calibrate_by(bench, frames=3000, keep=keep, **options))
+                run_procedure(calibrate_with_method(bench, frames=3000, checkpoint=checkpoint, **options))
 
 
 def test_another_matrix_in_the_loop_is_refused(good, tmp_path, monkeypatch):
@@ -123,10 +127,12 @@ def test_another_matrix_in_the_loop_is_refused(good, tmp_path, monkeypatch):
     with pytest.raises(Aborted):
         measure(good, "docrime, closed loop", path)
     scaled = replace(good.matrix, data=good.matrix.data * np.float32(1.1))
-    closing = replace(good.run.result, matrix=scaled)
-    keep = Checkpoint(tmp_path / "new.state", path)
+    closed_loop = replace(good.run.result, matrix=scaled)
+    checkpoint = Checkpoint(tmp_path / "new.state", path)
     with small(*OFTEN) as bench:
-        procedure = calibrate_by(bench, "docrime", frames=3000, poke=0.01, closing=closing, keep=keep)
+        procedure = calibrate_with_method(
+            bench, "docrime", frames=3000, poke=0.01, closed_loop=closed_loop, checkpoint=checkpoint
+        )
         with pytest.raises(IncompatibleProduct, match="closed with"):
             run_procedure(procedure)
 
@@ -136,8 +142,8 @@ def test_a_damaged_state_is_refused(kept, tmp_path):
     content[len(content) // 2] ^= 1
     damaged = tmp_path / "damaged.state"
     damaged.write_bytes(content)
-    keep = Checkpoint(tmp_path / "new.state", damaged)
+    checkpoint = Checkpoint(tmp_path / "new.state", damaged)
     with small(*OFTEN) as bench:
-        procedure = calibrate_by(bench, "docrime", frames=3000, keep=keep)
+        procedure = calibrate_with_method(bench, "docrime", frames=3000, checkpoint=checkpoint)
         with pytest.raises(ProductError, match="damaged"):
             run_procedure(procedure)

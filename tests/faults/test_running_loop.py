@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from small_bench import assert_flat, small
 
-from escape_hw.calibration.closed_loop import integrator_for
-from escape_hw.calibration.loop_run import RunningLoop
-from escape_hw.calibration.sensor_setup import extractor
-from escape_hw.pipeline.reconstructor import reconstructor
+from escape_hw.calibration.acquisition.sensor_setup import build_slope_function
+from escape_hw.calibration.loop.performance import build_integrator
+from escape_hw.calibration.loop.runner import RunningLoop
+from escape_hw.pipeline.control.reconstructor import reconstructor
 
 
 class Watch:
@@ -31,8 +31,8 @@ def pokes(bench, n_modes, amplitude):
 
 def run(bench, good, *stretches, gain=0.3):
     """Run stretches of a loop, ``(frames, poke amplitude, what to do before)`` each."""
-    control = integrator_for(bench, good.matrix, good.grid, gain=gain)
-    loop = RunningLoop(bench, good.matrix.m2c, extractor(bench, good.grid), control)
+    control = build_integrator(bench, good.matrix, good.grid, gain=gain)
+    loop = RunningLoop(bench, good.matrix.m2c, build_slope_function(bench, good.grid), control)
     watch = Watch(bench, control)
     try:
         for frames, amplitude, before in stretches:

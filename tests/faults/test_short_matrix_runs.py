@@ -7,11 +7,11 @@ import pytest
 from small_bench import PLANTED, small
 
 from escape_hw.api.procedure import run
-from escape_hw.calibration import escape as procedure
-from escape_hw.calibration.docrime import docrime_run
-from escape_hw.calibration.escape_few import fit_record
-from escape_hw.calibration.sprint import fit_steps
-from escape_hw.calibration.telemetry_sprint import independent_columns
+from escape_hw.calibration.docrime.open_loop import docrime_run
+from escape_hw.calibration.escape import method as procedure
+from escape_hw.calibration.escape.short_runs import fit_recorded_frames
+from escape_hw.calibration.sprint.fit import fit_registration
+from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
 
 #: Frames of a run with 30 modes, and how many runs.
 FRAMES, RUNS = 90, 6
@@ -23,10 +23,12 @@ def test_the_frames_err_less_than_the_sums_of_a_matrix():
         for k in range(RUNS):
             found = bench.run(docrime_run(bench, frames=FRAMES, record=True))
             matrix, grid, solution = found.result.matrix, found.result.grid, found.solution
-            frames = bench.run(fit_record(bench, found.record, matrix, grid, 6)).estimate
-            columns = independent_columns(matrix, solution.gram, solution.variance)
+            frames = bench.run(fit_recorded_frames(bench, found.record, matrix, grid, 6)).estimate
+            columns = decorrelate_columns(matrix, solution.gram, solution.variance)
             model = bench.model(grid)
-            sums = run(fit_steps(columns, model, covariance=solution.covariance, learn=True)).estimate
+            sums = run(
+                fit_registration(columns, model, covariance=solution.covariance, update_priors=True)
+            ).estimate
             by_frames[k] = frames.registration.to_array() - PLANTED
             by_sums[k] = sums.registration.to_array() - PLANTED
     ratio = np.sqrt(np.square(by_frames).mean(axis=0) / np.square(by_sums).mean(axis=0))
@@ -36,13 +38,13 @@ def test_the_frames_err_less_than_the_sums_of_a_matrix():
 
 @pytest.mark.parametrize(("frames", "fitted"), [(120, 1), (310, 0)])
 def test_the_frames_are_fitted_up_to_ten_per_mode(monkeypatch, frames, fitted):
-    asked, real = [], procedure.fit_record
+    asked, real = [], procedure.fit_recorded_frames
 
     def watched(*args):
         asked.append(args)
         return real(*args)
 
-    monkeypatch.setattr(procedure, "fit_record", watched)
+    monkeypatch.setattr(procedure, "fit_recorded_frames", watched)
     with small() as bench:
         result = bench.run(procedure.escape(bench, frames=frames))
     assert len(asked) == fitted

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from escape_hw.calibration.sprint import sprint
+from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.errors import CalibrationError, IncompatibleProduct
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from small_bench import assert_flat, small
 
-from escape_hw.api.taps import Taps
-from escape_hw.calibration.closed_loop import integrator_for
-from escape_hw.calibration.loop_run import RunningLoop
-from escape_hw.calibration.sensor_setup import extractor
+from escape_hw.api.callbacks import Callbacks
+from escape_hw.calibration.acquisition.sensor_setup import build_slope_function
+from escape_hw.calibration.loop.performance import build_integrator
+from escape_hw.calibration.loop.runner import RunningLoop
 
 
 class Seen:
@@ -17,8 +17,8 @@ class Seen:
     def __init__(self) -> None:
         self.frames, self.images, self.slopes, self.commands, self.residuals = [], [], [], [], []
 
-    def taps(self) -> Taps:
-        return Taps(
+    def callbacks(self) -> Callbacks:
+        return Callbacks(
             frame=self.frames.append,
             science=self.images.append,
             slopes=lambda index, slopes: self.slopes.append((index, slopes.copy())),
@@ -29,8 +29,8 @@ class Seen:
 
 def closed(bench, good, frames=60):
     """Close the loop for some frames; what an observer sees of it."""
-    control = integrator_for(bench, good.matrix, good.grid)
-    loop = RunningLoop(bench, good.matrix.m2c, extractor(bench, good.grid), control, science=True)
+    control = build_integrator(bench, good.matrix, good.grid)
+    loop = RunningLoop(bench, good.matrix.m2c, build_slope_function(bench, good.grid), control, science=True)
     seen = []
     try:
         bench.run(loop.run(frames, observe=(lambda *row: seen.append([np.array(v) for v in row]),)))
@@ -42,7 +42,7 @@ def closed(bench, good, frames=60):
 
 def test_taps_see_what_passes(bench, good):
     look = Seen()
-    bench.taps = look.taps()
+    bench.callbacks = look.callbacks()
     loop, seen = closed(bench, good, 300)
     indices = [int(row[0]) for row in seen]
     assert [frame.index for frame in look.frames] == indices
@@ -60,12 +60,12 @@ def test_taps_see_what_passes(bench, good):
 
 
 def test_nobody_looks_unless_asked(bench, good):
-    assert bench.taps == Taps()
-    assert (bench.wfs.tap, bench.dm.tap, bench.science.tap) == (None, None, None)
-    assert type(extractor(bench, good.grid)).__name__ == "SlopeExtractor"
-    bench.taps = Seen().taps()
-    bench.taps = Taps()
-    assert (bench.wfs.tap, bench.dm.tap, bench.science.tap) == (None, None, None)
+    assert bench.callbacks == Callbacks()
+    assert (bench.wfs.callback, bench.dm.callback, bench.science.callback) == (None, None, None)
+    assert type(build_slope_function(bench, good.grid)).__name__ == "SlopeExtractor"
+    bench.callbacks = Seen().callbacks()
+    bench.callbacks = Callbacks()
+    assert (bench.wfs.callback, bench.dm.callback, bench.science.callback) == (None, None, None)
 
 
 def test_a_tap_that_fails_is_dropped_and_the_loop_goes_on(bench, good, caplog):
@@ -75,7 +75,7 @@ def test_a_tap_that_fails_is_dropped_and_the_loop_goes_on(bench, good, caplog):
         calls.append(row)
         raise ValueError("the screen is gone")
 
-    bench.taps = Taps(failing, failing, failing, failing, failing)
+    bench.callbacks = Callbacks(failing, failing, failing, failing, failing)
     loop, seen = closed(bench, good)
     assert len(seen) == loop.record.frames == 60
     told = [record.message for record in caplog.records if "is dropped" in record.message]
@@ -89,7 +89,7 @@ def test_a_run_ends_with_the_same_numbers_whether_it_is_looked_at_or_not(good):
     for look in (False, True):
         with small("twin.loss_probability=0") as bench:
             if look:
-                bench.taps = Seen().taps()
+                bench.callbacks = Seen().callbacks()
             closed(bench, good)
             commands.append(bench.dm.sent_count)
             _, seen = closed(bench, good)

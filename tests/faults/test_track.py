@@ -12,15 +12,15 @@ from small_bench import assert_flat, small
 from small_system import configuration
 
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_hw.api.results import Measured, TemporalResponse
-from escape_hw.calibration.track import track
-from escape_hw.calibration.track_proposal import inverted
+from escape_hw.api.results import Estimate, TemporalResponse
+from escape_hw.calibration.tracking.exchange import invert_matrix
+from escape_hw.calibration.tracking.tracker import track
 from escape_hw.cli import main
 from escape_hw.errors import Aborted, CalibrationError, ConfigError
-from escape_hw.io.fits import load_matrix, save_matrix
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
 from escape_hw.io.provenance import Provenance
-from escape_hw.pipeline.integrator import LeakyIntegrator
-from escape_sim.flexure import FlexingSurface, Flexure
+from escape_hw.pipeline.control.integrator import LeakyIntegrator
+from escape_sim.mirror.surface import DriftingSurface, Flexure
 
 JUMP = np.array([25.0, -15.0, 0.3, 0.0, 0.0])
 QUIET = "twin.loss_probability=0"
@@ -103,12 +103,12 @@ def test_proposals_alone_change_nothing(start):
     assert found.exchanges[-1].change["shift_x"][0] > 5
     assert found.latest.matrix.method == "escape"
     np.testing.assert_array_equal(
-        inverted(found.latest.matrix, 4).shape, (found.latest.matrix.n_modes, start.grid.n_slopes)
+        invert_matrix(found.latest.matrix, 4).shape, (found.latest.matrix.n_modes, start.grid.n_slopes)
     )
 
 
 def test_what_was_fitted_beside_the_registration_stays(start):
-    extras = {"anamorphosis": Measured(0.4, 0.1, "% of the diameter")}
+    extras = {"anamorphosis": Estimate(0.4, 0.1, "% of the diameter")}
     told = replace(start, registration=replace(start.registration, extras=extras))
     with small(QUIET) as bench:
         found = followed(bench, told, 2, exchange=False)
@@ -139,7 +139,7 @@ def test_a_jump_raises_an_alarm_and_is_found_again(start):
         x = twin.pupil.coordinates_m
         moved = Flexure(there, twin.config.twin.drift)
         twin.flexure = moved
-        twin._surface = FlexingSurface(twin.influence, moved, twin.pupil.sub_aperture_m, x, x)
+        twin._surface = DriftingSurface(twin.influence, moved, twin.pupil.sub_aperture_m, x, x)
 
     with small(QUIET) as bench:
         found = followed(bench, start, 13, at=6, do=jump)

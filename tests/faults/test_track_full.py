@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from escape_hw.api.results import TemporalResponse
-from escape_hw.calibration.track import track
-from escape_hw.runtime.system import open_system
+from escape_hw.calibration.tracking.tracker import track
+from escape_hw.runtime.session.system import open_system
 
 pytestmark = pytest.mark.slow
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.api.frames import FrameStatus
+from escape_hw.api.camera import FrameStatus
 from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout
 from escape_hw.safety.limits import MirrorLimits
 from escape_hw.testing import FaultyCamera, FaultyMirror
-from escape_hw.testing.reference import RecordingMirror, SyntheticCamera
+from escape_hw.testing.reference_devices import RecordingMirror, SyntheticCamera
 
 
 def indices(camera: FaultyCamera, n: int) -> list[int]:

@@ -18,21 +18,21 @@ from PySide6.QtCore import QTimer
 from PySide6.QtWidgets import QApplication
 from scripted import ScriptedControl, ScriptedSource
 
-from escape_gui.app import application
+from escape_gui.app import qt_application
+from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels import PANELS
+from escape_gui.panels.base import Panel
 from escape_gui.panels.camera import CameraPanel
 from escape_gui.panels.devices import DevicesPanel
 from escape_gui.panels.log import LogPanel
-from escape_gui.panels.panel import Panel
-from escape_gui.session import Session
 from escape_gui.settings import Settings
 
 
 @pytest.fixture(scope="session")
 def qapp() -> QApplication:
     """The application, set up as the command does."""
-    return application()
+    return qt_application()
 
 
 def segments() -> set[str]:
@@ -89,7 +89,7 @@ def control() -> ScriptedControl:
 def session(source: ScriptedSource, control: ScriptedControl) -> Iterator[Session]:
     """A session on both."""
     session = Session()
-    session.use(source, control)
+    session.set_source(source, control)
     yield session
     session.close()
     session.deleteLater()
@@ -104,7 +104,7 @@ def make_window(session: Session, tmp_path: Path) -> Iterator[Callable[..., Main
         made.append(shown(session, tmp_path / "gui.json", panels, settings))
         for dock in made[-1].docks.values() if len(panels) == 1 else ():
             dock.show()
-        made[-1].ticker.tick(everything=True)
+        made[-1].update_timer.tick(force=True)
         return made[-1]
 
     yield make

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from PySide6.QtCore import QCoreApplication, QEvent
 
+from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels import PANELS
-from escape_gui.panels.panel import Panel
-from escape_gui.session import Session
+from escape_gui.panels.base import Panel
 from escape_gui.settings import Settings
 
 
@@ -24,13 +24,16 @@ def settle() -> None:
 
 
 def shown(
-    session: Session, store: Path, panels: Sequence[type[Panel]] = PANELS, settings: Settings | None = None
+    session: Session,
+    settings_path: Path,
+    panels: Sequence[type[Panel]] = PANELS,
+    settings: Settings | None = None,
 ) -> MainWindow:
     """A window that has looked once at everything."""
-    window = MainWindow(session, settings or Settings(), store, panels)
+    window = MainWindow(session, settings or Settings(), settings_path, panels)
     window.show()
     QCoreApplication.processEvents()
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     QCoreApplication.processEvents()
     return window
 

@@ -13,25 +13,25 @@ from escape_hw.errors import EscapeError
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import (
     Arguments,
+    DeviceHealth,
     DeviceState,
-    Disk,
-    Fault,
+    DiskState,
+    FaultState,
+    FrameCounters,
     Geometry,
-    Health,
-    Latency,
+    Illumination,
+    LatencyState,
     Lease,
-    Light,
     LogLine,
     LoopState,
-    Mirror,
+    MirrorState,
     Phase,
-    Plan,
     ProcedureEntry,
-    Product,
-    Rates,
+    ProcedurePlan,
+    ProductEntry,
     State,
 )
-from escape_hw.streams.histogram import BINS, bin_of
+from escape_hw.streams.timing import BINS, bin_of
 
 CLIENT = "0123456789abcdef"
 LEASE = Lease(client=CLIENT, name="ana", host="bench", pid=7, since_utc="2026-11-21T20:00:00")
@@ -42,7 +42,7 @@ DEVICES = (
         model="ALPAO DM97-15",
         serial="BAX123",
         simulated=True,
-        health=Health.OK,
+        health=DeviceHealth.OK,
         facts={"temperature_c": 31.2},
     ),
     DeviceState(
@@ -51,7 +51,7 @@ DEVICES = (
         model="XIMEA MQ013MG-ON",
         serial="CX0815",
         simulated=True,
-        health=Health.OK,
+        health=DeviceHealth.OK,
         facts={"frame_rate_hz": 500.0, "exposure_s": 0.0019, "temperature_c": 41.0},
     ),
     DeviceState(
@@ -60,7 +60,7 @@ DEVICES = (
         model="FLIR BFS-U3",
         serial="19001",
         simulated=True,
-        health=Health.OK,
+        health=DeviceHealth.OK,
     ),
 )
 
@@ -142,10 +142,10 @@ def running(**changes: Any) -> State:
         "phase": Phase.LOOP,
         "lease": LEASE,
         "devices": DEVICES,
-        "rates": Rates(frame_hz=500.0, frames=123456, lost=2),
-        "light": Light(saturated=0.0004, peak=0.97),
-        "mirror": Mirror(rms=0.082, peak=0.412, clipped=0.0),
-        "latency": Latency(p50=312.0, p99=401.0, largest=880.0, jitter_p99=64.0),
+        "rates": FrameCounters(frame_hz=500.0, frames=123456, lost=2),
+        "light": Illumination(saturated=0.0004, peak=0.97),
+        "mirror": MirrorState(rms=0.082, peak=0.412, clipped=0.0),
+        "latency": LatencyState(p50=312.0, p99=401.0, largest=880.0, jitter_p99=64.0),
         "loop": LoopState(
             closed=True,
             matrix="escape",
@@ -158,12 +158,12 @@ def running(**changes: Any) -> State:
             strehl_sigma=0.004,
         ),
         "products": (
-            Product(
+            ProductEntry(
                 name="escape", kind="matrix", path="/runs/1/im.fits", summary="ESCAPE, 1000 frames, 94 modes"
             ),
-            Product(name="docrime", kind="matrix", path="/runs/1/do.fits", summary="DO-CRIME, 94 modes"),
+            ProductEntry(name="docrime", kind="matrix", path="/runs/1/do.fits", summary="DO-CRIME, 94 modes"),
         ),
-        "disk": Disk(folder="/runs", free_gb=512.3),
+        "disk": DiskState(folder="/runs", free_gb=512.3),
     }
     return State(**{**values, **changes})
 
@@ -186,8 +186,8 @@ class ScriptedSource:
 
     def fail(self, reason: str = "no frames for 0.5 s") -> None:
         """A fault that made the mirror safe."""
-        fault = Fault(reason=reason, at_utc="2026-11-21T21:00:00", way_out="look at the camera's cable")
-        lost = DEVICES[1].model_copy(update={"health": Health.LOST, "message": "unplugged"})
+        fault = FaultState(reason=reason, at_utc="2026-11-21T21:00:00", way_out="look at the camera's cable")
+        lost = DEVICES[1].model_copy(update={"health": DeviceHealth.LOST, "message": "unplugged"})
         loop = self.state.loop.model_copy(update={"closed": False})
         self.change(phase=Phase.FAULT, fault=fault, devices=(DEVICES[0], lost, DEVICES[2]), loop=loop)
 
@@ -240,10 +240,10 @@ class ScriptedSource:
         """What can be started."""
         return self.offers
 
-    def check(self, procedure: str, arguments: Arguments) -> Plan:
+    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """A plan as long as was asked."""
         frames = int(arguments.get("frames") or 1000)
-        return Plan(
+        return ProcedurePlan(
             name=procedure, arguments=dict(arguments), frames=frames, seconds=frames / 500, stroke=0.02
         )
 
@@ -272,7 +272,7 @@ class ScriptedControl:
             raise AttributeError(verb)
         return lambda *args, **kwargs: self._note(verb, **({"args": args} if args else {}), **kwargs)
 
-    def check(self, procedure: str, arguments: Arguments) -> Plan:
+    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """A plan."""
         self._note("check", procedure=procedure, arguments=arguments)
         return ScriptedSource().check(procedure, arguments)

@@ -15,18 +15,26 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
 from scripted import ScriptedControl, ScriptedSource
 
+from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.gains import GainsPanel
-from escape_gui.panels.modes import LIVE, ModesPanel
+from escape_gui.panels.modes import LIVE_LABEL, ModesPanel
 from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.panels.sprint import SprintPanel
-from escape_gui.session import Session
 from escape_gui.settings import Settings
-from escape_gui.widgets.map_tiles import best_columns
-from escape_hw.api.registration import TO_PLAIN
+from escape_gui.widgets.images.map_tiles import best_columns
+from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
-from escape_hw.io.fits import save_matrix
-from escape_hw.remote.state import Ended, Finish, Parameter, Phase, ProcedureEntry, Product, Running
+from escape_hw.io.fits.matrix import save_matrix
+from escape_hw.remote.state import (
+    ActiveRun,
+    Finish,
+    FinishedRun,
+    Phase,
+    ProcedureEntry,
+    ProcedureParameter,
+    ProductEntry,
+)
 
 OFFERS = (
     ProcedureEntry(
@@ -34,24 +42,24 @@ OFFERS = (
         title="ESCAPE",
         help="Calibrates without a source.",
         parameters=(
-            Parameter(
+            ProcedureParameter(
                 name="frames", kind="int", default=1000, unit="frame", low=1, high=1e6, help="How many."
             ),
-            Parameter(name="snr", kind="float", low=0.01, help="Goal."),
-            Parameter(name="pokes", kind="choice", default="white", choices=("white", "shaped")),
-            Parameter(name="plain", kind="bool", default=False),
-            Parameter(name="closed_loop", kind="matrix"),
+            ProcedureParameter(name="snr", kind="float", low=0.01, help="Goal."),
+            ProcedureParameter(name="pokes", kind="choice", default="white", choices=("white", "shaped")),
+            ProcedureParameter(name="plain", kind="bool", default=False),
+            ProcedureParameter(name="closed_loop", kind="matrix"),
         ),
     ),
     ProcedureEntry(
         name="gains",
         title="Optical gains",
         help="Scale it.",
-        parameters=(Parameter(name="im", kind="matrix"),),
+        parameters=(ProcedureParameter(name="im", kind="matrix"),),
     ),
 )
 MATRIX = fake.calibration("docrime-whitened", n=24, n_modes=30).matrix
-RUNNING = Running(
+RUNNING = ActiveRun(
     id=3, name="escape", arguments={}, stage="DO-CRIME", done=610, total=1000, remaining_s=252.0
 )
 
@@ -78,9 +86,9 @@ def calibrate(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
 
 def look(window: MainWindow) -> None:
     QApplication.processEvents()
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     QApplication.processEvents()
-    assert window.ticker.broken == {}
+    assert window.update_timer.failed_panels == {}
 
 
 def until(what: Callable[[], bool], window: MainWindow) -> None:
@@ -107,13 +115,13 @@ def measure(source: ScriptedSource, share: float) -> None:
 def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
     panel = calibrate.panels["modes"]
     look(calibrate)
-    assert panel.is_empty
+    assert panel.shows_placeholder
     source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
     measure(source, 1e-4)
     look(calibrate)
-    assert not panel.is_empty
-    assert panel.which.currentData() == LIVE
-    assert panel.which.currentText() == "DO-CRIME, as measured now"
+    assert not panel.shows_placeholder
+    assert panel.matrix_selector.currentData() == LIVE_LABEL
+    assert panel.matrix_selector.currentText() == "DO-CRIME, as measured now"
     pale = contrast(panel)
     measure(source, 1.0)
     look(calibrate)
@@ -134,7 +142,7 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     for method in ("push-pull", "escape"):
         made = fake.calibration(method, n=24, n_modes=30)
         path = save_matrix(tmp_path / f"{method}.fits", made, fake.ORIGIN)
-        products.append(Product(name=method, kind="matrix", path=str(path)))
+        products.append(ProductEntry(name=method, kind="matrix", path=str(path)))
     source.change(products=tuple(products))
     until(lambda: "ESCAPE" in panel.matrices, calibrate)
     look(calibrate)
@@ -176,12 +184,12 @@ def test_pages_turn(calibrate, source):
     look(calibrate)
     page, pages = panel.mosaic.page
     assert (page, pages > 1) == (0, True)
-    press(panel._on)
+    press(panel._next_button)
     assert panel.mosaic.page[0] == 1
-    assert panel._pages.text() == f"page 2 of {pages}"
+    assert panel._page_label.text() == f"page 2 of {pages}"
     panel.mosaic.choose(29)
     assert panel.mosaic.page[0] == pages - 1
-    assert not panel._on.isEnabled()
+    assert not panel._next_button.isEnabled()
 
 
 # ---------------------------------------------------------------- SPRINT and gains
@@ -191,26 +199,26 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     path = np.array([step.registration.to_array() for step in estimate.iterations])
     norm = np.array([step.step_norm for step in estimate.iterations])
     source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
-    source.push("registration", path[:6] * TO_PLAIN)
+    source.push("registration", path[:6] * TO_STREAM_UNITS)
     source.push("registration_sigma", np.full(5, np.nan))
     source.push("step_norm", norm[:6])
     look(calibrate)
-    assert panel._pill.word == "running, 6 iterations"
-    source.push("registration", path * TO_PLAIN)
-    source.push("registration_sigma", estimate.sigma * TO_PLAIN)
+    assert panel._indicator.word == "running, 6 iterations"
+    source.push("registration", path * TO_STREAM_UNITS)
+    source.push("registration_sigma", estimate.sigma * TO_STREAM_UNITS)
     source.push("step_norm", norm)
     document = calibration_document(fake.calibration("escape"))
-    ended = Ended(id=3, name="escape", finish=Finish.DONE, document=document)
+    ended = FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document)
     source.change(phase=Phase.IDLE, procedure=None, last=ended)
     look(calibrate)
-    assert panel._pill.word == "converged, 18 iterations"
+    assert panel._indicator.word == "converged, 18 iterations"
     assert "±" in panel._values[0].text()
     assert "tangential_scaling is consistent with zero" in panel._notes.text()
     # Runs that fit no registration leave the verdict as it is, gains that did not converge among them.
     for k, name, told in ((4, "push-pull", None), (5, "gains", False)):
-        source.change(last=Ended(id=k, name=name, finish=Finish.ABORTED, document={"converged": told}))
+        source.change(last=FinishedRun(id=k, name=name, finish=Finish.ABORTED, document={"converged": told}))
         look(calibrate)
-        assert panel._pill.word == "converged, 18 iterations"
+        assert panel._indicator.word == "converged, 18 iterations"
     press(panel.units)
     assert panel.plot.physical
     table = panel.shown()[0].data
@@ -316,7 +324,7 @@ def test_a_procedure_is_watched_halted_and_stopped(calibrate, source, control):
 def test_the_result_stands_beside_the_one_before(calibrate, source):
     panel = calibrate.panels["procedure"]
     document = calibration_document(fake.calibration("escape"))
-    first = Ended(id=1, name="escape", finish=Finish.DONE, folder="/runs/1", document=document)
+    first = FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/1", document=document)
     source.change(last=first)
     look(calibrate)
     assert panel.outcome.text() == "Done: escape"
@@ -336,11 +344,13 @@ def test_new_matrices_are_offered_to_the_form(calibrate, source):
     box = panel.form.fields["im"]
     assert box.currentText() == "–"
     names = ("first", "second")
-    source.change(products=tuple(Product(name=name, kind="matrix", path="/x.fits") for name in names))
+    source.change(products=tuple(ProductEntry(name=name, kind="matrix", path="/x.fits") for name in names))
     look(calibrate)
     assert box.currentText() == "second"
     panel.form.set_value("im", "first")
-    source.change(products=(*source.state.products, Product(name="third", kind="matrix", path="/x.fits")))
+    source.change(
+        products=(*source.state.products, ProductEntry(name="third", kind="matrix", path="/x.fits"))
+    )
     look(calibrate)
     assert box.currentText() == "first"
 

@@ -10,13 +10,13 @@ from PySide6.QtWidgets import QFileDialog
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, ScriptedSource, running
 
-from escape_gui.actions import ACTIONS, MENUS, Action
 from escape_gui.main_window import MainWindow
-from escape_hw.io import fits_file
-from escape_hw.remote.state import Fault, Lease, LoopState, Phase, Running
+from escape_gui.window.actions import ACTIONS, MENUS, Action
+from escape_hw.io.fits import file as fits_file
+from escape_hw.remote.state import ActiveRun, FaultState, Lease, LoopState, Phase
 
-RUN = Running(id=3, name="escape", arguments={}, total=1000)
-FAULT = Fault(reason="no frames", at_utc="2026-11-21T21:00:00")
+RUN = ActiveRun(id=3, name="escape", arguments={}, total=1000)
+FAULT = FaultState(reason="no frames", at_utc="2026-11-21T21:00:00")
 SOMEBODY = Lease(
     client="fedcba9876543210", name="ben", host="control", pid=3, since_utc="2026-11-21T20:00:00"
 )
@@ -36,8 +36,8 @@ class Stage:
 
     def refused(self, name: str) -> None:
         """What was chosen is no recording, and a note says so."""
-        self.bot.waitUntil(lambda: bool(self.window.toasts.notes), timeout=5000)
-        assert name in self.window.toasts.notes[-1].text
+        self.bot.waitUntil(lambda: bool(self.window.notifications.notes), timeout=5000)
+        assert name in self.window.notifications.notes[-1].text
 
     def saved(self, ending: str) -> Path:
         """One file was saved."""
@@ -74,7 +74,7 @@ def _scale(sign: int) -> Callable[[Stage], None]:
 
 
 def _focus(stage: Stage) -> None:
-    assert stage.window.panel_in_focus() is not None
+    assert stage.window.focused_panel() is not None
 
 
 def _reset(stage: Stage) -> None:
@@ -96,8 +96,8 @@ CHECKS: dict[str, Callable[[Stage], None]] = {
     "reset_layout": _reset,
     "next_panel": _focus,
     "previous_panel": _focus,
-    "freeze": lambda s: _is(s.window.ticker.frozen),
-    "theme": lambda s: _is(s.window.context.theme.shade == "light"),
+    "freeze": lambda s: _is(s.window.update_timer.frozen),
+    "theme": lambda s: _is(s.window.context.theme.palette_name == "light"),
     "larger": _scale(+1),
     "smaller": _scale(-1),
     "normal": _scale(0),
@@ -189,7 +189,7 @@ def test_without_a_server_nothing_can_be_asked(small_window: MainWindow, source:
     source.connected = False
     window.refresh()
     assert all("does not answer" in window.actions_by_name[one.name].toolTip() for one in asking)
-    window.context.session.use(source, None)
+    window.context.session.set_source(source, None)
     window.refresh()
     assert all("replayed" in window.actions_by_name[one.name].toolTip() for one in asking)
     assert not any(window.actions_by_name[one.name].isEnabled() for one in asking)
@@ -204,5 +204,5 @@ def test_safety_needs_no_lease(small_window: MainWindow, source: ScriptedSource)
     window = small_window
     source.state = running(lease=SOMEBODY, loop=LoopState(closed=True))
     window.refresh()
-    assert window.band.open_button.isEnabled()
-    assert window.band.flatten_button.isEnabled()
+    assert window.header.open_button.isEnabled()
+    assert window.header.flatten_button.isEnabled()

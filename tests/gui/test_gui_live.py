@@ -11,8 +11,8 @@ import pytest
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedSource, running
 
-from escape_gui import live
-from escape_gui.live import Attachment, LiveSource
+from escape_gui.client import connection as live
+from escape_gui.client.connection import LiveSource, ServerAttachment
 from escape_hw.errors import ServerGone
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import Geometry, ProcedureEntry
@@ -69,8 +69,8 @@ def found() -> list[LiveSource]:
     return []
 
 
-def attach(address: str, found: list[LiveSource]) -> Iterator[Attachment]:
-    attachment = Attachment(address)
+def attach(address: str, found: list[LiveSource]) -> Iterator[ServerAttachment]:
+    attachment = ServerAttachment(address)
     attachment.attached.connect(found.append)
     attachment.start()
     yield attachment
@@ -79,17 +79,17 @@ def attach(address: str, found: list[LiveSource]) -> Iterator[Attachment]:
 
 
 @pytest.fixture
-def here(network: Network, found: list[LiveSource]) -> Iterator[Attachment]:
+def here(network: Network, found: list[LiveSource]) -> Iterator[ServerAttachment]:
     yield from attach("razor-shwfs", found)
 
 
 @pytest.fixture
-def afar(network: Network, found: list[LiveSource]) -> Iterator[Attachment]:
+def afar(network: Network, found: list[LiveSource]) -> Iterator[ServerAttachment]:
     yield from attach("tcp://bench:5555", found)
 
 
 def test_what_takes_time_is_asked_by_the_thread(
-    here: Attachment, found: list[LiveSource], network: Network, qtbot: QtBot
+    here: ServerAttachment, found: list[LiveSource], network: Network, qtbot: QtBot
 ) -> None:
     qtbot.waitUntil(lambda: bool(found) and bool(found[0].procedures()))
     source = found[0]
@@ -103,7 +103,7 @@ def test_what_takes_time_is_asked_by_the_thread(
 
 
 def test_streams_from_afar_never_stop_the_window(
-    afar: Attachment, found: list[LiveSource], network: Network, qtbot: QtBot
+    afar: ServerAttachment, found: list[LiveSource], network: Network, qtbot: QtBot
 ) -> None:
     qtbot.waitUntil(lambda: bool(found))
     source = found[0]
@@ -118,11 +118,11 @@ def test_streams_from_afar_never_stop_the_window(
 
 
 def test_a_server_that_came_back_is_found(
-    here: Attachment, found: list[LiveSource], network: Network, qtbot: QtBot
+    here: ServerAttachment, found: list[LiveSource], network: Network, qtbot: QtBot
 ) -> None:
     qtbot.waitUntil(lambda: len(found) == 1)
     reasons: list[str] = []
-    here.failing.connect(reasons.append)
+    here.connection_failed.connect(reasons.append)
     network.reachable = False
     network.made[0].connected = False
     qtbot.waitUntil(lambda: bool(reasons))
@@ -131,7 +131,7 @@ def test_a_server_that_came_back_is_found(
     network.reachable = True
     qtbot.waitUntil(lambda: len(found) == 2)
     assert found[1].connected
-    here.drop(found[0])
+    here.discard(found[0])
     qtbot.waitUntil(lambda: network.made[0].closed)
 
 

@@ -13,21 +13,29 @@ from PySide6.QtGui import QGuiApplication
 from pytestqt.qtbot import QtBot
 from scripted import DEVICES, ScriptedControl, ScriptedSource, running, secondary
 
+from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels import PANELS
+from escape_gui.panels.base import Panel
 from escape_gui.panels.camera import CameraPanel
-from escape_gui.panels.devices import DevicesPanel, fact
+from escape_gui.panels.devices import DevicesPanel, format_fact
 from escape_gui.panels.latency import LatencyPanel
 from escape_gui.panels.log import LogPanel
 from escape_gui.panels.loop import LoopPanel
 from escape_gui.panels.mirror import MirrorPanel
-from escape_gui.panels.panel import Panel
 from escape_gui.panels.performance import PerformancePanel
 from escape_gui.panels.psf import PsfPanel
-from escape_gui.session import Session
-from escape_gui.widgets.hold_button import HOLD_MS
+from escape_gui.widgets.controls.hold_button import HOLD_MS
 from escape_hw.errors import StorageError
-from escape_hw.remote.state import Health, Light, LoopState, Mirror, Phase, State, StreamEntry
+from escape_hw.remote.state import (
+    DeviceHealth,
+    Illumination,
+    LoopState,
+    MirrorState,
+    Phase,
+    State,
+    StreamEntry,
+)
 
 P = TypeVar("P", bound=Panel)
 MakeWindow = Callable[..., MainWindow]
@@ -52,41 +60,41 @@ def test_each_panel_lives_through_everything(
     window = make_window((kind,))
     dock, panel = window.docks[kind.name], window.panels[kind.name]
 
-    def look() -> Health:
-        window.ticker.tick(everything=True)
-        assert window.ticker.broken == {}
+    def look() -> DeviceHealth:
+        window.update_timer.tick(force=True)
+        assert window.update_timer.failed_panels == {}
         return panel.health
 
-    assert look() is Health.OK
+    assert look() is DeviceHealth.OK
     assert not dock._pill.isVisible()
     source.fail()
-    assert look() is Health.FAULT
+    assert look() is DeviceHealth.FAULT
     assert dock._pill.word == "fault"
     source.connected = False
-    assert look() is Health.LOST
+    assert look() is DeviceHealth.LOST
     assert dock._pill.word == "lost"
     source.connected = True
     source.state = running(engine_pid=99, serial=1000)
     source.push_all(1)
-    assert look() is Health.OK
+    assert look() is DeviceHealth.OK
     # Nothing at all, as before the first connection.
     source.state, source.streams, source.lines = State(), {}, []
     look()
-    assert panel.is_empty == bool(panel.empty) or kind.stale_after_s is None
+    assert panel.shows_placeholder == bool(panel.placeholder) or kind.stale_after_s is None
 
 
 def test_frames_that_stop_are_called_stale(
     window: MainWindow, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     camera = panel_of(window, CameraPanel)
-    assert camera.health is Health.OK
-    camera._newest -= 2.0
-    window.ticker.tick(everything=True)
-    assert camera.health is Health.STALE
+    assert camera.health is DeviceHealth.OK
+    camera._last_sample_s -= 2.0
+    window.update_timer.tick(force=True)
+    assert camera.health is DeviceHealth.STALE
     assert window.docks["camera"]._pill.word == "stale"
     source.push_all(5)
-    window.ticker.tick(everything=True)
-    assert camera.health is Health.OK
+    window.update_timer.tick(force=True)
+    assert camera.health is DeviceHealth.OK
 
 
 def test_every_panel_says_what_to_do_when_there_is_nothing() -> None:
@@ -101,12 +109,12 @@ def test_camera_counts_and_hatches_saturation(window: MainWindow, source: Script
     frame = np.zeros((400, 400), np.uint16)
     frame[7, 9] = 1023
     source.push("frames", frame, top=1023.0)
-    source.change(light=Light(saturated=0.0321, peak=1.0))
+    source.change(light=Illumination(saturated=0.0321, peak=1.0))
     camera._histogram_due = 0.0
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert "3.21 %" in camera.saturation.text()
-    assert camera.picture._veil.isVisible()
-    assert np.argwhere(camera.picture._veil.image[..., 3]).tolist() == [[7, 9]]
+    assert camera.picture._marks.isVisible()
+    assert np.argwhere(camera.picture._marks.image[..., 3]).tolist() == [[7, 9]]
 
 
 def test_camera_views(window: MainWindow, source: ScriptedSource) -> None:
@@ -122,7 +130,7 @@ def test_camera_views(window: MainWindow, source: ScriptedSource) -> None:
     assert np.isfinite(maps).sum() == 2 * n
     camera.choice.choose("change")
     source.push_all(3)
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert camera.signed.data is not None
     assert np.array_equal(camera.signed.data, source.streams["frames"].data - kept)
 
@@ -130,7 +138,7 @@ def test_camera_views(window: MainWindow, source: ScriptedSource) -> None:
 def test_cursor_says_place_and_value(window: MainWindow, source: ScriptedSource, qtbot: QtBot) -> None:
     picture = panel_of(window, CameraPanel).picture
     said: list[str] = []
-    picture.pointed.connect(said.append)
+    picture.cursor_changed.connect(said.append)
     qtbot.keyClick(picture, Qt.Key.Key_Right)
     value = source.streams["frames"].data[200, 201]
     assert said[-1].split() == ["x", "201", "y", "200", str(value), "counts"]
@@ -139,7 +147,7 @@ def test_cursor_says_place_and_value(window: MainWindow, source: ScriptedSource,
 def test_mirror_of_a_secondary_shows_both(session: Session, make_window: MakeWindow) -> None:
     source = ScriptedSource(geometry=secondary())
     source.push_all()
-    session.use(source, None)
+    session.set_source(source, None)
     window = make_window((MirrorPanel,))
     mirror = panel_of(window, MirrorPanel)
     assert mirror.picture.data is not None
@@ -151,9 +159,9 @@ def test_mirror_of_a_secondary_shows_both(session: Session, make_window: MakeWin
 
 
 def test_mirror_tells_peak_and_clipping(window: MainWindow, source: ScriptedSource) -> None:
-    source.change(mirror=Mirror(rms=0.0812, peak=0.8, clipped=0.031))
+    source.change(mirror=MirrorState(rms=0.0812, peak=0.8, clipped=0.031))
     window.show_workspace("align")
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     readouts = panel_of(window, MirrorPanel).readouts
     assert [readouts[name].text for name in ("rms", "peak", "clipped")] == ["0.0812", "0.8000", "3.10"]
 
@@ -164,12 +172,12 @@ def test_loop_edit_check_apply(
     loop = panel_of(window, LoopPanel)
     assert not loop.apply_button.isEnabled()
     loop.gain.setValue(0.5)
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert control.asked == []
     assert "press Check first" in loop.apply_button.toolTip()
     loop.check_button.click()
     assert loop.message.text() == "Apply: gain 0.425 → 0.5"
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     loop.apply_button.click()
     qtbot.waitUntil(lambda: loop.message.text() == "Done.")
     assert control.asked == [("set_loop", {"gain": 0.5})]
@@ -182,7 +190,7 @@ def test_loop_refuses_what_the_server_would(window: MainWindow, source: Scripted
     loop.check()
     assert "gain: Input should be greater than 0" in loop.message.text()
     assert "94 of 94 leaves none to control" in loop.message.text()
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert not loop.apply_button.isEnabled()
 
 
@@ -190,10 +198,10 @@ def test_loop_form_keeps_an_edit_while_the_state_changes(window: MainWindow, sou
     loop = panel_of(window, LoopPanel)
     loop.leak.setValue(0.1)
     source.change(loop=source.state.loop.model_copy(update={"gain": 0.6}))
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert loop.current["gain"].text() == "0.6000"
     assert (loop.leak.value(), loop.gain.value()) == (0.1, 0.425)
-    loop.reset_button.click()
+    loop.revert_button.click()
     assert (loop.leak.value(), loop.gain.value()) == (0.026, 0.6)
 
 
@@ -203,7 +211,7 @@ def test_closing_the_loop_needs_a_held_button(
     loop = panel_of(window, LoopPanel)
     assert "it is closed" in loop.close_button.toolTip()
     source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4, leak=0.02, dropped_modes=3, modes=80))
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     qtbot.mouseClick(loop.close_button, Qt.MouseButton.LeftButton)
     qtbot.wait(50)
     assert control.asked == []
@@ -218,7 +226,7 @@ def test_return_held_closes_the_loop_too(
 ) -> None:
     button = panel_of(window, LoopPanel).close_button
     source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4))
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     qtbot.keyPress(button, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: control.verbs == ["close_loop"], timeout=20 * HOLD_MS)
     qtbot.keyRelease(button, Qt.Key.Key_Return)
@@ -228,7 +236,7 @@ def test_log_search_level_and_copy(window: MainWindow, source: ScriptedSource) -
     for k in range(1, 7):
         source.push_all(k)
     log = panel_of(window, LogPanel)
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert len(log.text.toPlainText().splitlines()) == 7
     log.level.setCurrentText("Warning")
     assert len(log.text.toPlainText().splitlines()) == 4
@@ -242,8 +250,8 @@ def test_performance_has_gaps_where_nobody_looked(window: MainWindow, source: Sc
     panel = panel_of(window, PerformancePanel)
     panel._last -= 60.0
     source.change(loop=source.state.loop.model_copy(update={"residual_nm": 50.0}))
-    window.ticker.tick(everything=True)
-    (table,) = panel.shown()
+    window.update_timer.tick(force=True)
+    (table,) = panel.export_arrays()
     assert np.isnan(table.data[-2, 1:]).all()
     assert table.data[-1, 2] == 50.0
 
@@ -254,8 +262,8 @@ def test_performance_has_gaps_where_the_loop_was_open(
     monkeypatch.setattr("escape_gui.panels.performance._GAP_S", np.inf)
     panel = panel_of(window, PerformancePanel)
     source.change(loop=source.state.loop.model_copy(update={"closed": False}))
-    window.ticker.tick(everything=True)
-    (table,) = panel.shown()
+    window.update_timer.tick(force=True)
+    (table,) = panel.export_arrays()
     assert table.data[-2, 1:] == pytest.approx([36.5, 44.0])
     assert np.isnan(table.data[-1, 1:]).all()
 
@@ -267,13 +275,13 @@ def test_profiles_begin_at_the_strehl_ratio(make_window: MakeWindow, source: Scr
     source.push("model_psf", 1000 * narrow)
     source.push("psf", (50 + 3000 * wide).astype(np.uint16))
     window = make_window((PsfPanel,))
-    profiles = {one.name: one.data for one in panel_of(window, PsfPanel).shown()}
+    profiles = {one.name: one.data for one in panel_of(window, PsfPanel).export_arrays()}
     assert profiles["psf_profile"][0] / profiles["model_psf_profile"][0] == pytest.approx(0.25, rel=0.01)
 
 
 def test_latencies_are_counted_where_they_lie(make_window: MakeWindow, source: ScriptedSource) -> None:
     window = make_window((LatencyPanel,))
-    (table,) = panel_of(window, LatencyPanel).shown()
+    (table,) = panel_of(window, LatencyPanel).export_arrays()
     assert table.data[:, 1].sum() == 4000
     middle = table.data[:, 0] @ table.data[:, 1] / 4000
     assert middle == pytest.approx(60 * 5.2, rel=0.05)
@@ -282,10 +290,10 @@ def test_latencies_are_counted_where_they_lie(make_window: MakeWindow, source: S
 def test_devices_are_listed_with_units(window: MainWindow, source: ScriptedSource) -> None:
     panel = panel_of(window, DevicesPanel)
     window.show_workspace("align")
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert list(panel._rows) == [device.name for device in DEVICES]
     source.change(devices=DEVICES[:1])
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert list(panel._rows) == ["dm"]
 
 
@@ -298,7 +306,7 @@ def test_devices_are_listed_with_units(window: MainWindow, source: ScriptedSourc
     ],
 )
 def test_facts_in_words(key: str, value: float | str, text: str) -> None:
-    assert fact(key, value) == text
+    assert format_fact(key, value) == text
 
 
 def test_a_full_disk_is_told_and_nothing_breaks(
@@ -307,9 +315,9 @@ def test_a_full_disk_is_told_and_nothing_breaks(
     def full(path: Path, content: bytes) -> None:
         raise StorageError(f"{path}: cannot be written (No space left on device)")
 
-    monkeypatch.setattr("escape_gui.exports.write_atomic", full)
-    window.saver.panel_to(tmp_path / "a.png", "png", window.panels["camera"])
-    assert "No space left" in window.toasts.notes[-1].text
+    monkeypatch.setattr("escape_gui.window.export.write_atomic", full)
+    window.exporter.save_panel_to(tmp_path / "a.png", "png", window.panels["camera"])
+    assert "No space left" in window.notifications.notes[-1].text
     assert list(tmp_path.glob("a*")) == []
 
 
@@ -319,12 +327,12 @@ def test_a_missing_model_image_is_told(make_window: MakeWindow, source: Scripted
     window = make_window((PsfPanel, PerformancePanel))
     psf, performance = panel_of(window, PsfPanel), panel_of(window, PerformancePanel)
     window.docks["psf"].raise_()
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert "run model-psf" in psf.captions["model_psf"].text()
     assert performance.readouts["strehl"].text == "–"
-    assert performance.missing.isVisible()
+    assert performance.model_missing_label.isVisible()
     source.streams["model_psf"] = model
     source.change(streams=(StreamEntry(name="model_psf", segment="", unit=""),))
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert psf.captions["model_psf"].text() == "model, dashed"
-    assert not performance.missing.isVisible()
+    assert not performance.model_missing_label.isVisible()

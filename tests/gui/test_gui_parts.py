@@ -13,15 +13,14 @@ import pytest
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, disc, rows_of, secondary
 
-from escape_gui.display import check_display
-from escape_gui.loop_form import LoopEdit
-from escape_gui.maps import GAP, ActuatorMap, mask_of, slope_maps
-from escape_gui.radial import RadialProfile
-from escape_gui.session import Commands
+from escape_gui.app import require_display
+from escape_gui.client.session import RequestSender
 from escape_gui.settings import Settings, load_settings, save_settings
-from escape_gui.theme import PALETTES, SCALES, Colours, Theme, contrast
-from escape_gui.widgets.quiver import outline_points
-from escape_gui.widgets.strip_chart import History
+from escape_gui.theme import PALETTES, SCALES, Palette, Theme, contrast
+from escape_gui.views.images import GAP, ActuatorImage, RadialProfile, mask_from_rows, slope_map_pair
+from escape_gui.views.loop_form import LoopSettingsEdit
+from escape_gui.widgets.images.quiver import outline_points
+from escape_gui.widgets.plots.strip_chart import TimeSeriesBuffer
 from escape_hw.cli.app import run
 from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Geometry, LoopState
@@ -38,7 +37,7 @@ PAIRS = (
 
 
 @pytest.mark.parametrize("colours", PALETTES.values(), ids=PALETTES.keys())
-def test_every_text_can_be_read(colours: Colours) -> None:
+def test_every_text_can_be_read(colours: Palette) -> None:
     pairs = [(text, surface) for text in TEXTS for surface in SURFACES]
     poor = {
         (front, back): round(contrast(getattr(colours, front), getattr(colours, back)), 2)
@@ -49,7 +48,7 @@ def test_every_text_can_be_read(colours: Colours) -> None:
 
 
 @pytest.mark.parametrize("colours", PALETTES.values(), ids=PALETTES.keys())
-def test_curves_stand_out_from_their_ground(colours: Colours) -> None:
+def test_curves_stand_out_from_their_ground(colours: Palette) -> None:
     assert min(contrast(colour, colours.field) for colour in colours.series) >= 3.0
 
 
@@ -104,14 +103,14 @@ def test_without_a_file_there_is_nothing_to_warn_of(tmp_path: Path) -> None:
 
 # ---------------------------------------------------------------- requests
 @pytest.fixture
-def commands(control: ScriptedControl):
-    commands = Commands(control)
-    yield commands
-    commands.close()
-    commands.deleteLater()
+def requests(control: ScriptedControl):
+    requests = RequestSender(control)
+    yield requests
+    requests.close()
+    requests.deleteLater()
 
 
-def test_answers_come_back_into_the_windows_thread(commands: Commands, qtbot: QtBot) -> None:
+def test_answers_come_back_into_the_windows_thread(requests: RequestSender, qtbot: QtBot) -> None:
     threads: list[threading.Thread] = []
     asked = threading.current_thread()
 
@@ -119,54 +118,56 @@ def test_answers_come_back_into_the_windows_thread(commands: Commands, qtbot: Qt
         threads.append(threading.current_thread())
         return "done"
 
-    def then(answer: str) -> None:
+    def on_result(answer: str) -> None:
         threads.append(threading.current_thread())
         assert answer == "done"
 
-    commands.ask("try", call, then)
+    requests.ask("try", call, on_result)
     qtbot.waitUntil(lambda: len(threads) == 2)
     assert threads[0] is not asked
     assert threads[1] is asked
 
 
 def test_safety_does_not_wait_behind_a_slow_question(
-    commands: Commands, control: ScriptedControl, qtbot: QtBot
+    requests: RequestSender, control: ScriptedControl, qtbot: QtBot
 ) -> None:
     go_on = threading.Event()
-    commands.ask("check", lambda server: go_on.wait(20))
-    commands.ask("flatten", lambda server: server.flatten(), urgent=True)
+    requests.ask("check", lambda server: go_on.wait(20))
+    requests.ask("flatten", lambda server: server.flatten(), urgent=True)
     qtbot.waitUntil(lambda: control.verbs == ["flatten"])
     assert not go_on.is_set()
     go_on.set()
 
 
-def test_a_failure_reaches_whoever_asked(commands: Commands, control: ScriptedControl, qtbot: QtBot) -> None:
+def test_a_failure_reaches_whoever_asked(
+    requests: RequestSender, control: ScriptedControl, qtbot: QtBot
+) -> None:
     control.refuse = "the loop is open"
     heard: list[str] = []
-    with qtbot.waitSignal(commands.failed) as told:
-        commands.ask("change the loop", lambda server: server.set_loop(gain=0.5), otherwise=heard.append)
+    with qtbot.waitSignal(requests.failed) as told:
+        requests.ask("change the loop", lambda server: server.set_loop(gain=0.5), on_error=heard.append)
     assert told.args == ["change the loop", "the loop is open"]
     assert heard == ["the loop is open"]
 
 
 def test_answers_after_the_end_are_dropped(control: ScriptedControl, qtbot: QtBot) -> None:
-    commands = Commands(control)
+    requests = RequestSender(control)
     go_on, heard = threading.Event(), []
-    commands.ask("slow", lambda server: go_on.wait(20), heard.append)
+    requests.ask("slow", lambda server: go_on.wait(20), heard.append)
     go_on.set()
-    commands.close()
-    commands.ask("late", lambda server: server.flatten(), heard.append)
+    requests.close()
+    requests.ask("late", lambda server: server.flatten(), heard.append)
     qtbot.wait(50)
     assert heard == []
     assert control.asked == []
-    commands.deleteLater()
+    requests.deleteLater()
 
 
 # ---------------------------------------------------------------- pictures
 def test_slopes_become_two_maps() -> None:
     valid = disc(5)
     n = int(valid.sum())
-    maps = slope_maps(np.arange(2.0 * n), valid)
+    maps = slope_map_pair(np.arange(2.0 * n), valid)
     assert maps.shape == (5, 10 + GAP)
     assert maps[:, :5][valid].tolist() == list(range(n))
     assert maps[:, 5 + GAP :][valid].tolist() == list(range(n, 2 * n))
@@ -174,12 +175,12 @@ def test_slopes_become_two_maps() -> None:
 
 
 def test_geometry_without_a_sensor_has_an_empty_mask() -> None:
-    assert mask_of(()).size == 0
+    assert mask_from_rows(()).size == 0
 
 
 def test_actuators_on_a_grid_have_a_square_each() -> None:
     mask = disc(11, 1.03)
-    chart = ActuatorMap(Geometry(layout=rows_of(mask)))
+    chart = ActuatorImage(Geometry(layout=rows_of(mask)))
     values = np.arange(chart.n_act, dtype=float)
     assert chart.n_act == int(mask.sum())
     picture = chart.picture(values)
@@ -189,7 +190,7 @@ def test_actuators_on_a_grid_have_a_square_each() -> None:
 
 def test_actuators_without_a_grid_stand_at_their_places() -> None:
     places = secondary().places_m
-    chart = ActuatorMap(Geometry(places_m=places))
+    chart = ActuatorImage(Geometry(places_m=places))
     picture = chart.picture(np.array([x for x, _ in places]))
     # Values rise to the right as the places do, and every actuator is to be seen.
     rows, columns = np.nonzero(np.isfinite(picture))
@@ -214,7 +215,7 @@ def test_outlines_of_lenslets_are_squares_and_of_pupils_circles() -> None:
 
 
 def test_history_forgets_the_oldest() -> None:
-    history = History(4)
+    history = TimeSeriesBuffer(4)
     for k in range(11):
         history.add(float(k), 10.0 * k)
     times, values = history.arrays
@@ -226,12 +227,12 @@ def test_history_forgets_the_oldest() -> None:
 
 def test_what_an_edit_changes() -> None:
     loop = LoopState(matrix="escape", gain=0.4, leak=0.02, dropped_modes=3, modes=80)
-    assert LoopEdit("escape", 0.4, 0.02, 3).changed(loop) == {}
-    edit = LoopEdit("docrime", 0.4, 0.02, 5)
+    assert LoopSettingsEdit("escape", 0.4, 0.02, 3).changed(loop) == {}
+    edit = LoopSettingsEdit("docrime", 0.4, 0.02, 5)
     assert edit.changed(loop) == {"matrix": "docrime", "dropped_modes": 5}
-    assert edit.in_words(loop) == "matrix escape → docrime, dropped modes 3 → 5"
-    assert edit.problems(loop) == ()
-    assert LoopEdit("escape", 0.4, 0.02, 83).problems(loop) != ()
+    assert edit.describe_changes(loop) == "matrix escape → docrime, dropped modes 3 → 5"
+    assert edit.validation_errors(loop) == ()
+    assert LoopSettingsEdit("escape", 0.4, 0.02, 83).validation_errors(loop) != ()
 
 
 # ---------------------------------------------------------------- the command
@@ -251,9 +252,9 @@ def test_without_a_display_the_way_out_is_told(
     monkeypatch.setenv("DISPLAY", display)
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     with pytest.raises(ConfigError, match=said):
-        check_display()
+        require_display()
     monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
-    check_display()
+    require_display()
 
 
 def test_qt_keeps_its_references() -> None:

@@ -20,26 +20,35 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, ScriptedSource
 
-from escape_gui.band import Band
+from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.procedure import ProcedurePanel
-from escape_gui.session import NoSource, Session
 from escape_gui.settings import Settings, load_settings
-from escape_gui.widgets.picture import Picture
-from escape_gui.widgets.status_pill import Level
-from escape_gui.workspaces import WORKSPACES
-from escape_hw.remote.source import Source
-from escape_hw.remote.state import Ended, Finish, Health, Parameter, ProcedureEntry, Rates
+from escape_gui.widgets.controls.status_indicator import Level
+from escape_gui.widgets.images.image_viewer import ImageViewer
+from escape_gui.window.header import HeaderBar
+from escape_gui.window.workspaces import WORKSPACES
+from escape_hw.remote.source import DataSource
+from escape_hw.remote.state import (
+    DeviceHealth,
+    Finish,
+    FinishedRun,
+    FrameCounters,
+    ProcedureEntry,
+    ProcedureParameter,
+)
 
 MakeWindow = Callable[..., MainWindow]
 
 
-def places(band: Band) -> list[QPoint]:
-    return [button.mapTo(band.window(), QPoint(0, 0)) for button in (band.open_button, band.flatten_button)]
+def places(header: HeaderBar) -> list[QPoint]:
+    return [
+        button.mapTo(header.window(), QPoint(0, 0)) for button in (header.open_button, header.flatten_button)
+    ]
 
 
 def test_safety_buttons_never_move(window: MainWindow, source: ScriptedSource, qapp: QApplication) -> None:
-    where = places(window.band)
+    where = places(window.header)
     for one in WORKSPACES:
         window.show_workspace(one.name)
         source.change(rates=source.state.rates.model_copy(update={"lost": 999999, "frame_hz": 9999.9}))
@@ -48,11 +57,11 @@ def test_safety_buttons_never_move(window: MainWindow, source: ScriptedSource, q
         )
         window.refresh()
         qapp.processEvents()
-        assert places(window.band) == where
+        assert places(window.header) == where
     source.fail()
     window.refresh()
     qapp.processEvents()
-    assert places(window.band) == where
+    assert places(window.header) == where
 
 
 def test_safety_keys_work_from_everywhere(
@@ -65,7 +74,7 @@ def test_safety_keys_work_from_everywhere(
         Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier,
     )
     qtbot.waitUntil(lambda: control.verbs == ["open_loop"])
-    window.toggle_key_map()
+    window.toggle_keyboard_table()
     qtbot.keyClick(
         window.overlay, Qt.Key.Key_F, Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
     )
@@ -76,60 +85,62 @@ def test_safety_keys_work_from_everywhere(
 
 def test_the_band_says_what_it_is(small_window: MainWindow, source: ScriptedSource) -> None:
     window = small_window
-    strip = window.band.strip
-    assert strip.text().startswith("SIMULATED")
-    assert strip.width() == window.width()
+    connection_banner = window.header.connection_banner
+    assert connection_banner.text().startswith("SIMULATED")
+    assert connection_banner.width() == window.width()
     source.change(simulated=False)
     window.refresh()
-    assert strip.text() == "HARDWARE · razor-shwfs"
+    assert connection_banner.text() == "HARDWARE · razor-shwfs"
     source.connected = False
     window.refresh()
-    assert strip.text().startswith("NOT CONNECTED")
-    assert window.toasts.notes[-1].title == "Server lost"
-    window.context.session.use(source, None)
+    assert connection_banner.text().startswith("NOT CONNECTED")
+    assert window.notifications.notes[-1].title == "Server lost"
+    window.context.session.set_source(source, None)
     window.refresh()
-    assert strip.text().startswith("REPLAY")
+    assert connection_banner.text().startswith("REPLAY")
 
 
 def test_light_is_unknown_until_frames_come(small_window: MainWindow, source: ScriptedSource) -> None:
-    light = small_window.band.light
+    light = small_window.header.light
     assert (light.level, light.word) == (Level.GOOD, "saturated 0.04 %")
-    source.change(rates=Rates())
+    source.change(rates=FrameCounters())
     small_window.refresh()
-    assert (light.level, light.word) == (Level.QUIET, "saturated –")
+    assert (light.level, light.word) == (Level.NEUTRAL, "saturated –")
 
 
 def test_a_fault_stays_until_it_is_cleared(
     small_window: MainWindow, source: ScriptedSource, control: ScriptedControl
 ) -> None:
     window = small_window
-    assert not window.fault_bar.isVisible()
+    assert not window.fault_banner.isVisible()
     source.fail("no frames for 0.5 s")
     window.refresh()
-    assert window.fault_bar.isVisible()
-    assert "no frames for 0.5 s" in window.fault_bar._text.text()
-    assert "cable" in window.fault_bar._text.text()
-    assert window.toasts.notes[-1].title == "Fault, mirror made safe"
+    assert window.fault_banner.isVisible()
+    assert "no frames for 0.5 s" in window.fault_banner._text.text()
+    assert "cable" in window.fault_banner._text.text()
+    assert window.notifications.notes[-1].title == "Fault, mirror made safe"
     source.change(fault=None)
     window.refresh()
-    assert not window.fault_bar.isVisible()
+    assert not window.fault_banner.isVisible()
 
 
 def test_the_end_of_a_run_is_told(small_window: MainWindow, source: ScriptedSource) -> None:
-    source.change(last=Ended(id=1, name="escape", finish=Finish.FAILED, message="too dark", folder="/runs/2"))
+    source.change(
+        last=FinishedRun(id=1, name="escape", finish=Finish.FAILED, message="too dark", folder="/runs/2")
+    )
     small_window.refresh()
-    note = small_window.toasts.notes[-1]
+    note = small_window.notifications.notes[-1]
     assert (note.title, note.text) == ("escape failed", "too dark\n/runs/2")
-    note.shut.click()
-    assert small_window.toasts.notes == []
+    note.close_button.click()
+    assert small_window.notifications.notes == []
 
 
 def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: ScriptedSource) -> None:
     """Nine arguments and five lines of result at 1280 x 800, and no unit at its field's edge."""
     parameters = (
-        Parameter(name="poke", kind="float", default=0.01, unit="of full stroke"),
-        Parameter(name="accuracy", kind="float", unit="% of a sub-aperture"),
-        *(Parameter(name=f"number {k}", kind="int", default=k, unit="frame") for k in range(7)),
+        ProcedureParameter(name="poke", kind="float", default=0.01, unit="of full stroke"),
+        ProcedureParameter(name="accuracy", kind="float", unit="% of a sub-aperture"),
+        *(ProcedureParameter(name=f"number {k}", kind="int", default=k, unit="frame") for k in range(7)),
     )
     about = "Calibrates without a calibration source: DO-CRIME on the turbulence, then SPRINT. " * 2
     source.offers = (ProcedureEntry(name="escape", title="ESCAPE", help=about, parameters=parameters),)
@@ -139,12 +150,14 @@ def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: Scri
         "snr": {"min": 8.2},
         "strehl": {"peak": {"value": 0.4}},
     }
-    source.change(last=Ended(id=1, name="escape", finish=Finish.DONE, folder="/runs/2", document=document))
+    source.change(
+        last=FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/2", document=document)
+    )
     window = make_window(settings=Settings(workspace="calibrate"))
     panel = window.panels["procedure"]
     assert isinstance(panel, ProcedurePanel)
     for _ in range(3):
-        window.ticker.tick(everything=True)
+        window.update_timer.tick(force=True)
         QApplication.processEvents()
     fields = panel.form.fields.values()
     assert len(fields) == 9
@@ -164,13 +177,13 @@ def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: Scri
 def test_a_note_covers_nothing(
     small_window: MainWindow, qtbot: QtBot, qapp: QApplication, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    window, toasts = small_window, small_window.toasts
+    window, notifications = small_window, small_window.notifications
     where = {name: dock.geometry() for name, dock in window.docks.items()}
-    monkeypatch.setattr("escape_gui.widgets.toasts.SHOWN_MS", 2000)
-    toasts.tell(Level.BAD, "Not saved", "the disk is full, " * 40 + "\n/runs/2")
-    toasts.tell(Level.GOOD, "Saved", "/runs/3")
+    monkeypatch.setattr("escape_gui.window.notifications.DISPLAY_MS", 2000)
+    notifications.show_message(Level.ERROR, "Not saved", "the disk is full, " * 40 + "\n/runs/2")
+    notifications.show_message(Level.GOOD, "Saved", "/runs/3")
     qapp.processEvents()
-    bad, good = toasts.notes
+    bad, good = notifications.notes
     assert good.isVisible()
     assert not bad.isVisible()
     assert {name: dock.geometry() for name, dock in window.docks.items()} == where
@@ -178,17 +191,17 @@ def test_a_note_covers_nothing(
     assert window.width() == 1280
     assert "/runs/2" in bad.toolTip()
     # What informs goes by itself; what is bad comes back and stays.
-    qtbot.waitUntil(lambda: toasts.notes == [bad], timeout=60_000)
+    qtbot.waitUntil(lambda: notifications.notes == [bad], timeout=60_000)
     qapp.processEvents()
     assert bad.isVisible()
-    assert bad.shut.mapTo(window, QPoint(0, 0)).x() < window.width()
+    assert bad.close_button.mapTo(window, QPoint(0, 0)).x() < window.width()
 
 
 def test_a_refused_request_is_told(small_window: MainWindow, control: ScriptedControl, qtbot: QtBot) -> None:
     control.refuse = "ben has control since 20:00"
     small_window.actions_by_name["give_back"].trigger()
-    qtbot.waitUntil(lambda: bool(small_window.toasts.notes))
-    note = small_window.toasts.notes[-1]
+    qtbot.waitUntil(lambda: bool(small_window.notifications.notes))
+    note = small_window.notifications.notes[-1]
     assert (note.title, note.text) == ("Could not give control back", "ben has control since 20:00")
 
 
@@ -197,11 +210,11 @@ def test_hidden_panels_cost_nothing(window: MainWindow, source: ScriptedSource) 
         dock.hide()
     settle()
     source.reads = 0
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert source.reads == 0
     window.docks["camera"].show()
     QApplication.processEvents()
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert source.reads == 2
 
 
@@ -211,7 +224,7 @@ def test_a_tab_behind_another_costs_nothing(window: MainWindow, source: Scripted
     window.docks["psf"].raise_()
     QApplication.processEvents()
     source.reads = 0
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     seen = {"camera": 2, "psf": 2}
     assert source.reads == sum(seen.values())
 
@@ -220,17 +233,17 @@ def test_a_broken_panel_does_not_stop_the_others(
     window: MainWindow, source: ScriptedSource, caplog: pytest.LogCaptureFixture
 ) -> None:
     source.push("psf", source.streams["psf"].data.ravel())
-    window.ticker.tick(everything=True)
-    assert list(window.ticker.broken) == ["psf"]
-    assert window.panels["psf"].is_empty
+    window.update_timer.tick(force=True)
+    assert list(window.update_timer.failed_panels) == ["psf"]
+    assert window.panels["psf"].shows_placeholder
     assert "panel 'psf' failed" in caplog.text
     source.push_all(1)
-    window.ticker.tick(everything=True)
-    assert window.panels["camera"].health is Health.OK
+    window.update_timer.tick(force=True)
+    assert window.panels["camera"].health is DeviceHealth.OK
     # Another source gives it another chance.
-    window.context.session.use(source, None)
-    window.ticker.tick(everything=True)
-    assert window.ticker.broken == {}
+    window.context.session.set_source(source, None)
+    window.update_timer.tick(force=True)
+    assert window.update_timer.failed_panels == {}
 
 
 def test_frozen_panels_hold_but_the_band_goes_on(small_window: MainWindow, source: ScriptedSource) -> None:
@@ -239,24 +252,24 @@ def test_frozen_panels_hold_but_the_band_goes_on(small_window: MainWindow, sourc
     before = window.panels["camera"].picture.data
     source.push_all(2)
     source.change(rates=source.state.rates.model_copy(update={"frame_hz": 123.4}))
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     assert window.panels["camera"].picture.data is before
-    assert window.band.readouts["rate"].text == "123.4"
+    assert window.header.readouts["rate"].text == "123.4"
 
 
 def test_layout_and_look_are_remembered(make_window: MakeWindow, tmp_path: Path) -> None:
-    store = tmp_path / "gui.json"
+    settings_path = tmp_path / "gui.json"
     window = make_window()
     window.docks["log"].close()
     window.show_workspace("align")
     window.toggle_theme()
-    window.step_letters(+1)
+    window.step_font_scale(+1)
     window.close()
-    settings, warnings = load_settings(store)
+    settings, warnings = load_settings(settings_path)
     assert warnings == ()
     window = make_window(settings=settings)
     assert window.workspace.name == "align"
-    assert (window.context.theme.shade, window.context.theme.scale) == ("light", 1.1)
+    assert (window.context.theme.palette_name, window.context.theme.scale) == ("light", 1.1)
     assert window.docks["camera"].isVisible()
     window.show_workspace("operate")
     assert window.docks["performance"].isVisible()
@@ -271,7 +284,7 @@ def test_a_layout_of_another_time_is_dropped(make_window: MakeWindow) -> None:
 
 
 def test_everything_can_be_reached_and_named(window: MainWindow) -> None:
-    kinds = (QAbstractButton, QAbstractSpinBox, QComboBox, QLineEdit, QTabBar, Picture)
+    kinds = (QAbstractButton, QAbstractSpinBox, QComboBox, QLineEdit, QTabBar, ImageViewer)
     nameless, deaf = [], []
     for kind in kinds:
         for widget in window.findChildren(kind):
@@ -294,26 +307,26 @@ def test_nothing_of_the_band_is_cut_off(make_window: MakeWindow, scale: float) -
     window = make_window((), Settings(font_scale=scale))
     window.resize(round(1280 * max(scale, 1)), 800)
     QApplication.processEvents()
-    band = window.band
-    for widget in (*band.readouts.values(), band.phase, band.loop, band.light, band.control):
+    header = window.header
+    for widget in (*header.readouts.values(), header.phase, header.loop, header.light, header.control):
         assert widget.width() >= widget.sizeHint().width()
-        assert widget.geometry().right() < band.open_button.geometry().left()
+        assert widget.geometry().right() < header.open_button.geometry().left()
 
 
 def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
     session = Session()
-    quiet: Source = NoSource()
+    quiet: DataSource = EmptySource()
     assert not quiet.connected
     window = shown(session, tmp_path / "gui.json")
-    assert window.panels["camera"].is_empty
-    band = window.band
-    assert "escape serve SYSTEM" in band.strip.text()
-    assert "old" not in band.strip.text()
-    assert {one.text for one in band.readouts.values()} == {"–"}
-    for pill in (band.phase, band.loop, band.light, band.control):
-        assert pill.level is Level.QUIET
-        assert pill.word.endswith("–")
-    assert "escape serve SYSTEM" in window.panels["loop"]._nothing.text()
+    assert window.panels["camera"].shows_placeholder
+    header = window.header
+    assert "escape serve SYSTEM" in header.connection_banner.text()
+    assert "old" not in header.connection_banner.text()
+    assert {one.text for one in header.readouts.values()} == {"–"}
+    for loop_indicator in (header.phase, header.loop, header.light, header.control):
+        assert loop_indicator.level is Level.NEUTRAL
+        assert loop_indicator.word.endswith("–")
+    assert "escape serve SYSTEM" in window.panels["loop"]._placeholder_label.text()
     dispose(window)
     session.close()
 
@@ -328,17 +341,17 @@ def test_the_window_fits_a_small_screen(
             name="escape",
             title="ESCAPE",
             help="Measures an interaction matrix. " * 12,
-            parameters=tuple(Parameter(name=f"number {k}", kind="int", default=k) for k in range(9)),
+            parameters=tuple(ProcedureParameter(name=f"number {k}", kind="int", default=k) for k in range(9)),
         ),
     )
-    source.change(last=Ended(id=1, name="escape", finish=Finish.DONE, message="all went well " * 20))
+    source.change(last=FinishedRun(id=1, name="escape", finish=Finish.DONE, message="all went well " * 20))
     source.fail()
     window = make_window(settings=Settings(font_scale=scale))
-    window.ticker.tick(everything=True)
+    window.update_timer.tick(force=True)
     for one in WORKSPACES:
         window.show_workspace(one.name)
         QApplication.processEvents()
-        window.ticker.tick(everything=True)
+        window.update_timer.tick(force=True)
         QApplication.processEvents()
         assert window.minimumSizeHint().height() <= 700, one.name
         window.resize(round(1366 * scale), 700)
@@ -351,7 +364,7 @@ def test_no_tab_bar_of_another_workspace_stays(make_window: MakeWindow) -> None:
         window.show_workspace(one.name)
         for _ in range(5):
             QApplication.processEvents()
-            window.ticker.tick(everything=True)
+            window.update_timer.tick(force=True)
         bars = window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly)
         seen = {
             tuple(bar.tabText(k) for k in range(bar.count()))

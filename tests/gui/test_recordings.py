@@ -14,12 +14,12 @@ from PySide6.QtCore import QMimeData, QPoint, QPointF, Qt, QUrl
 from PySide6.QtGui import QDragEnterEvent, QDropEvent
 from PySide6.QtWidgets import QApplication, QFileDialog
 
+from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels import PANELS
 from escape_gui.replay.source import ReplaySource
-from escape_gui.session import Session
 from escape_gui.settings import Settings
-from escape_gui.widgets.status_pill import Level
+from escape_gui.widgets.controls.status_indicator import Level
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +45,8 @@ def until(what: Callable[[], bool], window: MainWindow) -> None:
     while not what():
         assert time.monotonic() < deadline
         QApplication.processEvents()
-        window.ticker.tick(everything=True)
-        assert window.ticker.broken == {}
+        window.update_timer.tick(force=True)
+        assert window.update_timer.failed_panels == {}
         time.sleep(0.005)
 
 
@@ -67,11 +67,11 @@ def test_a_run_is_shown_by_every_panel(empty, folder):
             QApplication.processEvents()
     for panel in PANELS:
         empty.docks[panel.name].show()
-    empty.ticker.tick(everything=True)
+    empty.update_timer.tick(force=True)
     sprint, gains = empty.panels["sprint"], empty.panels["gains"]
-    assert sprint._pill.word == "converged, 18 iterations"
+    assert sprint._indicator.word == "converged, 18 iterations"
     assert list(gains._curves) == ["ESCAPE", "DO-CRIME"]
-    assert not empty.panels["psf"].is_empty
+    assert not empty.panels["psf"].shows_placeholder
 
 
 def test_what_a_recording_does_not_know_is_no_zero(empty, folder):
@@ -82,9 +82,9 @@ def test_what_a_recording_does_not_know_is_no_zero(empty, folder):
         empty.docks[name].raise_()
         QApplication.processEvents()
         until(lambda: True, empty)
-    band, panels = empty.band, empty.panels
-    assert {one.text for one in band.readouts.values()} == {"–"}
-    assert (band.light.level, band.light.word) == (Level.QUIET, "saturated –")
+    header, panels = empty.header, empty.panels
+    assert {one.text for one in header.readouts.values()} == {"–"}
+    assert (header.light.level, header.light.word) == (Level.NEUTRAL, "saturated –")
     assert panels["camera"].saturation.text() == "peak –   saturated –"
     assert {one.text for one in panels["mirror"].readouts.values()} == {"–"}
 
@@ -97,22 +97,22 @@ def test_nothing_can_be_commanded_and_the_reason_is_told(empty, folder):
     for button in (procedure.check, procedure.start, procedure.pause, procedure.abort):
         assert not button.isEnabled()
         assert "replayed" in button.toolTip()
-    assert "recording" in procedure._about.text()
+    assert "recording" in procedure._description.text()
     assert procedure.outcome.text() == "Done: A run"
 
 
 def test_the_slider_goes_through_the_run(empty, folder):
     empty.replay.open(folder)
     until(lambda: is_open(empty), empty)
-    sprint, transport = empty.panels["sprint"], empty.replay.transport
-    until(lambda: sprint._course is not None and len(sprint._course.values) == 18, empty)
-    assert transport.isVisible()
-    transport.slider.setValue(transport.slider.maximum() // 2)
-    until(lambda: len(sprint._course.values) == 9, empty)
-    transport.slider.setValue(transport.slider.maximum() - 2)
-    transport.play.click()
-    until(lambda: not transport.play.isChecked(), empty)
-    until(lambda: len(sprint._course.values) == 18, empty)
+    sprint, playback_bar = empty.panels["sprint"], empty.replay.playback_bar
+    until(lambda: sprint._history is not None and len(sprint._history.values) == 18, empty)
+    assert playback_bar.isVisible()
+    playback_bar.slider.setValue(playback_bar.slider.maximum() // 2)
+    until(lambda: len(sprint._history.values) == 9, empty)
+    playback_bar.slider.setValue(playback_bar.slider.maximum() - 2)
+    playback_bar.play.click()
+    until(lambda: not playback_bar.play.isChecked(), empty)
+    until(lambda: len(sprint._history.values) == 18, empty)
 
 
 @pytest.mark.parametrize("name", ["", "escape.fits"])
@@ -132,7 +132,7 @@ def test_what_cannot_be_read_is_told(empty, tmp_path, monkeypatch):
     path.write_bytes(b"no FITS")
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_: (str(path), ""))
     told: list[str] = []
-    monkeypatch.setattr(empty.toasts, "tell", lambda _level, _title, text: told.append(text))
+    monkeypatch.setattr(empty.notifications, "show_message", lambda _level, _title, text: told.append(text))
     empty.actions_by_name["open_product"].trigger()
     until(lambda: bool(told), empty)
     assert "im.fits: not a FITS file" in told[0]
@@ -143,9 +143,9 @@ def test_a_bench_keeps_its_window(small_window, folder, monkeypatch):
     """The safety buttons of a window on a bench must go on working."""
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(folder))
     small_window.actions_by_name["open_run"].trigger()
-    until(lambda: bool(small_window.replay.others), small_window)
+    until(lambda: bool(small_window.replay.replay_windows), small_window)
     assert not is_open(small_window)
-    (other,) = small_window.replay.others
+    (other,) = small_window.replay.replay_windows
     assert is_open(other)
     assert other.isVisible()
     assert np.array_equal(

@@ -20,8 +20,8 @@ pytestmark = [pytest.mark.screenshots, pytest.mark.timeout(1800)]
 
 def picture(operator: Operator, name: str) -> None:
     """Save the window with few colours: a page of pictures loads quickly."""
-    for note in tuple(operator.window.toasts.notes):
-        note.shut.click()
+    for note in tuple(operator.window.notifications.notes):
+        note.close_button.click()
     operator.settle(1.0)
     FIGURES.mkdir(exist_ok=True)
     path = FIGURES / f"{name}.png"
@@ -47,7 +47,9 @@ def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         picture(operator, "plan")
         before = source.source.state.last.id
         operator.press(operator.procedure.start)
-        operator.until(lambda: panels["modes"].which.currentData() == "as measured now", "maps fill in")
+        operator.until(
+            lambda: panels["modes"].matrix_selector.currentData() == "as measured now", "maps fill in"
+        )
         picture(operator, "measuring")
         operator.until(lambda: operator.ended(before), "it ends")
         operator.run("push-pull", frames="1")

@@ -10,15 +10,15 @@ from small_system import configuration
 from whole_run import Operator, operating
 
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_hw.io.fits import load_matrix
-from escape_hw.remote.state import Ended, Finish
+from escape_hw.io.fits.matrix import load_matrix
+from escape_hw.remote.state import Finish, FinishedRun
 
 
-def planted(ended: Ended) -> Registration:
+def planted(ended: FinishedRun) -> Registration:
     return Registration(**ended.document["planted"])
 
 
-def recovered(ended: Ended) -> None:
+def recovered(ended: FinishedRun) -> None:
     """The registration is the planted one, within five of its standard errors."""
     truth = planted(ended).to_dict()
     for name in PARAMETERS:
@@ -26,7 +26,7 @@ def recovered(ended: Ended) -> None:
         assert abs(found["value"] - truth[name]) < 5 * found["sigma"], name
 
 
-def calibrated(operator: Operator, ended: Ended) -> None:
+def calibrated(operator: Operator, ended: FinishedRun) -> None:
     """What the panels show after ESCAPE."""
     window = operator.window
     modes, sprint = window.panels["modes"], window.panels["sprint"]
@@ -36,9 +36,9 @@ def calibrated(operator: Operator, ended: Ended) -> None:
     assert operator.seen["live_modes"]
     assert any(operator.seen["abort"])
     operator.until(lambda: {"DO-CRIME", "ESCAPE"} <= set(modes.matrices), "products are shown")
-    assert sprint._pill.word.startswith("converged")
+    assert sprint._indicator.word.startswith("converged")
     product = load_matrix(ended.products["im"])
-    operator.until(lambda: modes.which.currentText() == "ESCAPE", "the newest is in front")
+    operator.until(lambda: modes.matrix_selector.currentText() == "ESCAPE", "the newest is in front")
     np.testing.assert_array_equal(modes.matrices["ESCAPE"].data, product.matrix.data)
     assert "Shift X" in operator.procedure.numbers.text()
     assert operator.procedure.report.isVisible()

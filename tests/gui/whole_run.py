@@ -14,12 +14,12 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
 
-from escape_gui.app import Desk
+from escape_gui.app import WindowController
+from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.procedure import ProcedurePanel
-from escape_gui.session import Session
 from escape_gui.settings import Settings
-from escape_hw.remote.state import Ended, Phase
+from escape_hw.remote.state import FinishedRun, Phase
 
 #: Longest wait for a step; a calibration takes minutes on a busy machine.
 PATIENCE_S = 900.0
@@ -48,7 +48,7 @@ class Operator:
         while not what():
             assert time.monotonic() < deadline, f"never happened: {why}"
             QApplication.processEvents()
-            assert self.window.ticker.broken == {}
+            assert self.window.update_timer.failed_panels == {}
             time.sleep(0.01)
 
     def press(self, button: QPushButton) -> None:
@@ -73,7 +73,7 @@ class Operator:
             form.form.set_value(key, text)
         self.until(form.start.isEnabled, f"{name} is planned: {form.plan.text()}")
 
-    def run(self, name: str, **arguments: str) -> Ended:
+    def run(self, name: str, **arguments: str) -> FinishedRun:
         """Start a procedure by its button, watch it to its end."""
         self.choose(name, **arguments)
         source = self.window.context.session.source
@@ -98,9 +98,9 @@ class Operator:
 
     def _watch(self) -> bool:
         panels, seen = self.window.panels, self.seen
-        if panels["modes"].which.currentData() == "as measured now":
+        if panels["modes"].matrix_selector.currentData() == "as measured now":
             seen["live_modes"].append(panels["modes"].mosaic.n_modes)
-        if (course := panels["sprint"]._course) is not None:
+        if (course := panels["sprint"]._history) is not None:
             seen["iterations"].append(len(course.values))
         seen["gains"].append(len(panels["gains"]._curves))
         seen["abort"].append(self.procedure.abort.isEnabled())
@@ -116,9 +116,9 @@ def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Ope
         os.environ["XDG_RUNTIME_DIR"] = served.environment["XDG_RUNTIME_DIR"]
         session = Session()
         window = MainWindow(session, Settings(**{"workspace": "calibrate", **settings}), None)
-        desk = Desk(window, session, serving.SYSTEM, None)
+        desk = WindowController(window, session, serving.SYSTEM, None)
         window.resize(1280, 800)
-        window.ticker.start()
+        window.update_timer.start()
         window.show()
         try:
             yield Operator(window)

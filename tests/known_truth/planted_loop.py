@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from escape_hw.calibration.docrime_estimator import DocrimeEstimator
-from escape_hw.pipeline.integrator import LeakyIntegrator
+from escape_hw.calibration.docrime.estimator import DocrimeEstimator
+from escape_hw.pipeline.control.integrator import LeakyIntegrator
 
 N_SLOPES, N_MODES, LAGS, ORDER = 40, 10, 5, 4
 RESPONSE = np.array([0.0, 0.0, 0.45, 0.55, 0.0])
@@ -26,11 +26,11 @@ class Recorded:
 
     def fit(self, closed=True, order=ORDER, columns=None):
         """The estimator's solution; ``columns`` other than ``None`` stand for the commands."""
-        driven = self.commands if columns is None else columns
+        excitation = self.commands if columns is None else columns
         if closed:
-            driven = np.concatenate([driven, self.pokes], axis=1)
+            excitation = np.concatenate([excitation, self.pokes], axis=1)
         estimator = DocrimeEstimator(N_SLOPES, N_MODES, order=order, lags=LAGS, closed=closed)
-        return estimator.extend(self.index, self.slopes, driven).solve()
+        return estimator.extend(self.index, self.slopes, excitation).solve()
 
 
 def air(rng, frames, rms=0.3, pole=0.98):
@@ -77,7 +77,7 @@ def loop(
             largest = np.abs(total).max()
             sent[t] = total * min(1.0, limit / largest)
             if largest > limit or law is not None:
-                control.applied(sent[t] - pokes[t])
+                control.set_applied(sent[t] - pokes[t])
         else:
             sent[t] = sent[t - 1]
         padded[t + LAGS] = sent[t]

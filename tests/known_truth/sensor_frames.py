@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_sim.shack_hartmann import ShackHartmannOptics
+from escape_sim.optics.shack_hartmann import ShackHartmannOptics
 
 WAVELENGTH = 635e-9
 SPOT = 2.3

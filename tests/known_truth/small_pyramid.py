@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from escape_hw.config.load import load_system
-from escape_hw.config.models import SystemConfig
-from escape_hw.runtime.system import System
+from escape_hw.config.loader import load_system
+from escape_hw.config.system import SystemConfig
+from escape_hw.runtime.session.system import System
 
 #: Images of 16 pixels, 37 actuators, 20 modes, moderate turbulence; everything else as on the real bench.
 SMALL = (

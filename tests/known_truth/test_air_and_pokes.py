@@ -11,9 +11,9 @@ from small_pyramid import configuration
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
-from escape_hw.pipeline.pyramid_slopes import slopes_of_image
-from escape_sim.pyramid_model import PyramidModel, nominal_pupils
-from escape_sim.pyramid_turbulence import Pokes, strength, unit_screens
+from escape_hw.pipeline.slopes.pyramid import slopes_of_image
+from escape_sim.models.pyramid import PyramidModel, nominal_pupils
+from escape_sim.models.pyramid_turbulence import RandomPokes, estimate_strength, unit_screens
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def poked(pupils: PyramidPupils, rms: float, turbulence: float | None = 0.0) -> 
     return PyramidModel(configuration(), replace(pupils, pokes=rms), turbulence=turbulence)
 
 
-def random_pokes(model: PyramidModel) -> Pokes:
+def random_pokes(model: PyramidModel) -> RandomPokes:
     assert model._pokes is not None
     return model._pokes
 
@@ -47,12 +47,12 @@ def test_pokes_have_the_structure_function_of_their_phases(pupils: PyramidPupils
 def test_pokes_are_shared_among_modes_as_far_as_their_actuators_go() -> None:
     modes = np.random.default_rng(0).standard_normal((4, 8, 8))
     lit = np.ones((8, 8), bool)
-    pokes = Pokes.of(0.1, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
+    pokes = RandomPokes.from_rms(0.1, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
     amplitude = np.sqrt(np.square(pokes.modes_rad / modes).mean(axis=(1, 2)))
     assert amplitude[2] == pytest.approx(0.02, rel=1e-6)
     assert amplitude[[0, 1, 3]] == pytest.approx(np.sqrt((0.01 - 0.0004) / 3), rel=1e-6)
     # Asked for more than the limits leave, as by hand: all of them grow alike.
-    more = Pokes.of(2.0, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
+    more = RandomPokes.from_rms(2.0, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
     assert np.square(more.modes_rad / modes).mean(axis=(1, 2)).sum() == pytest.approx(4.0)
 
 
@@ -123,25 +123,25 @@ def test_the_strength_is_told_beside_pokes(pupils: PyramidPupils, ratio: float) 
     freedom = np.sqrt(len(air) / (len(air) - 1))
     first, second = (freedom * (s - s.mean(axis=0)) for s in (first, second))
     rms = float(np.sqrt(np.mean(np.square([first, second]))))
-    seen = replace(pupils, motion=rms, steady=float(np.mean(first * second) / rms**2))
-    assert strength(optics, seen, 4.0, pokes) == pytest.approx(ratio, rel=0.3)
+    seen = replace(pupils, motion=rms, persistent_fraction=float(np.mean(first * second) / rms**2))
+    assert estimate_strength(optics, seen, 4.0, pokes) == pytest.approx(ratio, rel=0.3)
 
 
 def test_pokes_alone_are_no_turbulence(pupils: PyramidPupils) -> None:
-    model = poked(replace(pupils, motion=0.4, steady=0.0), 0.05, turbulence=None)
+    model = poked(replace(pupils, motion=0.4, persistent_fraction=0.0), 0.05, turbulence=None)
     assert model.turbulence == 0
 
 
 def test_the_doubt_falls_with_the_states_that_were_seen(pupils: PyramidPupils) -> None:
-    config, few = configuration(), replace(pupils, looks=4.0, centre_sigma_px=0.01)
+    config, few = configuration(), replace(pupils, n_effective=4.0, centre_sigma_px=0.01)
     model = PyramidModel(config, few, turbulence=8.0)
-    once = model.registration_doubt
+    once = model.registration_systematic_error
     assert (once > 0).all()
     assert 0.5 < once[0] < 30
     assert 0.01 < once[2] < 3
-    many = PyramidModel(config, replace(few, looks=400.0, centre_sigma_px=0.0), turbulence=8.0)
-    assert many.registration_doubt[2:3] == pytest.approx(once[2:3] / 10)
+    many = PyramidModel(config, replace(few, n_effective=400.0, centre_sigma_px=0.0), turbulence=8.0)
+    assert many.registration_systematic_error[2:3] == pytest.approx(once[2:3] / 10)
     still = PyramidModel(config, replace(pupils, centre_sigma_px=0.01), turbulence=8.0)
-    assert still.registration_doubt[2] == 0
-    assert (many.registration_doubt[3:] < once[3:]).all()
-    assert still.registration_doubt[0] == pytest.approx(1.0, rel=0.1)
+    assert still.registration_systematic_error[2] == 0
+    assert (many.registration_systematic_error[3:] < once[3:]).all()
+    assert still.registration_systematic_error[0] == pytest.approx(1.0, rel=0.1)

@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 from scipy import special
 
-from escape_hw.config.twin_sky import TwinAtmosphere
-from escape_sim.atmosphere import Atmosphere, screen_pixels
-from escape_sim.spline import spline_gain
-from escape_sim.turbulent_layer import TurbulentLayer
-from escape_sim.von_karman import TurbulenceSource
+from escape_hw.config.twin import TwinAtmosphere
+from escape_sim.atmosphere.layers import Atmosphere, TurbulentLayer, screen_pixels
+from escape_sim.atmosphere.von_karman import TurbulenceSource, spline_gain
 
 PIXEL, R0, OUTER_SCALE, N, SIZE = 0.1, 0.16, 20.0, 48, 256
 LIT = np.ones((N, N), bool)

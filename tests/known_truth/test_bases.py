@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.results import CalibrationResult
-from escape_hw.runtime.system import open_system
+from escape_hw.runtime.session.system import open_system
 
 #: A small bench: 12 x 12 lenslets, 37 actuators, moderate turbulence.
 SMALL = (
@@ -39,12 +39,12 @@ def test_every_basis_gives_the_registration(kind):
 
 
 def test_a_basis_from_a_file_is_the_basis(tmp_path):
-    from escape_hw.io.fits import save_matrix
-    from escape_hw.runtime.records import BenchRecord
+    from escape_hw.io.fits.matrix import save_matrix
+    from escape_hw.runtime.session.record import BenchRecord
 
     with open_system("razor-shwfs", set=[*SMALL, "basis.kind=zernike"], seed=3) as bench:
         first = bench.calibrate(frames=400)
-        save_matrix(tmp_path / "modes.fits", first, BenchRecord.of(bench).origin())
+        save_matrix(tmp_path / "modes.fits", first, BenchRecord.from_bench(bench).origin())
     again = calibrated("basis.kind=file", f"basis.file={tmp_path / 'modes.fits'}")
     np.testing.assert_allclose(again.matrix.m2c, first.matrix.m2c, rtol=1e-9)
 

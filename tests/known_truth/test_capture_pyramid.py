@@ -1,4 +1,4 @@
-"""A pyramid from two actuator pitches and ten degrees away; `benchmarks/capture.py` does a hundred."""
+"""A pyramid from two actuator pitches and ten degrees away; `benchmarks/studies/capture_range.py` does a hundred."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from small_pyramid import configuration
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.modes import karhunen_loeve
-from escape_hw.calibration.sprint import sprint
-from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+from escape_hw.calibration.modes.bases import karhunen_loeve
+from escape_hw.calibration.sprint.fit import sprint
+from escape_sim.models.pyramid import PyramidModel, nominal_pupils
 
 #: Actuator pitch in % of a pixel of the pupil image.
 PITCH = 100 * 16 / 5

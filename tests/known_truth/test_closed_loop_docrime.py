@@ -6,7 +6,7 @@ import numpy as np
 import planted_loop as planted
 import pytest
 
-from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 from escape_hw.errors import CalibrationError
 
 SEEDS, FRAMES = 10, 2500
@@ -84,14 +84,14 @@ def test_the_error_falls_with_the_frames_and_the_poke():
 def test_a_delay_beyond_the_lags_is_told(closed, lags):
     """Too few lags would give a matrix that is too small, or has the wrong sign, with small errors."""
     run = planted.loop(1, frames=FRAMES, poke=0.02, gain=0.2 if closed else 1e-9)
-    driven = np.concatenate([run.commands, run.pokes], axis=1) if closed else run.commands
+    excitation = np.concatenate([run.commands, run.pokes], axis=1) if closed else run.commands
     blind = DocrimeEstimator(
         planted.N_SLOPES, planted.N_MODES, order=planted.ORDER, lags=lags, closed=closed, correlations=False
     )
     with pytest.raises(
         CalibrationError, match=r"answers pokes [23] frames after .* calibration.lags to at least [56]"
     ):
-        blind.extend(run.index, run.slopes, driven).solve()
+        blind.extend(run.index, run.slopes, excitation).solve()
 
 
 def test_without_a_response_there_is_no_matrix():
@@ -110,7 +110,7 @@ def test_what_the_mirror_did_before_a_resumed_run_is_not_made_up():
     for seed in range(4):
         run = planted.loop(seed, frames=4000)
         whole = run.fit()
-        driven = np.concatenate([run.commands, run.pokes], axis=1)
+        excitation = np.concatenate([run.commands, run.pokes], axis=1)
         state = None
         for part in np.array_split(np.arange(4000), 2):
             estimator = DocrimeEstimator(
@@ -119,7 +119,7 @@ def test_what_the_mirror_did_before_a_resumed_run_is_not_made_up():
             if state is not None:
                 estimator.restore(*state)
             # The second process counts its own frames.
-            estimator.extend(np.arange(part.size), run.slopes[part], driven[part])
+            estimator.extend(np.arange(part.size), run.slopes[part], excitation[part])
             state = estimator.state()
         resumed = estimator.solve()
         assert resumed.frames == 4000 - planted.LAGS

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.demodulation import (
-    find_delay,
-    find_lines,
-    line_frequencies,
-    matrix_from,
+from escape_hw.calibration.push_pull.demodulation import (
+    choose_line_frequencies,
+    compute_matrix,
+    estimate_delay,
+    fit_lines,
     response_at,
 )
 from escape_hw.errors import TooFewFrames
@@ -22,7 +22,7 @@ def _run(seed: int, delay: float = 2.3, noise: float = 1.0, loss: float = 0.0):
     rng = np.random.default_rng(seed)
     matrix = rng.standard_normal((SLOPES, MODES))
     amplitude = rng.uniform(0.5, 1.0, MODES)
-    frequency = line_frequencies(MODES, FRAMES, (0.1, 0.4))
+    frequency = choose_line_frequencies(MODES, FRAMES, (0.1, 0.4))
     time = np.arange(FRAMES)
     command = amplitude * np.sin(np.outer(np.arange(-8, FRAMES), frequency))
     whole, share = int(delay), delay - int(delay)
@@ -30,23 +30,23 @@ def _run(seed: int, delay: float = 2.3, noise: float = 1.0, loss: float = 0.0):
     turbulence = np.cumsum(rng.standard_normal((FRAMES, SLOPES)), axis=0)
     slopes = seen @ matrix.T + turbulence + noise * rng.standard_normal((FRAMES, SLOPES))
     kept = rng.random(FRAMES) >= loss
-    return matrix, find_lines(time[kept], slopes[kept], frequency, amplitude, FRAMES)
+    return matrix, fit_lines(time[kept], slopes[kept], frequency, amplitude, FRAMES)
 
 
 def test_lines_fill_the_band_and_stand_apart():
-    frequency = line_frequencies(MODES, FRAMES, (0.1, 0.4))
+    frequency = choose_line_frequencies(MODES, FRAMES, (0.1, 0.4))
     cycles = frequency * FRAMES / (2 * np.pi)
     np.testing.assert_allclose(cycles, np.rint(cycles), atol=1e-9)
     assert (np.diff(cycles) >= 4).all()
     assert (cycles[0], cycles[-1]) == (50, 200)
-    assert line_frequencies(1000, FRAMES, (0.1, 0.4)).size == 38
+    assert choose_line_frequencies(1000, FRAMES, (0.1, 0.4)).size == 38
 
 
 def test_too_few_frames_for_a_line():
     with pytest.raises(TooFewFrames, match="hold no line"):
-        line_frequencies(3, 12, (0.1, 0.4))
+        choose_line_frequencies(3, 12, (0.1, 0.4))
     with pytest.raises(TooFewFrames, match="cannot tell"):
-        find_lines(np.arange(20), np.zeros((20, 3)), np.linspace(0.7, 2, 12), np.ones(12), 20)
+        fit_lines(np.arange(20), np.zeros((20, 3)), np.linspace(0.7, 2, 12), np.ones(12), 20)
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.03])
@@ -54,7 +54,7 @@ def test_matrix_and_errors_over_seeds(loss):
     pulls, ratios = [], []
     for seed in range(25):
         matrix, lines = _run(seed, loss=loss)
-        found, sigma = matrix_from(lines, 2.3)
+        found, sigma = compute_matrix(lines, 2.3)
         pulls.append((found - matrix) / sigma)
         ratios.append(np.vdot(found, matrix) / np.vdot(matrix, matrix))
     chi2 = np.mean(np.square(pulls))
@@ -65,7 +65,7 @@ def test_matrix_and_errors_over_seeds(loss):
 
 @pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 2.16, 3.75])
 def test_delay_over_seeds(delay):
-    found = np.array([find_delay(_run(seed, delay, noise=2.0)[1], 5.0) for seed in range(12)])
+    found = np.array([estimate_delay(_run(seed, delay, noise=2.0)[1], 5.0) for seed in range(12)])
     errors = found[:, 0] - delay
     assert np.abs(errors).max() < 0.05
     assert (np.abs(errors) < 5 * found[:, 1] + 0.01).all()
@@ -73,11 +73,11 @@ def test_delay_over_seeds(delay):
 
 def test_noise_alone_has_unit_pulls():
     rng = np.random.default_rng(4)
-    frequency = line_frequencies(MODES, FRAMES, (0.1, 0.4))
-    lines = find_lines(
+    frequency = choose_line_frequencies(MODES, FRAMES, (0.1, 0.4))
+    lines = fit_lines(
         np.arange(FRAMES), rng.standard_normal((FRAMES, 200)), frequency, np.ones(MODES), FRAMES
     )
-    found, sigma = matrix_from(lines, 1.0)
+    found, sigma = compute_matrix(lines, 1.0)
     assert np.mean(np.square(found / sigma)) == pytest.approx(1.0, abs=0.1)
 
 

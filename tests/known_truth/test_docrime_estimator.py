@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 from escape_hw.errors import CalibrationError, TooFewFrames
 
 N_SLOPES, N_MODES = 60, 12

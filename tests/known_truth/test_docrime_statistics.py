@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from escape_hw.calibration.docrime_estimator import DocrimeEstimator
+from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 
 N_SLOPES, N_MODES, LAGS, ORDER = 40, 10, 5, 4
 FRAMES = 1500

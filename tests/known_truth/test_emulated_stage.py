@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import escape_hw
-from escape_hw.runtime.system import System
+from escape_hw.runtime.session.system import System
 
 #: A small pyramid without imperfections of its own, its modulator at the other end of a wire.
 SMALL = (
@@ -31,7 +31,7 @@ SMALL = (
 
 def points(bench: System) -> np.ndarray:
     """Where the twin's beam goes on the pyramid, lambda/D."""
-    return np.asarray(bench.wfs._bench.beam_circle.points().points)
+    return np.asarray(bench.wfs._bench.beam_path.points().points)
 
 
 def test_the_beam_goes_where_the_stage_points():

@@ -9,14 +9,16 @@ import pytest
 from small_pyramid import configuration as small_pyramid
 from small_system import configuration as small_lenslets
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.found_mirror import found_matrix
-from escape_hw.calibration.pseudo_synthetic import pseudo_synthetic
-from escape_hw.calibration.sprint import sprint
+from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.calibration.sprint.synthetic_matrix import (
+    compute_fitted_matrix,
+    compute_pseudo_synthetic_matrix,
+)
 from escape_hw.errors import ConfigError
-from escape_hw.runtime.system import System
-from escape_sim.model import make_model
+from escape_hw.runtime.session.system import System
+from escape_sim.models.shack_hartmann import make_model
 
 SEEDS = range(6)
 SHEAR = 1.5
@@ -50,9 +52,11 @@ def errors(estimate, truth: Registration) -> np.ndarray:
 @pytest.mark.parametrize("shear", [-4.0, 0.0, 0.7, 3.0])
 def test_a_shear_and_its_axes_are_the_same_stretch(shear):
     given = Registration(3.0, -2.0, 1.1, 2.5, -1.2)
-    leaning = given.sheared(shear)
-    np.testing.assert_allclose(leaning.stretch, given.stretch + np.array([[0, shear], [shear, 0]]) / 100)
-    straight, back = leaning.along_axes
+    leaning = given.with_shear(shear)
+    np.testing.assert_allclose(
+        leaning.scaling_matrix, given.scaling_matrix + np.array([[0, shear], [shear, 0]]) / 100
+    )
+    straight, back = leaning.axis_scalings_and_shear
     assert back == pytest.approx(shear, abs=1e-12)
     np.testing.assert_allclose(straight.to_array(), given.to_array(), atol=1e-12)
     assert not straight.anamorphosis_angle
@@ -62,7 +66,7 @@ def test_a_shear_is_recovered_within_its_error(model):
     pulls, blind = [], []
     for seed in SEEDS:
         truth = plant(seed)
-        matrix = noisy(model.zonal_matrix(truth.sheared(SHEAR)), model, seed)
+        matrix = noisy(model.zonal_matrix(truth.with_shear(SHEAR)), model, seed)
         found = sprint(matrix, model, also=("anamorphosis",))
         assert found.converged, found.warnings
         shear = found.extras["anamorphosis"]
@@ -91,12 +95,12 @@ def test_where_there_is_no_shear_asking_for_one_does_no_harm(model):
 
 def test_a_shear_is_in_the_pseudo_synthetic_matrix(model):
     truth = plant(1)
-    sheared = model.zonal_matrix(truth.sheared(SHEAR))
-    matrix = noisy(sheared, model, 1)
+    with_shear = model.zonal_matrix(truth.with_shear(SHEAR))
+    matrix = noisy(with_shear, model, 1)
 
     def missed(estimate):
-        made, _ = pseudo_synthetic(model, estimate, np.eye(model.n_act))
-        return np.square(made - sheared).sum() / np.square(sheared).sum()
+        made, _ = compute_pseudo_synthetic_matrix(model, estimate, np.eye(model.n_act))
+        return np.square(made - with_shear).sum() / np.square(with_shear).sum()
 
     assert missed(sprint(matrix, model, also=("anamorphosis",))) < 0.2 * missed(sprint(matrix, model))
 
@@ -104,15 +108,17 @@ def test_a_shear_is_in_the_pseudo_synthetic_matrix(model):
 def test_a_shear_stays_with_a_mirror_that_moves_on(model):
     """As for a tracker, which follows the registration alone."""
     truth, basis = plant(1), np.eye(model.n_act)
-    found = sprint(noisy(model.zonal_matrix(truth.sheared(SHEAR)), model, 1), model, also=("anamorphosis",))
-    there = Registration.from_array(found.registration.to_array() + np.array([8.0, -5.0, 0.2, 0.0, 0.0]))
-    sheared = model.zonal_matrix(there.sheared(found.extras["anamorphosis"].value), found.width.value)
-    alike = replace(found, departures=None)
-    np.testing.assert_allclose(
-        found_matrix(model, there, alike, basis), sheared, atol=1e-3 * np.abs(sheared).max()
+    found = sprint(
+        noisy(model.zonal_matrix(truth.with_shear(SHEAR)), model, 1), model, also=("anamorphosis",)
     )
-    bare = found_matrix(model, there, replace(alike, extras={}), basis)
-    assert np.abs(bare - sheared).max() > 1e-2 * np.abs(sheared).max()
+    there = Registration.from_array(found.registration.to_array() + np.array([8.0, -5.0, 0.2, 0.0, 0.0]))
+    with_shear = model.zonal_matrix(there.with_shear(found.extras["anamorphosis"].value), found.width.value)
+    alike = replace(found, actuator_corrections=None)
+    np.testing.assert_allclose(
+        compute_fitted_matrix(model, there, alike, basis), with_shear, atol=1e-3 * np.abs(with_shear).max()
+    )
+    bare = compute_fitted_matrix(model, there, replace(alike, extras={}), basis)
+    assert np.abs(bare - with_shear).max() > 1e-2 * np.abs(with_shear).max()
 
 
 def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
@@ -135,7 +141,7 @@ def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
 def test_on_the_twin_a_planted_shear_is_found_and_told():
     pulls = []
     for seed in (1, 2, 3):
-        leaning = Registration(-16.0, -71.0, -0.77, 2.9, 0.0).sheared(SHEAR)
+        leaning = Registration(-16.0, -71.0, -0.77, 2.9, 0.0).with_shear(SHEAR)
         planted = [f"twin.registration.{name}={value!r}" for name, value in leaning.to_dict().items()]
         config = small_lenslets(*planted, 'calibration.also=["anamorphosis"]', seed=seed)
         with System.from_config(config) as bench:

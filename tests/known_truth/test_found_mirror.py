@@ -10,17 +10,19 @@ import pytest
 import small_pyramid
 import small_system
 
-from escape_hw.api.departures import PEDESTAL
-from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.model import SyntheticModel
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.basis import configured_basis
-from escape_hw.calibration.found_mirror import found_matrix
-from escape_hw.calibration.pseudo_synthetic import pseudo_synthetic
-from escape_hw.calibration.sprint import sprint
-from escape_hw.runtime.system import System
-from escape_sim.model import make_model, nominal_grid
-from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+from escape_hw.api.results import PEDESTAL
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.calibration.modes.bases import build_basis
+from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.calibration.sprint.synthetic_matrix import (
+    compute_fitted_matrix,
+    compute_pseudo_synthetic_matrix,
+)
+from escape_hw.runtime.session.system import System
+from escape_sim.models.pyramid import PyramidModel, nominal_pupils
+from escape_sim.models.shack_hartmann import make_model, nominal_grid
 
 PLANTED = Registration(-16.0, 31.0, -0.77, 1.9, 0.5)
 SEEDS = range(4)
@@ -38,16 +40,14 @@ class Design:
 def lenslets() -> Design:
     config = small_system.configuration()
     model = make_model(config, None)
-    m2c = configured_basis(config, *model.influence_functions(), ())
+    m2c = build_basis(config, *model.influence_functions(), ())
     return Design(model, nominal_grid(config).valid, m2c)
 
 
 def pyramid() -> Design:
     config = small_pyramid.configuration()
     model = PyramidModel(config, nominal_pupils(config))
-    return Design(
-        model, nominal_pupils(config).valid, configured_basis(config, *model.influence_functions(), ())
-    )
+    return Design(model, nominal_pupils(config).valid, build_basis(config, *model.influence_functions(), ()))
 
 
 @pytest.fixture(scope="module", params=[lenslets, pyramid])
@@ -85,10 +85,10 @@ def compared(design: Design, noise: float, m2c: np.ndarray | None = None) -> np.
     errors, basis = [], design.m2c if m2c is None else m2c
     for seed in SEEDS:
         zonal = planted(design, seed)
-        estimate = sprint(measured(design, zonal, noise, seed), design.model, learn=True)
+        estimate = sprint(measured(design, zonal, noise, seed), design.model, update_priors=True)
         made = [
-            pseudo_synthetic(design.model, one, basis)[0]
-            for one in (estimate, replace(estimate, departures=None))
+            compute_pseudo_synthetic_matrix(design.model, one, basis)[0]
+            for one in (estimate, replace(estimate, actuator_corrections=None))
         ]
         errors.append([missed(one, zonal @ basis) for one in made])
     return np.array(errors)
@@ -103,11 +103,11 @@ def test_a_mirror_on_a_large_pedestal_is_found(design: Design) -> None:
     errors = []
     for seed in SEEDS:
         zonal = planted(design, seed, 0.4)
-        estimate = sprint(measured(design, zonal, 0.1, seed), design.model, learn=True)
+        estimate = sprint(measured(design, zonal, 0.1, seed), design.model, update_priors=True)
         assert estimate.converged, estimate.warnings
         off = estimate.registration.to_array() - PLANTED.to_array()
         assert (np.abs(off) < 4 * np.sqrt(np.diag(estimate.covariance))).all()
-        made = pseudo_synthetic(design.model, estimate, design.m2c)[0]
+        made = compute_pseudo_synthetic_matrix(design.model, estimate, design.m2c)[0]
         errors.append(missed(made, zonal @ design.m2c))
     assert np.mean(errors) < 0.014
 
@@ -131,7 +131,7 @@ def test_departures_belong_to_actuators_and_not_to_modes(design: Design) -> None
     estimate = sprint(measured(design, zonal, 0.1, 0), design.model)
     turn = np.random.default_rng(2).standard_normal((design.m2c.shape[1], 5))
     made, turned = (
-        found_matrix(design.model, estimate.registration, estimate, m2c)
+        compute_fitted_matrix(design.model, estimate.registration, estimate, m2c)
         for m2c in (design.m2c, design.m2c @ turn)
     )
     np.testing.assert_allclose(turned, made @ turn, atol=1e-4 * np.abs(turned).max())
@@ -139,25 +139,25 @@ def test_departures_belong_to_actuators_and_not_to_modes(design: Design) -> None
 
 def test_its_errors_know_of_single_actuators(design: Design) -> None:
     zonal = planted(design, 0)
-    estimate = sprint(measured(design, zonal, 1.0, 0), design.model, learn=True)
-    made, sigma = pseudo_synthetic(design.model, estimate, design.m2c)
+    estimate = sprint(measured(design, zonal, 1.0, 0), design.model, update_priors=True)
+    made, sigma = compute_pseudo_synthetic_matrix(design.model, estimate, design.m2c)
     scale = float(np.vdot(made, zonal @ design.m2c) / np.vdot(made, made))
     pulls = (scale * made - zonal @ design.m2c) / sigma
     assert 0.2 < np.mean(np.square(pulls)) < 5
-    apart = estimate.departures
+    apart = estimate.actuator_corrections
     assert apart is not None
-    sure = replace(estimate, departures=replace(apart, gain_sigma=0 * apart.gain_sigma))
-    assert pseudo_synthetic(design.model, sure, design.m2c)[1].mean() < sigma.mean()
+    sure = replace(estimate, actuator_corrections=replace(apart, gain_sigma=0 * apart.gain_sigma))
+    assert compute_pseudo_synthetic_matrix(design.model, sure, design.m2c)[1].mean() < sigma.mean()
 
 
 def test_alike_is_the_matrix_of_the_drawing(design: Design) -> None:
     matrix = measured(design, planted(design, 0), 0.1, 0)
     found = sprint(matrix, design.model)
     alike = sprint(matrix, design.model, actuators="alike")
-    assert found.departures is not None
-    assert alike.departures is None
+    assert found.actuator_corrections is not None
+    assert alike.actuator_corrections is None
     np.testing.assert_array_equal(alike.registration.to_array(), found.registration.to_array())
-    made = pseudo_synthetic(design.model, alike, design.m2c)[0]
+    made = compute_pseudo_synthetic_matrix(design.model, alike, design.m2c)[0]
     drawn = design.model.zonal_matrix(alike.registration, alike.width.value) @ design.m2c
     np.testing.assert_allclose(made, alike.gain.value * drawn, atol=1e-4 * np.abs(made).max())
 
@@ -172,8 +172,8 @@ def test_a_tenth_of_a_second_tells_unequal_actuators(frames: int) -> None:
             exact = bench.calibrate("push-pull", grid=result.grid).matrix.data.astype(float)
             estimate = result.registration
             assert estimate is not None
-            drawn = replace(estimate, departures=None)
-            alike = pseudo_synthetic(bench.model(result.grid), drawn, result.matrix.m2c)[0]
+            drawn = replace(estimate, actuator_corrections=None)
+            alike = compute_pseudo_synthetic_matrix(bench.model(result.grid), drawn, result.matrix.m2c)[0]
             errors.append([missed(result.matrix.data.astype(float), exact), missed(alike, exact)])
     found, alike_error = np.array(errors).T
     assert (found < 0.85 * alike_error).all()

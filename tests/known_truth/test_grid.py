@@ -8,8 +8,8 @@ from scipy import special
 from sensor_frames import N_PIX, WAVELENGTH, flat, pupil_amplitude, sensor
 
 from escape_hw.errors import CalibrationError
-from escape_hw.pipeline.grid import _without_hot_pixels, find_grid
-from escape_sim.screen import RotatingScreen, von_karman_screen
+from escape_hw.pipeline.geometry.lenslet_grid import _without_hot_pixels, find_lenslet_grid
+from escape_sim.atmosphere.phase_plates import RotatingScreen, von_karman_screen
 
 PITCH_TOLERANCE = 1e-3
 ORIGIN_TOLERANCE = 0.1
@@ -25,7 +25,7 @@ SENSORS = {
 
 
 def find(frame, n_sub=24, nominal=15.54, **options):
-    return find_grid(
+    return find_lenslet_grid(
         frame, n_sub=n_sub, nominal_pitch_px=nominal, **{"threshold": 20.0, "min_flux": 0.5, **options}
     )
 

@@ -7,47 +7,53 @@ import pytest
 from small_pyramid import small as small_pyramid
 from small_system import configuration
 
-from escape_hw.calibration.acquire import Motion
-from escape_hw.calibration.closed_loop import integrator_for
-from escape_hw.calibration.live_registration import LiveRegistration
-from escape_hw.calibration.loop_run import RunningLoop
-from escape_hw.calibration.loop_tape import LoopTape
-from escape_hw.calibration.sensor_setup import extractor, poke_amplitudes, prepare_sensor
+from escape_hw.calibration.acquisition.frames import SlopeStatistics
+from escape_hw.calibration.acquisition.sensor_setup import (
+    build_slope_function,
+    compute_poke_amplitudes,
+    prepare_sensor,
+)
+from escape_hw.calibration.acquisition.telemetry import TelemetryBuffer
+from escape_hw.calibration.loop.performance import build_integrator
+from escape_hw.calibration.loop.runner import RunningLoop
+from escape_hw.calibration.tracking.live_registration import LiveRegistration
 from escape_hw.errors import TooFewFrames
-from escape_hw.runtime.sky_time import GOAL, plant_overrides, random_plant
-from escape_hw.runtime.system import System, open_system
+from escape_hw.paper.sky_time import GOAL, random_registration, registration_overrides
+from escape_hw.runtime.session.system import System, open_system
 
 SYSTEM = "razor-shwfs"
 #: Shear of a mirror that is seen askew, in % of the diameter.
 SHEAR = 1.5
 
 
-def looked(bench, blocks, frames, poke=0.002, gain=None, curved=0, memory=1e9, start_frames=600):
+def looked(
+    bench, blocks, frames, poke=0.002, gain=None, n_curve_coefficients=0, memory=1e9, start_frames=600
+):
     """Calibrate, close the loop, and look at blocks of its frames; the last look, and the calibration."""
     start = bench.calibrate(frames=start_frames)
     prepare_sensor(bench)
-    control = integrator_for(bench, start.matrix, start.grid)
+    control = build_integrator(bench, start.matrix, start.grid)
     if gain is not None:
         control.set_gain(gain(start.matrix.n_modes))
-    loop = RunningLoop(bench, start.matrix.m2c, extractor(bench, start.grid), control)
-    amplitude = poke_amplitudes(bench, start.matrix.m2c, poke)
-    motion = Motion(start.grid.n_slopes)
+    loop = RunningLoop(bench, start.matrix.m2c, build_slope_function(bench, start.grid), control)
+    amplitude = compute_poke_amplitudes(bench, start.matrix.m2c, poke)
+    slope_statistics = SlopeStatistics(start.grid.n_slopes)
     bench.run(loop.run(100))
-    bench.run(loop.run(300, observe=[lambda *frame: motion.add(frame[1])]))
+    bench.run(loop.run(300, observe=[lambda *frame: slope_statistics.add(frame[1])]))
     c = bench.config.calibration
     live = LiveRegistration(
-        start.matrix, bench.model(motion.of(start.grid, closed=True)), start.registration,
-        order=c.whiten_order, lags=c.lags, memory=memory, curved=curved, response=start.response,
+        start.matrix, bench.model(slope_statistics.annotate_geometry(start.grid, closed=True)), start.registration,
+        order=c.whiten_order, lags=c.lags, memory=memory, n_curve_coefficients=n_curve_coefficients, response=start.response,
         step_s=frames / bench.wfs.settings.frame_rate_hz,
     )  # fmt: skip
-    tape = LoopTape(start.grid.n_slopes, start.matrix.n_modes, frames, live.memory_rows)
+    tape = TelemetryBuffer(start.grid.n_slopes, start.matrix.n_modes, frames, live.memory_rows)
     for _ in range(blocks):
         bench.run(
             loop.run(
                 frames, inject=lambda: amplitude * bench.rng.uniform(-1, 1, amplitude.size), observe=[tape]
             )
         )
-        found = live.update(*tape.handover())
+        found = live.update(*tape.take_block())
     bench.dm.flatten()
     return found, start
 
@@ -58,13 +64,13 @@ def errors_and_pulls(found, truth):
 
 
 def plant(number):
-    return open_system(SYSTEM, set=plant_overrides(random_plant(number)), seed=number + 1)
+    return open_system(SYSTEM, set=registration_overrides(random_registration(number)), seed=number + 1)
 
 
 def test_a_thousand_frames_in_closed_loop_at_small_pokes():
     """1 % of a sub-aperture, 0.02 degrees, 0.1 %: pokes of 0.2 % of the stroke."""
     with plant(0) as bench:
-        errors, pulls = errors_and_pulls(looked(bench, 2, 500)[0], random_plant(0))
+        errors, pulls = errors_and_pulls(looked(bench, 2, 500)[0], random_registration(0))
     assert (np.abs(errors) <= 2 * GOAL).all(), errors
     assert np.abs(pulls).max() < 4
 
@@ -72,8 +78,8 @@ def test_a_thousand_frames_in_closed_loop_at_small_pokes():
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.parametrize("gain", [None, lambda n: np.linspace(0.5, 0.2, n)], ids=["one gain", "by mode"])
 def test_any_controller_gives_the_same(number, gain):
-    truth = random_plant(number)
-    with System.from_config(configuration(*plant_overrides(truth), seed=number)) as bench:
+    truth = random_registration(number)
+    with System.from_config(configuration(*registration_overrides(truth), seed=number)) as bench:
         found, _ = looked(bench, 3, 500, gain=gain)
     _, pulls = errors_and_pulls(found, truth)
     # Twelve lenslets across five actuators: the scalings err by more than the noise.
@@ -94,7 +100,7 @@ def test_the_matrix_it_fits_answers_as_the_bench_does():
 def test_the_pyramid_has_gains_by_mode():
     with small_pyramid("twin.loss_probability=0") as bench:
         truth = bench.dm.twin.flexure.at(0.0)
-        found, _ = looked(bench, 4, 303, curved=3, start_frames=900)
+        found, _ = looked(bench, 4, 303, n_curve_coefficients=3, start_frames=900)
     errors, pulls = errors_and_pulls(found, truth)
     assert (np.abs(errors[:3]) < [8.0, 8.0, 0.2]).all()
     assert (np.abs(pulls[:3]) < 3.5).all()
@@ -105,7 +111,7 @@ def test_the_pyramid_has_gains_by_mode():
 
 def planted(truth, *more, seed):
     """The small bench with a mirror that is seen askew, too."""
-    leaning = truth.sheared(SHEAR).to_dict()
+    leaning = truth.with_shear(SHEAR).to_dict()
     plants = (f"twin.registration.{name}={value!r}" for name, value in leaning.items())
     return System.from_config(configuration(*plants, *more, seed=seed))
 
@@ -114,7 +120,7 @@ def test_a_sheared_mirror_does_not_lean_the_registration():
     """Shifts in % of a sub-aperture: they would take up part of a shear that nobody asked for."""
     missed, blind = [], []
     for number in (1, 3):
-        truth = random_plant(number)
+        truth = random_registration(number)
         with planted(truth, 'calibration.also=["anamorphosis"]', seed=number) as bench:
             found, start = looked(bench, 4, 500)
         errors, pulls = errors_and_pulls(found, truth)
@@ -135,7 +141,7 @@ def test_a_sheared_mirror_does_not_lean_the_registration():
 def test_the_pyramid_keeps_shear_and_shifted_images_beside_its_curve():
     with small_pyramid("twin.loss_probability=0", 'calibration.also=["anamorphosis","pupil_shift"]') as bench:
         truth = bench.dm.twin.flexure.at(0.0)
-        found, start = looked(bench, 2, 303, curved=3, start_frames=900)
+        found, start = looked(bench, 2, 303, n_curve_coefficients=3, start_frames=900)
     _, pulls = errors_and_pulls(found, truth)
     assert (np.abs(pulls[:3]) < 4).all()
     assert found.gains_sigma.shape == (20,)
@@ -155,7 +161,7 @@ def test_twelve_plants():
     errors, pulls = [], []
     for number in range(12):
         with plant(number) as bench:
-            e, p = errors_and_pulls(looked(bench, 2, 500)[0], random_plant(number))
+            e, p = errors_and_pulls(looked(bench, 2, 500)[0], random_registration(number))
         errors.append(e)
         pulls.append(p)
     assert (np.sqrt(np.mean(np.square(errors), axis=0)) <= GOAL).all()

@@ -10,9 +10,9 @@ import pytest
 import escape_hw
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellState
 from escape_hw.api.registration import Registration
-from escape_sim.model import make_model
-from escape_sim.sim_bench import SimBench
-from escape_sim.sim_secondary import SimAdaptiveSecondary
+from escape_sim.devices.bench import SimBench
+from escape_sim.devices.twins import SimAdaptiveSecondary
+from escape_sim.models.shack_hartmann import make_model
 
 #: Few modes on calm air keep this short; the faintest mode of so short a run is still well seen.
 FEW = [

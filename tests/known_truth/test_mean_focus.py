@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.calibration.acquire import Motion
-from escape_hw.calibration.mean_focus import MeanFocus
-from escape_sim.screen import von_karman_screen
+from escape_hw.calibration.acquisition.frames import SlopeStatistics
+from escape_hw.calibration.acquisition.mean_focus import StaticFocusEstimator
+from escape_sim.atmosphere.phase_plates import von_karman_screen
 
 N_SUB, RATE_HZ, SIZE = 16, 500.0, 1024
 #: Pupils per second of the wind, and pixels of the screen per sub-aperture.
@@ -50,12 +50,12 @@ def lattice() -> np.ndarray:
     return np.concatenate([STILL * (columns - middle) + 0.3, STILL * (rows - middle) - 0.2])
 
 
-def watched(slopes: np.ndarray) -> tuple[MeanFocus, Motion]:
-    focus, motion = MeanFocus(grid(), RATE_HZ), Motion(slopes.shape[1])
+def watched(slopes: np.ndarray) -> tuple[StaticFocusEstimator, SlopeStatistics]:
+    focus, slope_statistics = StaticFocusEstimator(grid(), RATE_HZ), SlopeStatistics(slopes.shape[1])
     for row in slopes.astype(np.float32):
         focus.add(row)
-        motion.add(row)
-    return focus, motion
+        slope_statistics.add(row)
+    return focus, slope_statistics
 
 
 def stretch(found: SubApertureGrid) -> float:
@@ -70,9 +70,9 @@ def errors() -> np.ndarray:
     out = []
     for seed in range(8):
         noise = np.random.default_rng(seed).normal(0, 0.05, (1000, lattice().size))
-        focus, motion = watched(layer(seed, 1000, direction=0.4 + seed) + lattice() + noise)
-        assert focus.still() is not None
-        out.append([stretch(motion.references(grid(), f)) - STILL for f in (focus, None)])
+        focus, slope_statistics = watched(layer(seed, 1000, direction=0.4 + seed) + lattice() + noise)
+        assert focus.static_focus() is not None
+        out.append([stretch(slope_statistics.update_references(grid(), f)) - STILL for f in (focus, None)])
     return np.array(out).T
 
 
@@ -85,16 +85,17 @@ def test_the_focus_that_stands_still_is_found(errors):
 
 def test_what_the_wind_does_not_explain_is_left_as_it_was():
     two = layer(1, 1000, 0.0) + layer(2, 1000, np.pi / 2)
-    focus, motion = watched(two + lattice())
-    assert focus.still() is None
+    focus, slope_statistics = watched(two + lattice())
+    assert focus.static_focus() is None
     assert np.array_equal(
-        motion.references(grid(), focus).references_px, motion.references(grid()).references_px
+        slope_statistics.update_references(grid(), focus).references_px,
+        slope_statistics.update_references(grid()).references_px,
     )
 
 
 def test_a_short_run_and_calm_air_leave_it_open():
-    assert watched(layer(1, 300, 0.0) + lattice())[0].still() is None
+    assert watched(layer(1, 300, 0.0) + lattice())[0].static_focus() is None
     rng = np.random.default_rng(1)
-    calm, motion = watched(lattice() + rng.normal(0, 0.05, (1000, lattice().size)))
-    assert calm.still() is None
-    assert stretch(motion.references(grid(), calm)) == pytest.approx(STILL, abs=1e-3)
+    calm, slope_statistics = watched(lattice() + rng.normal(0, 0.05, (1000, lattice().size)))
+    assert calm.static_focus() is None
+    assert stretch(slope_statistics.update_references(grid(), calm)) == pytest.approx(STILL, abs=1e-3)

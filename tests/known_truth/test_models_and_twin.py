@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.registration import Registration
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.config.registry import model_factory
 
 #: A little of everything that a twin can hide.

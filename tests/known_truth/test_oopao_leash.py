@@ -10,7 +10,7 @@ import threading
 import numpy as np
 import pytest
 
-from escape_sim.oopao_bridge import make_light, oopao, quiet
+from escape_sim.oopao.library import make_source, oopao, quiet
 
 
 def _run(code: str) -> subprocess.CompletedProcess[str]:
@@ -35,8 +35,8 @@ def test_nothing_is_printed_and_nothing_drawn():
         "import tomllib\n"
         "from importlib.resources import files\n"
         "from escape_hw.api.registration import Registration\n"
-        "from escape_hw.config.models import SystemConfig\n"
-        "from escape_sim.oopao_model import make_model\n"
+        "from escape_hw.config.system import SystemConfig\n"
+        "from escape_sim.oopao.models import make_model\n"
         "text = (files('escape_hw.config') / 'systems' / 'razor-shwfs.toml').read_text()\n"
         "model = make_model(SystemConfig.model_validate(tomllib.loads(text)), None)\n"
         "model.zonal_matrix(Registration(5, 5, 1, 1, 1))\n"
@@ -50,7 +50,7 @@ def test_nothing_is_printed_and_nothing_drawn():
 
 
 def test_a_command_of_the_wrong_length_does_not_end_the_process():
-    light = make_light(np.ones((16, 16), np.float32), 1.0, 635e-9)
+    light = make_source(np.ones((16, 16), np.float32), 1.0, 635e-9)
     with quiet():
         mirror = oopao().DeformableMirror(
             telescope=light.telescope,
@@ -87,5 +87,5 @@ def test_the_random_state_of_the_user_is_left_alone():
     np.random.seed(5)
     want = np.random.random()
     np.random.seed(5)
-    make_light(np.ones((16, 16), np.float32), 1.0, 635e-9)
+    make_source(np.ones((16, 16), np.float32), 1.0, 635e-9)
     assert np.random.random() == want

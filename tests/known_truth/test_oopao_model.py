@@ -9,13 +9,13 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from escape_hw.api.model import SyntheticModel
 from escape_hw.api.registration import Registration
-from escape_hw.config.models import SystemConfig
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.config.system import SystemConfig
 from escape_hw.errors import CalibrationError
-from escape_sim import model as fast_model
-from escape_sim import oopao_model
-from escape_sim.oopao_bridge import make_lenslets, quiet
+from escape_sim.models import shack_hartmann as fast_model
+from escape_sim.oopao import models as oopao_model
+from escape_sim.oopao.library import make_lenslets, quiet
 
 PAPER = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
 #: Relative, with no gain or any other freedom; 5e-8 is what we see.

@@ -7,11 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.pipeline.slopes import SlopeExtractor
-from escape_sim.oopao_bridge import make_lenslets, make_light, oopao, quiet
-from escape_sim.oopao_optics import OOPAOShackHartmann
-from escape_sim.oopao_readout import trigonometric_reading
-from escape_sim.shack_hartmann import ShackHartmannOptics
+from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
+from escape_sim.oopao.library import make_lenslets, make_source, oopao, quiet
+from escape_sim.oopao.optics import OOPAOShackHartmann, trigonometric_interpolation
+from escape_sim.optics.shack_hartmann import ShackHartmannOptics
 
 WAVELENGTH = 635e-9
 N_SUB, N_PIX = 10, 8
@@ -53,7 +52,7 @@ def tilt(x_waves: float, y_waves: float) -> NDArray[np.float32]:
 def own_geometry():
     """OOPAO's own detector: 16 whole pixels per lenslet, two per lambda/d; nothing is resampled."""
     pupil = gaussian_pupil()
-    light = make_light(pupil, 1.0, WAVELENGTH)
+    light = make_source(pupil, 1.0, WAVELENGTH)
     sensor = make_lenslets(light, N_SUB, 2 * N_PIX)
     side = N_SUB * 2 * N_PIX
     fast = ShackHartmannOptics(
@@ -66,7 +65,7 @@ def oopao_frame(light, sensor, opd):
     with quiet():
         light.source**light.telescope * oopao().OPD_map(opd.astype(float)) * sensor
     size = 2 * N_PIX
-    tiles = np.asarray(sensor.cam.frame).reshape(N_SUB, size, N_SUB, size) / light.unit
+    tiles = np.asarray(sensor.cam.frame).reshape(N_SUB, size, N_SUB, size) / light.photons_per_unit
     # OOPAO lays each lenslet's image down with x along its rows.
     return tiles.transpose(0, 3, 2, 1).reshape(N_SUB * size, N_SUB * size)
 
@@ -91,7 +90,7 @@ def test_slopes_equal_those_of_oopao(own_geometry, path):
     grid = SubApertureGrid(
         2.0 * N_PIX, (half, half), lit, np.zeros((int(lit.sum()), 2), np.float32), lit.astype(np.float32)
     )
-    extractor = SlopeExtractor(grid, frames[0].shape)
+    extractor = ShackHartmannSlopes(grid, frames[0].shape)
     flat, moved = (extractor(frame) for frame in frames)
     assert np.abs((moved - flat).reshape(2, -1) - theirs[:, lit]).max() < SLOPE_TOLERANCE
 
@@ -140,7 +139,7 @@ def test_the_twin_sees_the_same_slopes_with_oopao_inside(bench_geometry, path):
     grid = SubApertureGrid(
         15.55, (12.3, 14.7), valid, np.zeros((int(valid.sum()), 2), np.float32), valid.astype(np.float32)
     )
-    extractor = SlopeExtractor(grid, (170, 175))
+    extractor = ShackHartmannSlopes(grid, (170, 175))
     difference = extractor(fast.frame(PATHS[path])) - extractor(slow.frame(PATHS[path]))
     assert valid.sum() > 40
     assert np.abs(difference).max() < SLOPE_TOLERANCE
@@ -184,7 +183,9 @@ def test_the_reading_between_samples_is_exact():
     def image(position):
         return np.abs(np.exp(-2j * np.pi * np.outer(position, samples) / 16) @ field) ** 2
 
-    assert np.allclose(trigonometric_reading(at, 16) @ image(np.arange(16)), image(at), rtol=0, atol=1e-12)
+    assert np.allclose(
+        trigonometric_interpolation(at, 16) @ image(np.arange(16)), image(at), rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(

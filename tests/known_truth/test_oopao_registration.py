@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from escape_hw.api.registration import Registration
-from escape_hw.config import layouts
-from escape_sim.influence import InfluenceFunctions, layout_positions
-from escape_sim.mirror_surface import mirror_surface
-from escape_sim.oopao_bridge import make_light, mis_registration, oopao, quiet
+from escape_hw.config import actuator_layouts
+from escape_sim.mirror.influence_functions import InfluenceFunctions, layout_positions
+from escape_sim.mirror.surface import make_mirror_surface
+from escape_sim.oopao.library import make_source, mis_registration, oopao, quiet
 
 N = 64
 N_SUB = 8
@@ -43,7 +43,7 @@ def influence() -> InfluenceFunctions:
 
 @pytest.fixture(scope="module")
 def mirror(influence: InfluenceFunctions):
-    light = make_light(np.ones((N, N), np.float32), PUPIL_M, 635e-9)
+    light = make_source(np.ones((N, N), np.float32), PUPIL_M, 635e-9)
     with quiet():
         return oopao().DeformableMirror(
             telescope=light.telescope,
@@ -70,8 +70,8 @@ def test_surfaces_equal_those_of_oopao(influence, mirror, registration):
 @pytest.mark.parametrize("registration", REGISTRATIONS[6:], ids=str)
 def test_rings_equal_those_of_oopao(registration):
     pitch = PUPIL_M / 22
-    rings = InfluenceFunctions(layouts.positions("rings-336") * pitch, pitch, 0.3)
-    light = make_light(np.ones((48, 48), np.float32), PUPIL_M, 635e-9)
+    rings = InfluenceFunctions(actuator_layouts.positions("rings-336") * pitch, pitch, 0.3)
+    light = make_source(np.ones((48, 48), np.float32), PUPIL_M, 635e-9)
     with quiet():
         theirs = oopao().DeformableMirror(
             telescope=light.telescope, nSubap=N_SUB, mechCoupling=0.3, coordinates=rings.positions_m,
@@ -81,7 +81,7 @@ def test_rings_equal_those_of_oopao(registration):
     ours = rings.surfaces(registration, SUB_M, line, line)
     assert np.abs(ours - theirs.modes.T.reshape(ours.shape)).max() < 1e-9
     command = np.random.default_rng(0).uniform(-1, 1, 336)
-    fast = mirror_surface(rings, registration, SUB_M, line, line)(command)
+    fast = make_mirror_surface(rings, registration, SUB_M, line, line)(command)
     assert np.abs(fast.ravel() - theirs.modes @ command).max() < 1e-5
 
 
@@ -109,6 +109,6 @@ def test_positive_shifts_move_the_mirror_to_higher_columns_and_rows(influence):
 def test_a_positive_rotation_turns_columns_towards_rows(influence):
     right = int(np.argmax(influence.positions_m[:, 0]))
     before = influence.positions_m[right]
-    after = influence.placed(Registration(rotation=2.0), SUB_M)[right]
+    after = influence.registered_positions(Registration(rotation=2.0), SUB_M)[right]
     turned = np.degrees(np.arctan2(after[1], after[0]) - np.arctan2(before[1], before[0]))
     assert turned == pytest.approx(2.0, abs=1e-9)

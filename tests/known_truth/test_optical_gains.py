@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from small_pyramid import SMALL, small
 
-from escape_hw.api.gains import OpticalGains
+from escape_hw.api.optical_gains import OpticalGains
 from escape_hw.api.results import CalibrationResult
-from escape_hw.calibration.gain_bootstrap import GainsRun, bootstrap_gains
-from escape_hw.calibration.gain_loop import GainLoop, Stretch
-from escape_hw.calibration.optical_gain import projector, slope_weights
-from escape_hw.calibration.pseudo_synthetic import at_rest
-from escape_hw.calibration.push_pull import push_pull
+from escape_hw.calibration.optical_gain.bootstrap import GainsRun, bootstrap_gains
+from escape_hw.calibration.optical_gain.estimator import GainMeasurementLoop, LoopSegment
+from escape_hw.calibration.optical_gain.matrix_comparison import projector, slope_weights
+from escape_hw.calibration.push_pull.procedure import push_pull
+from escape_hw.calibration.sprint.synthetic_matrix import static_light_matrix
 from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
-from escape_hw.io.fits import load_matrix, save_matrix
-from escape_hw.runtime.records import without_turbulence
-from escape_hw.runtime.system import System, open_system
-from escape_sim.local_response import FrozenWavefronts, local_gains, twin_behind
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
+from escape_hw.runtime.session.record import without_turbulence
+from escape_hw.runtime.session.system import System, open_system
+from escape_sim.devices.true_optical_gains import WavefrontRecorder, get_simulated_bench, true_optical_gains
 
 #: The small twin's light saturates pixels now and then, which the truth, made without a detector, lacks.
 DIM = "twin.wfs.photons_per_frame=1.5e6"
@@ -33,7 +33,7 @@ POKE = 0.002
 @pytest.fixture(scope="module")
 def bench() -> Iterator[System]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("escape_sim.detector.Detector.POOL", 1 << 19)
+        patch.setattr("escape_sim.optics.detector.Detector.POOL", 1 << 19)
         with small(DIM) as opened:
             yield opened
 
@@ -57,46 +57,46 @@ def scaled(result: CalibrationResult, factor: float) -> CalibrationResult:
 
 def measured(
     bench: System, result: CalibrationResult, frames: int, wavefronts: int, every: int = 1
-) -> tuple[Stretch, np.ndarray]:
+) -> tuple[LoopSegment, np.ndarray]:
     """Gains at the usual loop gain, and the truth of some modes and wavefronts meanwhile."""
-    loop, matrix = GainLoop(bench, result, {}), result.matrix
+    loop, matrix = GainMeasurementLoop(bench, result, {}), result.matrix
     loop.control.set_gain(bench.config.loop.gain)
-    watching = FrozenWavefronts(twin_behind(bench), frames // wavefronts)
+    watching = WavefrontRecorder(get_simulated_bench(bench), frames // wavefronts)
     try:
         loop.start()
-        watching.keeping = False
+        watching.recording = False
         bench.run(loop.measure(300, np.full(matrix.n_modes, POKE), "settling"))
-        watching.keeping = True
-        stretch = bench.run(loop.measure(frames, np.full(matrix.n_modes, POKE), "gains"))
+        watching.recording = True
+        segment = bench.run(loop.measure(frames, np.full(matrix.n_modes, POKE), "gains"))
     finally:
         watching.close()
-        loop.open_again()
+        loop.open_loop()
     rows = projector(matrix, slope_weights(matrix))
     modes = list(range(0, matrix.n_modes, every))
-    return stretch, local_gains(twin_behind(bench), result.grid, matrix.m2c, rows, watching.kept, modes)[
-        :, modes
-    ]
+    return segment, true_optical_gains(
+        get_simulated_bench(bench), result.grid, matrix.m2c, rows, watching.wavefronts, modes
+    )[:, modes]
 
 
-def assert_true(stretch: Stretch, truth: np.ndarray, every: int = 1) -> None:
+def assert_true(segment: LoopSegment, truth: np.ndarray, every: int = 1) -> None:
     """Bias at most 1 % beside the stated error of the common scale, and errors of single modes honest."""
-    assert stretch.gains is not None
-    value, sigma = stretch.gains.value[0][::every], stretch.gains.sigma[0][::every]
+    assert segment.gains is not None
+    value, sigma = segment.gains.value[0][::every], segment.gains.sigma[0][::every]
     mean, error = truth.mean(axis=0), truth.std(axis=0, ddof=1) / np.sqrt(len(truth))
     # Weaker than on the calm beam, and not by the same for every mode.
     assert (mean < 0.98).mean() > 0.8
     bias = float(np.average(value / mean - 1, weights=sigma**-2))
-    assert stretch.gains.common_sigma < 0.008
-    assert abs(bias) < 0.01 + 2 * stretch.gains.common_sigma
+    assert segment.gains.common_sigma < 0.008
+    assert abs(bias) < 0.01 + 2 * segment.gains.common_sigma
     pulls = (value / mean / (1 + bias) - 1) / np.hypot(sigma / value, error / mean)
     assert 0.1 < np.mean(pulls**2) < 2.0
 
 
 def test_gains_are_those_of_the_frozen_residuals(bench: System, baseline: CalibrationResult) -> None:
-    stretch, truth = measured(bench, baseline, 6000, 100)
-    assert_true(stretch, truth)
-    assert stretch.gains is not None
-    assert np.median(stretch.gains.sigma) < 0.01
+    segment, truth = measured(bench, baseline, 6000, 100)
+    assert_true(segment, truth)
+    assert segment.gains is not None
+    assert np.median(segment.gains.sigma) < 0.01
 
 
 @pytest.mark.slow
@@ -110,7 +110,7 @@ def test_gains_of_the_bench_are_those_of_the_frozen_residuals() -> None:
 def test_small_pokes_go_on_with_the_response_that_larger_ones_told(
     bench: System, baseline: CalibrationResult
 ) -> None:
-    loop = GainLoop(bench, baseline, {})
+    loop = GainMeasurementLoop(bench, baseline, {})
     loop.control.set_gain(bench.config.loop.gain)
     modes = baseline.matrix.n_modes
     try:
@@ -119,7 +119,7 @@ def test_small_pokes_go_on_with_the_response_that_larger_ones_told(
             bench.run(loop.measure(600, np.full(modes, poke), "gains")).gains for poke in (POKE, POKE / 6)
         )
     finally:
-        loop.open_again()
+        loop.open_loop()
     assert large is not None
     assert small is not None
     # By themselves they tell the common scale to 5.6 %.
@@ -159,7 +159,7 @@ def test_bootstrap_converges_from_any_scale_to_the_same_matrix(
         gains, beside = gains_of(run), result.beside["baseline"]
         assert np.median(gains.best) * factor > 1
         assert 0.5 < np.median(beside.best) < 1
-        levels[factor] = np.abs(run.rescaled.matrix.data).mean(axis=0)
+        levels[factor] = np.abs(run.rescaled_calibration.matrix.data).mean(axis=0)
     np.testing.assert_allclose(levels[0.3], levels[3.0], rtol=0.25)
     assert np.median(levels[0.3] / levels[3.0]) == pytest.approx(1, abs=0.05)
 
@@ -207,9 +207,9 @@ def test_the_command_keeps_gains_and_matrix(
 ) -> None:
     from escape_hw.cli.app import run
     from escape_hw.report.content import read_run
-    from escape_hw.runtime.records import BenchRecord
+    from escape_hw.runtime.session.record import BenchRecord
 
-    im = save_matrix(tmp_path / "pp.fits", baseline, BenchRecord.of(bench).origin())
+    im = save_matrix(tmp_path / "pp.fits", baseline, BenchRecord.from_bench(bench).origin())
     words = [word for one in (*SMALL, DIM) for word in ("--set", one)]
     out = tmp_path / "run"
     options = ["--frames", "900", "--accuracy", "0.2", "--no-strehl", "--out", out, "--beside", im, "--json"]
@@ -241,7 +241,7 @@ def test_another_matrix_lends_its_shape(
         )
     )
     assert list(run.result.beside) == ["baseline"]
-    share = run.rescaled.matrix.data / baseline.matrix.data
+    share = run.rescaled_calibration.matrix.data / baseline.matrix.data
     # Half the gain of the same matrix at half the size.
     np.testing.assert_allclose(
         np.median(share, axis=0), np.maximum(run.result.beside["baseline"].best, 0.15), rtol=1e-3
@@ -250,11 +250,11 @@ def test_another_matrix_lends_its_shape(
 
 
 def test_only_a_matrix_of_the_model_has_a_shape_at_rest(bench: System, baseline: CalibrationResult) -> None:
-    assert at_rest(bench, baseline) is None
+    assert static_light_matrix(bench, baseline) is None
     # Lenslets answer alike at rest.
-    assert at_rest(bench, fake.calibration()) is None
+    assert static_light_matrix(bench, fake.calibration()) is None
     made = bench.calibrate("escape", frames=900)
-    calm = at_rest(bench, made)
+    calm = static_light_matrix(bench, made)
     assert calm is not None
     np.testing.assert_array_equal(calm.m2c, made.matrix.m2c)
     # At rest a pyramid answers more strongly than under turbulence.

@@ -9,22 +9,21 @@ import pytest
 from scipy.special import j0
 from small_pyramid import configuration
 
-from escape_hw.api.model import DifferentiableModel
-from escape_hw.api.pyramid import PyramidPupils, boxes
+from escape_hw.api.pyramid import PyramidPupils, pupil_boxes
 from escape_hw.api.registration import Registration
-from escape_hw.config.load import load_system
+from escape_hw.api.synthetic_model import DifferentiableModel
+from escape_hw.config.loader import load_system
 from escape_hw.errors import CalibrationError
-from escape_hw.pipeline.pyramid_slopes import slopes_of_image
-from escape_sim import oopao_model
-from escape_sim.model import make_model
-from escape_sim.modulation import Modulation
-from escape_sim.prism import Prism, frequencies
-from escape_sim.pyramid import PyramidOptics
-from escape_sim.pyramid_model import PyramidModel, nominal_pupils
-from escape_sim.pyramid_response import slope_response
-from escape_sim.pyramid_turbulence import distances, strength
-from escape_sim.surface_nodes import surface_nodes
-from escape_sim.turbulence_statistics import structure_function
+from escape_hw.pipeline.slopes.pyramid import slopes_of_image
+from escape_sim.atmosphere.von_karman import structure_function
+from escape_sim.mirror.mode_surfaces import surface_nodes
+from escape_sim.models.pyramid import PyramidModel, nominal_pupils
+from escape_sim.models.pyramid_response import slope_response
+from escape_sim.models.pyramid_turbulence import estimate_strength, sample_distances
+from escape_sim.models.shack_hartmann import make_model
+from escape_sim.oopao import models as oopao_model
+from escape_sim.optics.modulation import ModulationPath
+from escape_sim.optics.pyramid import Prism, PyramidOptics, frequencies
 
 WAVELENGTH = 635e-9
 PLANTED = Registration(62.0, -138.0, 0.9, -1.7, 0.8)
@@ -44,12 +43,12 @@ class Bare:
         centres = np.array([[8.3, 9.0], [29.1, 10.2], [9.0, 30.4], [28.0, 27.7]])
         valid = (self.light**2).reshape(n_px, samples, n_px, samples).sum((1, 3)) > 0.3 * samples**2
         self.pupils = PyramidPupils(
-            centres, float(n_px), boxes(centres, n_px), valid,
+            centres, float(n_px), pupil_boxes(centres, n_px), valid,
             np.zeros((int(valid.sum()), 2), np.float32), valid.astype(np.float32),
             normalisation=normalisation, modulation=radius,
         )  # fmt: skip
         self.prism = Prism((centres + 0.5) * samples - 0.5 - (n - 1) / 2, n)
-        self.modulation = Modulation.circle(radius, ellipse=0.1, centre=(0.1, 0.05))
+        self.modulation = ModulationPath.circle(radius, ellipse=0.1, centre=(0.1, 0.05))
         self.normalisation = normalisation
 
     def slopes(self, phase):
@@ -93,16 +92,16 @@ def test_derivatives_equal_push_and_pull(samples, radius, normalisation, calm):
     for phase in (bare.x, bare.x * bare.y, rng.standard_normal((n, n))):
         step = 1e-4
         want = (bare.slopes(step * phase) - bare.slopes(-step * phase)) / (2 * step)
-        ours = response.by_phase @ phase.ravel()
+        ours = response.phase_derivatives @ phase.ravel()
         assert np.linalg.norm(ours - want) < 3e-6 * np.linalg.norm(want)
 
 
 def test_derivatives_by_nodes_are_those_of_what_the_nodes_carry():
     bare = Bare()
     carry = np.random.default_rng(1).standard_normal((12, 7)).astype(np.float32)
-    ours = bare.response(carry=carry).by_phase
+    ours = bare.response(carry=carry).phase_derivatives
     want = np.einsum(
-        "kyx,yi,xj->kij", bare.response().by_phase.reshape(-1, 12, 12), carry, carry, optimize=True
+        "kyx,yi,xj->kij", bare.response().phase_derivatives.reshape(-1, 12, 12), carry, carry, optimize=True
     )
     assert np.abs(ours - want.reshape(len(ours), -1)).max() < 1e-5 * np.abs(want).max()
 
@@ -131,7 +130,7 @@ class Screens:
 
 def test_screens_have_the_structure_function_of_turbulence():
     ours = Screens(32, 3.0).structure()
-    want = structure_function(distances(32, 1 / 32), 1 / 3.0, 4.0)
+    want = structure_function(sample_distances(32, 1 / 32), 1 / 3.0, 4.0)
     assert ours[31, 40:] == pytest.approx(want[31, 40:], rel=0.06)
 
 
@@ -139,7 +138,7 @@ def test_screens_have_the_structure_function_of_turbulence():
 def test_mean_derivatives_are_those_of_frames_under_turbulence(ratio):
     bare = Bare(radius=1.0)
     screens, number, step = Screens(12, ratio), 200, 1e-2
-    mean, calm = bare.response(screens.structure()).by_phase, bare.response().by_phase
+    mean, calm = bare.response(screens.structure()).phase_derivatives, bare.response().phase_derivatives
     modes = np.stack([bare.x, bare.x**2 + bare.y**2, np.cos(6 * bare.x + 4 * bare.y)])
     light, by = 0.0, 0.0
     for phase in screens(number):
@@ -198,7 +197,7 @@ def test_matrices_equal_push_and_pull_of_the_bench():
     surfaces, lit, _ = model.influence_functions()
     optics = PyramidOptics(
         np.where(lit, 1.0, 0.0).astype(np.float32) * _beam(config, lit), 64, WAVELENGTH,
-        pupils.centres_px, (192, 192), Modulation.circle(3.0),
+        pupils.centres_px, (192, 192), ModulationPath.circle(3.0),
     )  # fmt: skip
     ours = model.modal_matrix(Registration(), pokes)
     for k, poke in enumerate(pokes.T):
@@ -265,7 +264,7 @@ def test_the_motion_of_the_slopes_tells_the_strength(ratio):
     paths = [p * WAVELENGTH / (2 * np.pi) for p in Screens(16, ratio)(100)]
     slopes = [slopes_of_image(optics.frame(p.astype(np.float32)), pupils) for p in paths]
     motion = float(np.sqrt(np.var(slopes, axis=0).mean()))
-    assert strength(optics, replace(pupils, motion=motion), 4.0) == pytest.approx(ratio, rel=0.25)
+    assert estimate_strength(optics, replace(pupils, motion=motion), 4.0) == pytest.approx(ratio, rel=0.25)
     assert PyramidModel(config, replace(pupils, motion=motion)).turbulence == pytest.approx(ratio, rel=0.25)
 
 
@@ -280,9 +279,9 @@ def test_motion_beyond_the_most_is_as_strong_as_the_most():
     config = configuration()
     pupils = nominal_pupils(config)
     optics = PyramidModel(config, pupils).optics()
-    most = strength(optics, replace(pupils, motion=10.0), 4.0)
+    most = estimate_strength(optics, replace(pupils, motion=10.0), 4.0)
     assert 7 < most < 40
-    assert strength(optics, replace(pupils, motion=20.0), 4.0) == most
+    assert estimate_strength(optics, replace(pupils, motion=20.0), 4.0) == most
 
 
 def test_variants_differ_in_turbulence_modulation_and_the_place_of_the_images(model):

@@ -7,14 +7,13 @@ import pytest
 from numpy.typing import NDArray
 from small_pyramid import configuration
 
-from escape_sim.fourier_filter import good_length
-from escape_sim.geometry import pupil_geometry
-from escape_sim.modulation import Modulation
-from escape_sim.oopao_bridge import make_light, make_pyramid, oopao, quiet
-from escape_sim.oopao_pyramid import OOPAOPyramid
-from escape_sim.prism import Prism
-from escape_sim.pyramid import PyramidOptics
-from escape_sim.sensor_optics import ModulatedOptics, make_sensor_optics
+from escape_sim.oopao.library import make_pyramid, make_source, oopao, quiet
+from escape_sim.oopao.optics import OOPAOPyramid
+from escape_sim.optics.fourier_filter import next_fast_length
+from escape_sim.optics.modulation import ModulationPath
+from escape_sim.optics.pupil import pupil_geometry
+from escape_sim.optics.pyramid import Prism, PyramidOptics
+from escape_sim.optics.sensor import ModulatedOptics, make_sensor_optics
 
 WAVELENGTH = 635e-9
 #: Single precision of the fast optics, relative to the brightest pixel.
@@ -54,7 +53,7 @@ def square(n_px: int, separation: int, grid: int) -> NDArray[np.float64]:
 
 def make(n_px, centres, grid, radius, **more) -> PyramidOptics:
     samples = more.get("samples", 1)
-    modulation = Modulation.circle(radius)
+    modulation = ModulationPath.circle(radius)
     return PyramidOptics(
         beam(n_px * samples), n_px, WAVELENGTH, centres, (grid, grid), modulation, grid_px=grid, **more
     )
@@ -68,7 +67,7 @@ def make(n_px, centres, grid, radius, **more) -> PyramidOptics:
 def test_frames_equal_those_of_oopao(samples, n_px, separation, radius):
     # OOPAO with nothing but its own arguments: its circle of points, its square of images.
     n = n_px * samples
-    light = make_light(beam(n), 1.0, WAVELENGTH)
+    light = make_source(beam(n), 1.0, WAVELENGTH)
     with quiet():
         sensor = make_pyramid(light, n_px, separation, separation // 2)
         sensor.modulation = radius
@@ -85,15 +84,15 @@ def test_frames_equal_those_of_oopao(samples, n_px, separation, radius):
         opd = turbulence(n, rms)
         with quiet():
             light.source**light.telescope * oopao().OPD_map(opd.astype(float)) * sensor
-        theirs = np.asarray(sensor.cam.frame) / light.unit
+        theirs = np.asarray(sensor.cam.frame) / light.photons_per_unit
         assert theirs.sum() == pytest.approx(1, rel=1e-6)
         for optics in ours.values():
             assert np.abs(optics.frame(opd) - theirs).max() < TOLERANCE * theirs.max()
 
 
 # ------------------------------------------------------------------ OOPAO inside the twin
-ELLIPSE = Modulation.circle(3.0, ellipse=0.1, ellipse_angle=0.4, phase=0.3, centre=(0.2, -0.1))
-UNEVEN = Modulation(np.array([[1.0, 0.5], [-2.0, 0.1], [0.0, 3.0]]), np.array([1.0, 2.0, 3.0]))
+ELLIPSE = ModulationPath.circle(3.0, ellipse=0.1, ellipse_angle=0.4, phase=0.3, centre=(0.2, -0.1))
+UNEVEN = ModulationPath(np.array([[1.0, 0.5], [-2.0, 0.1], [0.0, 3.0]]), np.array([1.0, 2.0, 3.0]))
 ANGLE = 0.1
 TURNED = 71.5 + 34 * CORNERS @ np.array([[np.cos(ANGLE), np.sin(ANGLE)], [-np.sin(ANGLE), np.cos(ANGLE)]])
 
@@ -110,7 +109,7 @@ TURNED = 71.5 + 34 * CORNERS @ np.array([[np.cos(ANGLE), np.sin(ANGLE)], [-np.si
 )
 def test_the_twin_sees_the_same_frames_with_oopao_inside(n_px, centres, shape, more):
     n = n_px * more.get("samples", 1)
-    modulation = Modulation.circle(3.0)
+    modulation = ModulationPath.circle(3.0)
     args = (beam(n), n_px, WAVELENGTH, centres, shape, modulation)
     fast, slow = PyramidOptics(*args, **more), OOPAOPyramid(*args, **more)
     for change in (modulation, ELLIPSE, UNEVEN):
@@ -135,7 +134,7 @@ def test_one_key_puts_oopao_into_the_bench():
 
 
 def test_frames_do_not_accumulate_in_oopao():
-    slow = OOPAOPyramid(beam(16), 16, WAVELENGTH, square(16, 4, 40), (40, 40), Modulation.circle(1.0))
+    slow = OOPAOPyramid(beam(16), 16, WAVELENGTH, square(16, 4, 40), (40, 40), ModulationPath.circle(1.0))
     first = slow.frame(turbulence(16, 50e-9))
     slow.frame(turbulence(16, 700e-9))
     assert np.array_equal(slow.frame(turbulence(16, 50e-9)), first)
@@ -190,7 +189,7 @@ def quarters(frame):
 
 @pytest.mark.parametrize("build", [PyramidOptics, OOPAOPyramid])
 def test_a_positive_slope_sends_the_light_to_higher_columns_and_rows(build):
-    optics = build(beam(32), 32, WAVELENGTH, square(32, 8, 80), (80, 80), Modulation.circle(0.0))
+    optics = build(beam(32), 32, WAVELENGTH, square(32, 8, 80), (80, 80), ModulationPath.circle(0.0))
     for waves, share in (((4, 0), (0, 1, 0, 1)), ((0, 4), (0, 0, 1, 1)), ((-4, 4), (0, 0, 1, 0))):
         assert quarters(optics.frame(tilt(32, *waves))) == pytest.approx(
             np.array(share) / sum(share), abs=0.06
@@ -201,7 +200,7 @@ def test_images_stand_where_they_should_and_upright():
     # Light far out on one face makes one full image of the pupil.
     pupil = beam(64)
     pupil[:32, :20] = 0
-    optics = PyramidOptics(pupil, 64, WAVELENGTH, BENCH, (192, 192), Modulation.circle(0.0))
+    optics = PyramidOptics(pupil, 64, WAVELENGTH, BENCH, (192, 192), ModulationPath.circle(0.0))
     y, x = np.indices((64, 64)) - 31.5
     # The square makes the light that edges scatter weigh little.
     reference = pupil.astype(float) ** 4
@@ -232,7 +231,7 @@ def test_frames_are_added_to_the_image_given():
 def test_light_beside_the_region_is_lost():
     centres = square(32, 8, 80)
     whole = make(32, centres, 80, 3.0, method="fourier").frame(turbulence(32, 300e-9))
-    modulation = Modulation.circle(3.0)
+    modulation = ModulationPath.circle(3.0)
     small = PyramidOptics(
         beam(32), 32, WAVELENGTH, centres - np.array([12, 10]), (56, 60), modulation, grid_px=80
     ).frame(turbulence(32, 300e-9))
@@ -256,7 +255,7 @@ def test_the_same_path_gives_the_same_frame_to_the_last_bit():
 def test_the_modulator_starts_changes_and_stops():
     optics, opd = make(32, square(32, 8, 80), 80, 0.0), turbulence(32, 300e-9)
     for radius in (3.0, 5.0, 0.0):
-        optics.modulation = Modulation.circle(radius)
+        optics.modulation = ModulationPath.circle(radius)
         assert np.array_equal(optics.frame(opd), make(32, square(32, 8, 80), 80, radius).frame(opd))
 
 
@@ -290,7 +289,7 @@ def test_wrong_geometry_is_refused(build, change, message):
         "wavelength_m": WAVELENGTH,
         "centres_px": square(32, 8, 80),
         "shape": (80, 80),
-        "modulation": Modulation.circle(0.0),
+        "modulation": ModulationPath.circle(0.0),
     }
     with pytest.raises(ValueError, match=message):
         build(**{**args, **change})
@@ -303,11 +302,11 @@ def test_matrix_products_need_a_rectangle():
 
 @pytest.mark.parametrize("build", [PyramidOptics, OOPAOPyramid])
 def test_a_path_of_the_wrong_size_is_refused(build):
-    optics = build(beam(16), 16, WAVELENGTH, square(16, 4, 40), (40, 40), Modulation.circle(0.0))
+    optics = build(beam(16), 16, WAVELENGTH, square(16, 4, 40), (40, 40), ModulationPath.circle(0.0))
     with pytest.raises(ValueError, match="optical path has shape"):
         optics.frame(np.zeros((16, 15), np.float32))
 
 
 def test_grids_have_lengths_that_transform_fast():
-    assert [good_length(x) for x in (130, 192, 193, 250)] == [144, 192, 200, 256]
-    assert good_length(25, 4) == 25
+    assert [next_fast_length(x) for x in (130, 192, 193, 250)] == [144, 192, 200, 256]
+    assert next_fast_length(25, 4) == 25

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from pupil_frames import NOMINAL, N, disk, frame, moved
 
-from escape_hw.api.pyramid import PyramidPupils, without_low_orders
+from escape_hw.api.pyramid import PyramidPupils, remove_low_orders
 from escape_hw.errors import CalibrationError
-from escape_hw.pipeline.pyramid_pupils import find_pupils, refine_pupils
+from escape_hw.pipeline.geometry.pupil_images import find_pupil_images, refine_pupil_images
 
 SEEDS = range(8)
 
 
 def find(image: np.ndarray, **more: Any) -> PyramidPupils:
     settings: dict[str, Any] = {"n_sub": N, "nominal_px": NOMINAL, "min_flux": 0.25}
-    return find_pupils(image, **{**settings, **more})
+    return find_pupil_images(image, **{**settings, **more})
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_a_longer_look_moves_centres_and_nothing_else() -> None:
     centres = moved(rng)
     first = find(frame(centres, rng, strength=0.5, noise=5.0))
     long = np.mean([frame(centres, rng, strength=0.5, noise=1.0) for _ in range(12)], axis=0)
-    better = refine_pupils([long], first)
+    better = refine_pupil_images([long], first)
     assert np.abs(better.centres_px - centres).max() < 0.1
     assert better.corners_px is first.corners_px
     assert better.valid is first.valid
@@ -96,7 +96,7 @@ def test_parts_of_a_run_tell_the_error_of_the_images_place() -> None:
         rng = np.random.default_rng(seed)
         centres = moved(rng)
         parts = [frame(centres, rng, strength=0.5, noise=20.0).astype(np.float32) for _ in range(6)]
-        found = refine_pupils(parts, find(parts[0]))
+        found = refine_pupil_images(parts, find(parts[0]))
         assert 0 < found.centre_sigma_px < 0.1
         pulls.append((found.centres_px - centres).mean(axis=0) / found.centre_sigma_px)
     # On the safe side: what noise makes of a rim that is round passes for dirt.
@@ -124,9 +124,9 @@ def test_low_orders_are_polynomials_of_the_second_degree() -> None:
     valid = np.hypot(x, y) < 1
     smooth = np.stack([0.3 + x - 0.5 * x * y, -0.2 * y + y * y], axis=2)[valid]
     flux = np.ones((N, N), np.float32)
-    assert np.abs(without_low_orders(smooth, valid, flux)).max() < 1e-12
+    assert np.abs(remove_low_orders(smooth, valid, flux)).max() < 1e-12
     waves = np.stack([np.sin(9 * x), np.cos(11 * y)], axis=2)[valid]
-    left = without_low_orders(waves, valid, flux)
+    left = remove_low_orders(waves, valid, flux)
     assert np.std(left - waves) < 0.2 * np.std(waves)
 
 

@@ -14,11 +14,12 @@ from escape_hw.api.modulator import Modulation
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.errors import CalibrationError, IncompatibleProduct, ProductError
-from escape_hw.io.fits import load_matrix, save_matrix
-from escape_hw.report import figures_bench, figures_matrix
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
 from escape_hw.report.comparison import compare
-from escape_hw.runtime.records import BenchRecord
-from escape_hw.runtime.system import System
+from escape_hw.report.figures import bench as figures_bench
+from escape_hw.report.figures import matrix as figures_matrix
+from escape_hw.runtime.session.record import BenchRecord
+from escape_hw.runtime.session.system import System
 
 TURN_S = 66 * 50e-6
 
@@ -26,7 +27,7 @@ TURN_S = 66 * 50e-6
 @pytest.fixture(scope="module")
 def bench() -> Iterator[System]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("escape_sim.detector.Detector.POOL", 1 << 19)
+        patch.setattr("escape_sim.optics.detector.Detector.POOL", 1 << 19)
         with small("twin.loss_probability=0") as opened:
             yield opened
 
@@ -57,7 +58,7 @@ def test_devices_open_with_the_modulator_parked_and_close_parked() -> None:
         assert one.simulated
         one.find_sensor(frames=10)
         assert one.modulator.modulation is not None
-        assert BenchRecord.of(one).serials["modulator"] == "SIMMOD"
+        assert BenchRecord.from_bench(one).serials["modulator"] == "SIMMOD"
     assert one.modulator.modulation is None
 
 
@@ -190,7 +191,7 @@ def test_product_of_a_pyramid_is_not_for_lenslets(measured: CalibrationResult, t
 def test_product_of_an_unknown_kind_is_refused(
     measured: CalibrationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from escape_hw.io import fits_geometry
+    from escape_hw.io.fits import extensions as fits_geometry
 
     monkeypatch.setitem(fits_geometry._KINDS, "curvature", fits_geometry._KINDS["pyramid"])
     monkeypatch.setattr(PyramidPupils, "kind", "curvature")
@@ -202,7 +203,7 @@ def test_product_of_an_unknown_kind_is_refused(
 
 def test_frames_and_modes_are_drawn(measured: CalibrationResult) -> None:
     assert measured.mean_frame is not None
-    figure = figures_bench.sensor(measured.mean_frame, measured.grid)
+    figure = figures_bench.sensor_frame(measured.mean_frame, measured.grid)
     axes = figure.axes[0]
     assert "four images of" in axes.get_title()
     circles = [patch for patch in axes.patches if hasattr(patch, "radius")]

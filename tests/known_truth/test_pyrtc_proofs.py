@@ -16,11 +16,11 @@ import escape_hw
 from escape_hw.api.procedure import run
 from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import build_bench
-from escape_hw.calibration.push_pull import push_pull
+from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.cli import main
-from escape_hw.config.load import load_system
-from escape_hw.io.fits import load_matrix
-from escape_hw.io.interchange.pyrtc_write import FrameFacts, export_matrix
+from escape_hw.config.loader import load_system
+from escape_hw.io.fits.matrix import load_matrix
+from escape_hw.io.interchange.pyrtc.calibration import FrameSettings, export_matrix
 
 pytestmark = [
     pytest.mark.slow,
@@ -102,10 +102,10 @@ def test_a_matrix_of_ours_closes_pyrtcs_loop(tmp_path: Path, command: Callable[.
 
 def measured_by_pyrtc(folder: Path, geometry: CalibrationResult, seed: int) -> Path:
     """pyRTC's push-pull through turbulence on our twin; returns its configuration."""
-    from escape_drivers.pyrtc_components import EscapeCamera, EscapeMirror, forget_benches
+    from escape_drivers.pyrtc_components import EscapeCamera, EscapeMirror, clear_shared_benches
 
-    forget_benches()
-    paths = export_matrix(folder, geometry, FrameFacts((200, 200), 12.0))
+    clear_shared_benches()
+    paths = export_matrix(folder, geometry, FrameSettings((200, 200), 12.0))
     found = sections(paths["settings"])
     ours = {"system": "razor-shwfs", "set": [*TWIN, f"system.seed={seed}"]}
     with rig("proof2") as made:

@@ -10,7 +10,15 @@ import pytest
 
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import PARAMETERS
-from escape_hw.runtime.sky_time import GOAL, RANGES, PlantErrors, random_plant, run_plant, sky_time, summary
+from escape_hw.paper.sky_time import (
+    GOAL,
+    HALF_RANGES,
+    RealisationErrors,
+    random_registration,
+    run_realisation,
+    sky_time,
+    summary,
+)
 
 SYSTEM = "razor-shwfs"
 
@@ -21,24 +29,24 @@ def _meets_goal(curves: dict[str, Any], estimator: str, frames: int) -> bool:
 
 
 @pytest.fixture(scope="module")
-def few() -> list[PlantErrors]:
+def few() -> list[RealisationErrors]:
     """Three plants, all imperfections on, 0.6 seconds of frames each."""
-    return [run_plant(SYSTEM, number, (300,)) for number in (0, 1, 2)]
+    return [run_realisation(SYSTEM, number, (300,)) for number in (0, 1, 2)]
 
 
 def test_plants_fill_their_ranges_and_differ() -> None:
-    plants = np.array([random_plant(n).to_array() for n in range(200)])
-    assert (np.abs(plants) <= RANGES).all()
-    assert (plants.std(axis=0) > 0.5 * RANGES).all()
+    plants = np.array([random_registration(n).to_array() for n in range(200)])
+    assert (np.abs(plants) <= HALF_RANGES).all()
+    assert (plants.std(axis=0) > 0.5 * HALF_RANGES).all()
 
 
-def test_three_hundred_frames_meet_the_goal_on_every_plant(few: Sequence[PlantErrors]) -> None:
+def test_three_hundred_frames_meet_the_goal_on_every_plant(few: Sequence[RealisationErrors]) -> None:
     curves = summary(few, (300,))
     assert _meets_goal(curves, "whitened", 300)
     assert curves["fewest_frames"]["whitened"] == 300
 
 
-def test_whitening_is_what_meets_it(few: Sequence[PlantErrors]) -> None:
+def test_whitening_is_what_meets_it(few: Sequence[RealisationErrors]) -> None:
     curves = summary(few, (300,))
     assert not _meets_goal(curves, "plain", 300)
     plain, whitened = (
@@ -47,13 +55,13 @@ def test_whitening_is_what_meets_it(few: Sequence[PlantErrors]) -> None:
     assert (plain / whitened).mean() > 3
 
 
-def test_no_error_is_beyond_what_its_sigma_allows(few: Sequence[PlantErrors]) -> None:
+def test_no_error_is_beyond_what_its_sigma_allows(few: Sequence[RealisationErrors]) -> None:
     pulls = np.array([p.errors / p.sigmas for p in few])
     assert np.abs(pulls).max() < 5
     assert 0.2 < np.mean(pulls[:, 1] ** 2) < 3
 
 
-def test_no_estimate_beats_the_bound_and_none_claims_to(few: Sequence[PlantErrors]) -> None:
+def test_no_estimate_beats_the_bound_and_none_claims_to(few: Sequence[RealisationErrors]) -> None:
     for plant in few:
         assert (plant.sigmas[1, 0] > plant.exact[0]).all()
 

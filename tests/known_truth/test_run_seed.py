@@ -8,8 +8,8 @@ import small_pyramid
 import small_system
 
 import escape_hw
-from escape_hw.api import threads
-from escape_sim.pyramid import PyramidOptics
+from escape_hw.api import concurrency as threads
+from escape_sim.optics.pyramid import PyramidOptics
 
 
 def opened(*more: str):
@@ -22,7 +22,7 @@ def test_runs_differ_in_air_and_noise_on_the_same_bench():
         with opened(*more) as bench:
             twin = bench.dm.twin
             seen.append(np.stack([bench.wfs.next_frame(1.0).data for _ in range(3)]).astype(int))
-            truths.append((twin.influence.gain, twin.mirror_path(np.ones(twin.influence.n_act) * 0.1)))
+            truths.append((twin.influence.gain, twin.mirror_opd(np.ones(twin.influence.n_act) * 0.1)))
     plain, first, again, other = seen
     assert np.array_equal(first, again)
     assert not np.array_equal(first, plain)
@@ -51,5 +51,5 @@ def test_a_pyramid_without_helper_threads_makes_the_same_image(monkeypatch, alon
             images.append(bench.wfs.next_frame(1.0).data)
             optics = bench.dm.twin.sensor()
             assert isinstance(optics, PyramidOptics)
-            assert (optics._helpers is not None) == helpers
+            assert (optics._executor is not None) == helpers
     assert np.array_equal(*images)

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 
 import escape_hw
-from escape_hw.calibration.docrime import docrime
-from escape_hw.calibration.sprint import sprint
-from escape_hw.io.fits import load_matrix, save_matrix
-from escape_hw.runtime.records import BenchRecord
+from escape_hw.calibration.docrime.open_loop import docrime
+from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
+from escape_hw.runtime.session.record import BenchRecord
 
 
 def test_registration_from_the_file_is_that_from_memory(tmp_path: Path) -> None:
     with escape_hw.open_system("razor-shwfs", seed=3) as bench:
         measured = bench.run(docrime(bench, frames=300))
-        save_matrix(tmp_path / "im.fits", measured, BenchRecord.of(bench).origin())
+        save_matrix(tmp_path / "im.fits", measured, BenchRecord.from_bench(bench).origin())
         stored = load_matrix(tmp_path / "im.fits", expect_system="razor-shwfs")
         here, there = (
             sprint(matrix, bench.model(grid), modes=30)

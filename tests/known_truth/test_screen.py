@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, special
 
-from escape_sim.screen import RotatingScreen, von_karman_screen
+from escape_sim.atmosphere.phase_plates import RotatingScreen, von_karman_screen
 
 PIXEL, R0, OUTER_SCALE = 0.02, 0.15, 1.5
 SIZE = 512

@@ -9,10 +9,15 @@ import pytest
 from numpy.typing import NDArray
 
 from escape_hw.api.pyramid import PyramidPupils
-from escape_hw.config.load import load_system
-from escape_sim.geometry import lit_as_seen, pupil_geometry, pupil_of_images, soiled_pupil
-from escape_sim.pyramid import PyramidOptics
-from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+from escape_hw.config.loader import load_system
+from escape_sim.models.pyramid import PyramidModel, nominal_pupils
+from escape_sim.optics.pupil import (
+    apply_measured_illumination,
+    contaminated_pupil,
+    pupil_from_images,
+    pupil_geometry,
+)
+from escape_sim.optics.pyramid import PyramidOptics
 
 SOILED = ("twin.contamination.edge_share=0.28", "twin.contamination.unevenness=0.06")
 
@@ -33,9 +38,9 @@ def seen(amplitude: NDArray[np.float32], offsets: NDArray[np.float64]) -> Pyrami
 
 def test_a_soiled_arc_is_dark_in_the_model() -> None:
     config = load_system("maps-nir", overrides=SOILED)
-    soiled, design = soiled_pupil(config, np.random.default_rng(3)), pupil_geometry(config)
+    soiled, design = contaminated_pupil(config, np.random.default_rng(3)), pupil_geometry(config)
     offsets = np.array([[0.3, -0.35], [-0.4, 0.2], [0.25, 0.4], [-0.2, -0.2]])
-    found = lit_as_seen(design, seen(soiled.amplitude, offsets))
+    found = apply_measured_illumination(design, seen(soiled.amplitude, offsets))
     light, want = (np.square(pupil.amplitude, dtype=float) for pupil in (found, soiled))
     # What the images cannot show: the last pixel of the rim, and samples half a pixel wide.
     radius = np.hypot(*np.meshgrid(design.coordinates_m, design.coordinates_m)) / 3.25
@@ -53,7 +58,7 @@ def test_a_soiled_arc_is_dark_in_the_model() -> None:
 
 def test_an_even_pupil_stays_even() -> None:
     design = pupil_geometry(load_system("maps-nir"))
-    found = lit_as_seen(design, seen(design.amplitude, np.zeros((4, 2))))
+    found = apply_measured_illumination(design, seen(design.amplitude, np.zeros((4, 2))))
     light, want = (np.square(pupil.amplitude, dtype=float)[design.lit] for pupil in (found, design))
     assert np.std(light / light.mean() - want / want.mean()) < 0.12
 
@@ -62,4 +67,4 @@ def test_a_bench_is_lit_by_its_design() -> None:
     config = load_system("razor-pywfs")
     pupils = nominal_pupils(config)
     dim = replace(pupils, flux=pupils.flux * np.linspace(0.5, 1, 64, dtype=np.float32))
-    assert np.array_equal(pupil_of_images(config, dim).amplitude, pupil_geometry(config).amplitude)
+    assert np.array_equal(pupil_from_images(config, dim).amplitude, pupil_geometry(config).amplitude)

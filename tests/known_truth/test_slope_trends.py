@@ -9,13 +9,13 @@ from scipy import ndimage
 from small_pyramid import configuration as small_pyramid
 from small_system import configuration as small_lenslets
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.slope_trends import slope_trends
-from escape_hw.calibration.sprint import SprintFit, fit_steps
-from escape_sim.model import make_model, nominal_grid
-from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+from escape_hw.calibration.sprint.fit import SprintFit, fit_registration
+from escape_hw.calibration.sprint.mixed_effects import slope_trends
+from escape_sim.models.pyramid import PyramidModel, nominal_pupils
+from escape_sim.models.shack_hartmann import make_model, nominal_grid
 
 SEEDS = range(6)
 #: Noise of an element, relative to the rms of the matrix.
@@ -54,20 +54,20 @@ def measured(
     """A matrix of unequal actuators and slopes, whose neighbours share their noise, and the truth."""
     rng, valid = np.random.default_rng(seed), nominal_pupils(small_pyramid()).valid
     truth = Registration(*(rng.uniform(-1, 1, 5) * [20, 20, 0.5, 1.5, 1.5]))
-    zonal = model.zonal_matrix(truth) * (1 + 0.05 * rng.standard_normal(model.n_act))
-    zonal *= (1 + 0.05 * rng.standard_normal(len(zonal)) + unit_trends(model) @ trend)[:, None]
+    zonal_matrix = model.zonal_matrix(truth) * (1 + 0.05 * rng.standard_normal(model.n_act))
+    zonal_matrix *= (1 + 0.05 * rng.standard_normal(len(zonal_matrix)) + unit_trends(model) @ trend)[:, None]
     white = rng.standard_normal((model.n_act, 2, *valid.shape))
     smooth = ndimage.gaussian_filter(white, (0, 0, 1.5, 1.5))[:, :, valid].reshape(model.n_act, -1).T
-    sigma = noise * zonal.std()
-    data = zonal + sigma * smooth / smooth.std()
+    sigma = noise * zonal_matrix.std()
+    data = zonal_matrix + sigma * smooth / smooth.std()
     return InteractionMatrix(
-        data.astype(np.float32), np.full(zonal.shape, sigma, np.float32), np.eye(model.n_act), valid,
+        data.astype(np.float32), np.full(zonal_matrix.shape, sigma, np.float32), np.eye(model.n_act), valid,
         "razor-pywfs", "docrime", True,
     ), truth  # fmt: skip
 
 
 def fitted(matrix: InteractionMatrix, model: object) -> SprintFit:
-    return run(fit_steps(matrix, model, learn=True))
+    return run(fit_registration(matrix, model, update_priors=True))
 
 
 def error_of(fit: SprintFit, truth: Registration) -> NDArray[np.float64]:
@@ -83,7 +83,7 @@ def test_a_planted_trend_is_found(model: PyramidModel) -> None:
         assert fit.estimate.converged, fit.estimate.warnings
         pulls.append(error_of(fit, truth) / fit.estimate.sigma)
         nominal = model.zonal_matrix(truth)
-        answers = (fit.zonal() * nominal).sum(axis=1) / np.square(nominal).sum(axis=1)
+        answers = (fit.zonal_matrix() * nominal).sum(axis=1) / np.square(nominal).sum(axis=1)
         told = np.linalg.lstsq(terms, answers)[0]
         shapes.append(told[1:] / told[0])
     assert np.mean(shapes, axis=0) == pytest.approx(TREND, abs=0.03)
@@ -131,15 +131,15 @@ def test_only_a_pyramid_under_turbulence_or_pokes_has_trends(model: PyramidModel
 def test_the_noise_that_lenslets_share_is_left_as_it_was() -> None:
     config = small_lenslets()
     lenslets, grid = make_model(config, None), nominal_grid(config)
-    zonal = lenslets.zonal_matrix(Registration(5.0, -3.0))
+    zonal_matrix = lenslets.zonal_matrix(Registration(5.0, -3.0))
     rng = np.random.default_rng(0)
     # Noise that all slopes share, which a pyramid's fit would count.
-    sigma = 0.1 * zonal.std()
-    data = zonal + sigma * rng.standard_normal((1, lenslets.n_act))
+    sigma = 0.1 * zonal_matrix.std()
+    data = zonal_matrix + sigma * rng.standard_normal((1, lenslets.n_act))
     matrix = InteractionMatrix(
-        data.astype(np.float32), np.full(zonal.shape, sigma, np.float32), np.eye(lenslets.n_act), grid.valid,
+        data.astype(np.float32), np.full(zonal_matrix.shape, sigma, np.float32), np.eye(lenslets.n_act), grid.valid,
         "razor-shwfs", "docrime", True,
     )  # fmt: skip
-    learned = run(fit_steps(matrix, lenslets)).learned
-    assert learned is not None
-    assert learned().priors.shared == 1.0
+    estimate_priors = run(fit_registration(matrix, lenslets)).estimate_priors
+    assert estimate_priors is not None
+    assert estimate_priors().priors.noise_inflation == 1.0

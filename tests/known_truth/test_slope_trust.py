@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 from small_pyramid import configuration as small_pyramid
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.sprint import sprint
-from escape_hw.config.load import load_system
-from escape_hw.config.models import Solver
-from escape_sim.pyramid_model import PyramidModel, nominal_pupils
+from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.config.loader import load_system
+from escape_hw.config.system import Solver
+from escape_sim.models.pyramid import PyramidModel, nominal_pupils
 
 #: Noise of an element, relative to the rms of the matrix.
 NOISE = 0.05
@@ -25,7 +25,7 @@ class Selective:
     """The same model, which knows where it does not hold."""
 
     def __init__(self, model: PyramidModel, trust: NDArray[np.float64]) -> None:
-        self._model, self.slope_trust = model, trust
+        self._model, self.slope_weights = model, trust
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._model, name)
@@ -79,14 +79,14 @@ def test_only_a_telescopes_model_distrusts_dim_pixels(system: str, telescope: bo
     arc = np.zeros(pupils.valid.shape, bool)
     arc[pupils.valid] = soiled(pupils)
     model = PyramidModel(config, replace(pupils, flux=np.where(arc, 0.4, 1.0).astype(np.float32)))
-    trusted = model.slope_trust == 1.0
+    trusted = model.slope_weights == 1.0
     expected = ~soiled(pupils) if telescope else np.ones(pupils.valid.sum(), bool)
     np.testing.assert_array_equal(trusted, np.tile(expected, 2))
-    assert (model.slope_trust > 0).all()
+    assert (model.slope_weights > 0).all()
 
 
 def test_a_pupil_that_is_dim_all_over_is_trusted_all_over() -> None:
     config = load_system("maps-nir", overrides=["sensor.n_sub=24", "basis.n_modes=20"])
     pupils = nominal_pupils(config)
     dim = np.where(np.random.default_rng(1).random(pupils.valid.shape) < 0.7, 0.5, 1.0)
-    assert (PyramidModel(config, replace(pupils, flux=dim.astype(np.float32))).slope_trust == 1.0).all()
+    assert (PyramidModel(config, replace(pupils, flux=dim.astype(np.float32))).slope_weights == 1.0).all()

@@ -9,13 +9,19 @@ import pytest
 from scipy.special import ndtri
 
 from escape_hw.api.registration import Registration
-from escape_hw.config.load import load_system
-from escape_hw.pipeline.slopes import windows
-from escape_sim.geometry import actuator_positions, pitch_on_pupil, pupil_geometry
-from escape_sim.influence import InfluenceFunctions
-from escape_sim.model import ShackHartmannModel, nominal_grid
-from escape_sim.shack_hartmann import ShackHartmannOptics
-from escape_sim.slope_weights import STEPS, gaussian_lattice, lenslet_turbulence, slope_weights
+from escape_hw.config.loader import load_system
+from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
+from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.models.shack_hartmann import (
+    NEIGHBOURS,
+    ShackHartmannModel,
+    gaussian_lattice,
+    lenslet_turbulence,
+    nominal_grid,
+    slope_weights,
+)
+from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.shack_hartmann import ShackHartmannOptics
 
 MOVED = Registration(35.0, -22.0, 1.3, 1.5, -2.0)
 #: Commands of the finite differences: spots move by a few hundredths of a pixel.
@@ -39,7 +45,7 @@ class Truth:
             self.pupil.n_sub, self.pupil.n_pix, config.system.wavelength_m, grid.pitch_px,
             config.sensor.spot_px, grid.origin_px, self.shape, self.pupil.amplitude,
         )  # fmt: skip
-        self.boxes = windows(grid.centres_px(), grid.pitch_px, self.shape)
+        self.boxes = subaperture_windows(grid.centres_px(), grid.pitch_px, self.shape)
 
     def slopes(self, opd):
         light = np.maximum(self.optics.frame(opd.astype(np.float32)).astype(float) - self.cut, 0.0)
@@ -160,7 +166,7 @@ def test_the_average_keeps_no_pattern_of_the_pixels(config):
 def test_weights_sum_to_the_response_to_tilts_and_ignore_piston(config):
     grid, pupil = nominal_grid(config), pupil_geometry(config)
     weights = slope_weights(config, grid, pupil)
-    assert set(weights) == set(STEPS)
+    assert set(weights) == set(NEIGHBOURS)
     truth = Truth(config, grid)
     rows, columns = np.nonzero(grid.valid)
     for x_px, y_px in ((1.0, 0.0), (0.3, -0.8)):
@@ -206,7 +212,7 @@ def test_a_blurred_spot_follows_a_tilt_as_a_sharp_one_does():
     config = load_system("razor-shwfs", overrides=["sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]"])
     grid = replace(nominal_grid(config), counts=2500.0, motion_px=0.9)
     pupil = pupil_geometry(config)
-    still, blurred = (slope_weights(config, replace(grid, air_px=air), pupil) for air in (0.0, 0.7))
+    still, blurred = (slope_weights(config, replace(grid, turbulence_px=air), pupil) for air in (0.0, 0.7))
     near = np.abs(blurred[0, 0] - still[0, 0]).max() / np.abs(still[0, 0]).max()
     # It changes the answer, and not by much.
     assert 0.01 < near < 1

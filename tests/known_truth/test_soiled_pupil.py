@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from escape_hw.config.telescope_models import TelescopeSection
-from escape_hw.pipeline.obscuration import passed_share, shadow_of, shadow_offset
-from escape_hw.pipeline.pyramid_pupils import find_pupils, refine_pupils
-from escape_hw.pipeline.rims import out_of_round
+from escape_hw.config.system import TelescopeSection
+from escape_hw.pipeline.geometry.obscuration import build_shadow, fit_shadow_offset, transmitted_fraction
+from escape_hw.pipeline.geometry.pupil_images import find_pupil_images, refine_pupil_images
+from escape_hw.pipeline.geometry.pupil_rims import estimate_roundness_error
 
 N, SHAPE = 30, (80, 80)
 NOMINAL = np.array([[19.5, 19.5], [59.5, 19.5], [19.5, 59.5], [59.5, 59.5]])
@@ -38,7 +38,9 @@ def frame(
         degree = (np.rad2deg(np.arctan2(fy[:, None], fx)) % 360).astype(int)
         inside = (np.hypot(fx, fy[:, None]) <= rim[degree]).reshape(80, FINE, 80, FINE).mean(axis=(1, 3))
         slope = 1 + rng.uniform(-0.2, 0.2) * x[None, :] + rng.uniform(-0.2, 0.2) * y[:, None]
-        image += 400 * inside * slope * passed_share(TELESCOPE, DIAMETER_M, x * DIAMETER_M, y * DIAMETER_M)
+        image += (
+            400 * inside * slope * transmitted_fraction(TELESCOPE, DIAMETER_M, x * DIAMETER_M, y * DIAMETER_M)
+        )
     # What diffraction adds to the pixels' own width.
     image = ndimage.gaussian_filter(image, 0.4)
     return (image + 400 * noise * rng.standard_normal(SHAPE)).astype(np.float32)
@@ -50,16 +52,16 @@ def test_the_shadow_is_found_where_it_is() -> None:
         rng = np.random.default_rng(seed)
         place = rng.uniform(-0.3, 0.3, 2)
         image = frame(NOMINAL + place, rng, 0.0).astype(float)
-        shadow = shadow_of(TELESCOPE, DIAMETER_M)
+        shadow = build_shadow(TELESCOPE, DIAMETER_M)
         assert shadow is not None
-        offset, sigma = shadow_offset(image, NOMINAL, N, shadow)
+        offset, sigma = fit_shadow_offset(image, NOMINAL, N, shadow)
         errors.append(offset - place)
         assert 0 < sigma < 0.04
     assert np.sqrt(np.mean(np.square(errors))) < 0.03
 
 
 def test_without_an_obscuration_there_is_no_shadow() -> None:
-    assert shadow_of(TelescopeSection(), DIAMETER_M) is None
+    assert build_shadow(TelescopeSection(), DIAMETER_M) is None
 
 
 def test_an_eaten_rim_shifts_its_circle_and_the_error_knows() -> None:
@@ -68,9 +70,9 @@ def test_an_eaten_rim_shifts_its_circle_and_the_error_knows() -> None:
         rng = np.random.default_rng(seed)
         centres = NOMINAL + rng.uniform(-0.4, 0.4, (4, 2))
         image = frame(centres, rng, 0.02)
-        first = find_pupils(image, n_sub=N, nominal_px=NOMINAL, min_flux=0.4)
-        found = refine_pupils([image], first, shadow_of(TELESCOPE, DIAMETER_M))
-        plain = refine_pupils([image], first)
+        first = find_pupil_images(image, n_sub=N, nominal_px=NOMINAL, min_flux=0.4)
+        found = refine_pupil_images([image], first, build_shadow(TELESCOPE, DIAMETER_M))
+        plain = refine_pupil_images([image], first)
         rim.append((plain.centres_px - centres).mean(axis=0))
         both.append((found.centres_px - centres).mean(axis=0))
         stated.append((plain.centre_sigma_px, found.centre_sigma_px))
@@ -86,5 +88,5 @@ def test_a_whole_rim_is_round() -> None:
     rng = np.random.default_rng(3)
     whole = frame(NOMINAL, rng, 0.0, noise=0.002).astype(float)
     soiled = frame(NOMINAL, np.random.default_rng(3), 0.03, noise=0.002).astype(float)
-    assert out_of_round(whole, NOMINAL, N / 2, N / 2) < 0.02
-    assert out_of_round(soiled, NOMINAL, N / 2, N / 2) > 0.04
+    assert estimate_roundness_error(whole, NOMINAL, N / 2, N / 2) < 0.02
+    assert estimate_roundness_error(soiled, NOMINAL, N / 2, N / 2) > 0.04

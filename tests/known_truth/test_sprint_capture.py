@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.modes import karhunen_loeve
-from escape_hw.calibration.sprint import sprint
-from escape_hw.config.load import load_system
-from escape_sim.model import ShackHartmannModel, make_model, nominal_grid
+from escape_hw.calibration.modes.bases import karhunen_loeve
+from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.config.loader import load_system
+from escape_sim.models.shack_hartmann import ShackHartmannModel, make_model, nominal_grid
 
 #: Noise of the matrix elements, relative to their rms.
 NOISE = 0.03
@@ -65,10 +65,10 @@ def test_finds_home_from_afar(model, matrix_at, planted):
 
 def test_a_shift_by_more_than_a_pitch_is_not_passed_off_as_found(model, matrix_at):
     planted = Registration(shift_x=400.0)
-    estimate = sprint(matrix_at(planted), model, max_iterations=10, reach=False)
+    estimate = sprint(matrix_at(planted), model, max_iterations=10, coarse_search=False)
     assert not estimate.converged
     assert any("explains" in warning for warning in estimate.warnings)
-    assert sprint(matrix_at(planted), model, start=Registration(shift_x=300.0), reach=False).converged
+    assert sprint(matrix_at(planted), model, start=Registration(shift_x=300.0), coarse_search=False).converged
 
 
 def random_far(number):
@@ -96,9 +96,9 @@ def test_plants_at_random_are_found_or_refused(model, matrix_at, n_modes):
     found = 0
     for number in range(6):
         rng = np.random.default_rng(number)
-        reach = PITCH * rng.choice([0.3, 1.0, 3.0, 6.0])
+        coarse_search = PITCH * rng.choice([0.3, 1.0, 3.0, 6.0])
         planted = Registration.from_array(
-            [*rng.uniform(-reach, reach, 2), *(rng.uniform(-1, 1, 3) * [12, 8, 8])]
+            [*rng.uniform(-coarse_search, coarse_search, 2), *(rng.uniform(-1, 1, 3) * [12, 8, 8])]
         )
         estimate = sprint(matrix_at(planted), model, modes=np.arange(n_modes), solver="light")
         error = np.abs(estimate.registration.to_array() - planted.to_array())
@@ -113,7 +113,7 @@ def test_high_modes_alone_are_found_by_many_starts(model, matrix_at):
     estimate = sprint(matrix_at(planted), model, modes=columns, solver="light")
     assert estimate.converged
     assert (np.abs(estimate.registration.to_array() - planted.to_array()) < 5 * estimate.sigma).all()
-    assert not sprint(matrix_at(planted), model, modes=columns, solver="light", reach=False).converged
+    assert not sprint(matrix_at(planted), model, modes=columns, solver="light", coarse_search=False).converged
 
 
 def test_light_and_full_agree_on_a_mirror_like_the_model(model, matrix_at):

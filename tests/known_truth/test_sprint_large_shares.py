@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.api.model import SyntheticModel
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.modes import karhunen_loeve
-from escape_hw.calibration.sprint import fit_steps
-from escape_hw.config.load import load_system
-from escape_sim.model import make_model, nominal_grid
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.calibration.modes.bases import karhunen_loeve
+from escape_hw.calibration.sprint.fit import fit_registration
+from escape_hw.config.loader import load_system
+from escape_sim.models.shack_hartmann import make_model, nominal_grid
 
 SMALL = (
     "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
@@ -63,7 +63,7 @@ def test_large_shares_are_found_with_the_registration(seed: int) -> None:
     sigma = np.full(exact.shape, 0.05 * exact.std(), np.float32)
     data = (exact + sigma * rng.standard_normal(exact.shape)).astype(np.float32)
     matrix = InteractionMatrix(data, sigma, m2c, nominal_grid(config).valid, "razor-shwfs", "docrime", True)
-    estimate = run(fit_steps(matrix, Doubtful(sharp))).estimate
+    estimate = run(fit_registration(matrix, Doubtful(sharp))).estimate
     assert estimate.converged, estimate.warnings
     assert len(estimate.iterations) <= 25
     pulls = (estimate.registration.to_array() - planted.to_array()) / np.sqrt(np.diag(estimate.covariance))

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.mode_choice import choose_modes
-from escape_hw.calibration.modes import karhunen_loeve
-from escape_hw.calibration.sprint import fit_steps, sprint
-from escape_hw.config.load import load_system
-from escape_sim.model import make_model, nominal_grid
+from escape_hw.calibration.modes.bases import karhunen_loeve
+from escape_hw.calibration.sprint.fit import fit_registration, sprint
+from escape_hw.calibration.sprint.mode_choice import choose_modes
+from escape_hw.config.loader import load_system
+from escape_sim.models.shack_hartmann import make_model, nominal_grid
 
 SMALL = (
     "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
@@ -33,15 +33,15 @@ def bench():
 def measured(bench, *, noise: float, actuators: float = 0.0, slopes: float = 0.0) -> InteractionMatrix:
     model, valid, m2c = bench
     rng = np.random.default_rng(6)
-    zonal = model.zonal_matrix(PLANTED) * (1 + actuators * rng.standard_normal(model.n_act))
-    exact = (zonal * (1 + slopes * rng.standard_normal(len(zonal)))[:, None]) @ m2c
+    zonal_matrix = model.zonal_matrix(PLANTED) * (1 + actuators * rng.standard_normal(model.n_act))
+    exact = (zonal_matrix * (1 + slopes * rng.standard_normal(len(zonal_matrix)))[:, None]) @ m2c
     sigma = np.full(exact.shape, noise * exact.std(), np.float32)
     data = (exact + sigma * rng.standard_normal(exact.shape)).astype(np.float32)
     return InteractionMatrix(data, sigma, m2c, valid, "razor-shwfs", "docrime", True)
 
 
 def solve(matrix, model, **options):
-    steps = fit_steps(matrix, model, **options)
+    steps = fit_registration(matrix, model, **options)
     while True:
         try:
             next(steps)
@@ -51,8 +51,8 @@ def solve(matrix, model, **options):
 
 @pytest.mark.parametrize(("actuators", "slopes"), [(0.05, 0.04), (0.15, 0.02)])
 def test_the_scatter_of_the_random_effects_is_learned(bench, actuators, slopes):
-    fit = solve(measured(bench, noise=0.05, actuators=actuators, slopes=slopes), bench[0], learn=True)
-    priors = fit.learned().priors
+    fit = solve(measured(bench, noise=0.05, actuators=actuators, slopes=slopes), bench[0], update_priors=True)
+    priors = fit.estimate_priors().priors
     # 37 actuators tell their scatter to an eighth, 200 slopes to a twentieth, and noise blurs both.
     assert priors.actuator_gain == pytest.approx(actuators, rel=0.45)
     assert priors.slope_gain == pytest.approx(slopes, rel=0.45)
@@ -63,7 +63,7 @@ def test_the_matrix_that_was_found_is_that_of_the_mirror_at_hand(bench):
     matrix = measured(bench, noise=0.02, actuators=0.1)
     exact = measured(bench, noise=0.0, actuators=0.1).data
     fit = solve(matrix, model)
-    found, nominal = fit.zonal() @ m2c, model.zonal_matrix(PLANTED) @ m2c
+    found, nominal = fit.zonal_matrix() @ m2c, model.zonal_matrix(PLANTED) @ m2c
     assert np.linalg.norm(found - exact) < 0.01 * np.linalg.norm(exact)
     assert np.linalg.norm(nominal - exact) > 0.05 * np.linalg.norm(exact)
 
@@ -105,7 +105,7 @@ def test_informative_modes_beat_the_first_ones(bench):
 
 def test_a_descent_of_small_steps_that_was_cut_has_not_converged(bench):
     matrix = measured(bench, noise=0.3)
-    cut = sprint(matrix, bench[0], learning_rate=0.01, reach=False, max_iterations=3)
+    cut = sprint(matrix, bench[0], learning_rate=0.01, coarse_search=False, max_iterations=3)
     assert not cut.converged
     assert any("did not shrink" in warning for warning in cut.warnings)
     assert sprint(matrix, bench[0]).converged
@@ -119,7 +119,7 @@ def test_what_is_not_known_is_refused(bench, option):
 
 def test_telemetry_is_not_fitted_by_modes():
     from escape_hw.errors import ConfigError
-    from escape_hw.runtime.system import open_system
+    from escape_hw.runtime.session.system import open_system
 
     with (
         open_system("razor-shwfs", set=["calibration.solver=diagonal"]) as system,

@@ -7,10 +7,17 @@ import pytest
 from numpy.typing import NDArray
 from sensor_frames import WAVELENGTH, pupil_amplitude
 
-from escape_hw.api.frames import Frame
+from escape_hw.api.camera import Frame
 from escape_hw.errors import CalibrationError
-from escape_hw.pipeline.strehl import centre_of, centred, encircled, peak_is_clipped, ratios, strehl
-from escape_sim.psf import FocalPlane
+from escape_hw.pipeline.psf.strehl import (
+    centre_image,
+    encircled,
+    find_peak,
+    is_peak_saturated,
+    strehl,
+    strehl_ratios,
+)
+from escape_sim.optics.focal_plane import FocalPlane
 
 N = 96
 PSF_PX = 2.46
@@ -52,13 +59,13 @@ def tilt(x_px: float, y_px: float) -> NDArray[np.float64]:
 
 
 def test_a_perfect_image_has_strehl_one(model):
-    assert ratios(model, model) == pytest.approx(np.ones(3), abs=1e-12)
+    assert strehl_ratios(model, model) == pytest.approx(np.ones(3), abs=1e-12)
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.2, 0.3])
 def test_small_aberrations_obey_marechal(plane, model, sigma):
     # Averaged over realisations: exp(-sigma^2) is exact only for Gaussian phase.
-    found = np.mean([ratios(plane.image(aberration(sigma, seed)), model) for seed in range(8)], axis=0)
+    found = np.mean([strehl_ratios(plane.image(aberration(sigma, seed)), model) for seed in range(8)], axis=0)
     assert found[:2] == pytest.approx(np.full(2, np.exp(-(sigma**2))), abs=0.1 * sigma**2 + 1e-3)
 
 
@@ -75,7 +82,7 @@ def test_defocus_of_a_round_pupil_follows_its_exact_formula(sigma):
     assert blurred[middle] / still[middle] == pytest.approx((np.sin(a) / a) ** 2, rel=0.02)
     if sigma < 1:
         # Where the brightest spot still is the middle, the estimators find it there.
-        peak, otf, _ = ratios(blurred, still)
+        peak, otf, _ = strehl_ratios(blurred, still)
         assert peak == pytest.approx((np.sin(a) / a) ** 2, rel=0.03)
         assert otf == pytest.approx((np.sin(a) / a) ** 2, rel=0.03)
 
@@ -84,52 +91,52 @@ def test_a_cut_off_peak_is_noticed_and_a_hot_pixel_is_not(plane):
     counts = np.minimum(plane.image(np.zeros((N, N), np.float32)) * 1e6, 1e9)
     counts = counts / counts.max() * 3000 + 10
     good = counts.astype(np.uint16)
-    assert not peak_is_clipped(Frame(good, 0, 0, 0, 0))
+    assert not is_peak_saturated(Frame(good, 0, 0, 0, 0))
     hot = good.copy()
     hot[5, 9] = 4095
-    assert not peak_is_clipped(Frame(hot, 0, 0, 0, 1))
+    assert not is_peak_saturated(Frame(hot, 0, 0, 0, 1))
     cut = np.minimum(good, 1500)
     saturated = int((cut == 1500).sum())
     assert saturated > 1
-    assert peak_is_clipped(Frame(cut, 0, 0, 0, saturated))
+    assert is_peak_saturated(Frame(cut, 0, 0, 0, saturated))
     # That is why: half of the peak gone is half of the first ratio gone.
-    assert ratios(cut.astype(float), good.astype(float))[0] < 0.7
+    assert strehl_ratios(cut.astype(float), good.astype(float))[0] < 0.7
 
 
 def test_all_three_agree_when_the_light_goes_far_away(plane, model):
     # Ripples of more than three cycles per pupil scatter light beyond the encircled energy's rim.
     images = [plane.image(aberration(0.3, seed, lowest=3.0, highest=12.0)) for seed in range(8)]
-    found = np.mean([ratios(image, model) for image in images], axis=0)
+    found = np.mean([strehl_ratios(image, model) for image in images], axis=0)
     assert found == pytest.approx(np.full(3, np.exp(-0.09)), abs=0.015)
 
 
 def test_encircled_energy_keeps_what_stays_close(plane, model):
     # Low orders move light by a pixel or two: the peak falls, the energy within three hardly does.
-    peak, _, energy = ratios(plane.image(aberration(0.4, 1, highest=1.5)), model)
+    peak, _, energy = strehl_ratios(plane.image(aberration(0.4, 1, highest=1.5)), model)
     assert peak < energy < 1
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, 0.5), (0.31, -0.77), (-7.2, 4.6), (15.5, -20.25)])
 def test_shifts_do_not_matter(plane, model, shift):
     opd = aberration(0.3, 2)
-    still = ratios(plane.image(opd), model)
-    moved = ratios(plane.image((opd + tilt(*shift)).astype(np.float32)), model)
+    still = strehl_ratios(plane.image(opd), model)
+    moved = strehl_ratios(plane.image((opd + tilt(*shift)).astype(np.float32)), model)
     # Up to the faint wings that leave the region.
     assert moved == pytest.approx(still, abs=5e-3)
 
 
 def test_scale_and_background_do_not_matter(plane, model):
     image = plane.image(aberration(0.3, 3))
-    want = ratios(image, model)
-    assert ratios(5e4 * image + 137.0, 2e3 * model + 12.0) == pytest.approx(want, abs=1e-3)
+    want = strehl_ratios(image, model)
+    assert strehl_ratios(5e4 * image + 137.0, 2e3 * model + 12.0) == pytest.approx(want, abs=1e-3)
 
 
 def test_the_image_is_centred(plane):
     image = plane.image(tilt(3.3, -6.6).astype(np.float32))
     assert np.unravel_index(np.argmax(image), SHAPE) == (64 - 7, 64 + 3)  # row, column
-    moved = centred(image)
+    moved = centre_image(image)
     assert moved.sum() == pytest.approx(1, rel=1e-6)
-    assert centre_of(moved) == pytest.approx((64, 64), abs=0.02)
+    assert find_peak(moved) == pytest.approx((64, 64), abs=0.02)
 
 
 def test_encircled_energy_of_a_uniform_image_is_the_circles_area():
@@ -157,7 +164,7 @@ def test_the_value_is_that_of_the_mean_frame(plane, model):
     stack = frames(plane, 20, 1)
     found = strehl(stack, model)
     assert [found.peak.value, found.otf.value, found.encircled.value] == pytest.approx(
-        ratios(stack.mean(axis=0), model)
+        strehl_ratios(stack.mean(axis=0), model)
     )
 
 
@@ -190,8 +197,8 @@ def test_no_frames_no_light_and_a_peak_at_the_edge_are_errors(plane, model):
     with pytest.raises(CalibrationError, match="no science frames"):
         strehl(np.empty((0, *SHAPE)), model)
     with pytest.raises(CalibrationError, match="no light"):
-        ratios(np.full(SHAPE, 7.0), model)
+        strehl_ratios(np.full(SHAPE, 7.0), model)
     edge = np.zeros(SHAPE)
     edge[0, 60] = 100.0
     with pytest.raises(CalibrationError, match="edge"):
-        ratios(edge, model)
+        strehl_ratios(edge, model)

@@ -9,8 +9,8 @@ import pytest
 from small_system import SMALL
 
 import escape_hw
-from escape_hw.calibration import closed_loop
-from escape_hw.pipeline.strehl import strehl
+from escape_hw.calibration.loop import performance as closed_loop
+from escape_hw.pipeline.psf.strehl import strehl
 
 #: Science frames of a loop of 1,000 frames.
 LENGTH = 85

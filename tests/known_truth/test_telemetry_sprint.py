@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.results import CalibrationResult
-from escape_hw.calibration.telemetry_sprint import independent_columns, time_line
+from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns, telemetry_from_frames
 from escape_hw.errors import TooFewFrames
-from escape_hw.runtime.sky_time import GOAL, plant_overrides, random_plant
-from escape_hw.runtime.system import System, open_system
+from escape_hw.paper.sky_time import GOAL, random_registration, registration_overrides
+from escape_hw.runtime.session.system import System, open_system
 
 SYSTEM = "razor-shwfs"
 
 
 def _calibrate(number: int, frames: int, estimator: str = "auto") -> tuple[np.ndarray, CalibrationResult]:
     """Errors of the registration on a random plant, all imperfections on, and the calibration."""
-    plant = random_plant(number)
-    with open_system(SYSTEM, set=plant_overrides(plant), seed=number + 1) as bench:
+    plant = random_registration(number)
+    with open_system(SYSTEM, set=registration_overrides(plant), seed=number + 1) as bench:
         result = bench.calibrate(frames=frames, estimator=estimator)
     assert result.registration is not None
     assert result.registration.converged, result.registration.warnings
@@ -82,7 +82,7 @@ def test_turned_columns_hold_the_likelihood():
         (slopes.T @ seen @ np.linalg.pinv(gram)).astype(np.float32),
         np.ones((n_slopes, n_modes), np.float32), np.eye(n_modes), valid, "x", "y", True,
     )  # fmt: skip
-    turned = independent_columns(measured, gram, np.full(n_slopes, 0.01))
+    turned = decorrelate_columns(measured, gram, np.full(n_slopes, 0.01))
     assert turned.data.shape == (n_slopes, n)
     for _ in range(3):
         trial = rng.standard_normal((n_slopes, n_modes))
@@ -96,7 +96,7 @@ def test_turned_columns_hold_the_likelihood():
 def test_lost_frames_keep_the_last_poke_and_lose_no_other():
     index = np.array([5, 6, 9, 10])
     slopes, pokes = np.arange(8.0).reshape(4, 2), np.arange(12.0).reshape(4, 3) + 1
-    data = time_line(index, slopes, pokes, before=2)
+    data = telemetry_from_frames(index, slopes, pokes, before=2)
     assert data.present.tolist() == [False, False, True, True, False, False, True, True]
     np.testing.assert_array_equal(data.pokes[:2], 0)
     np.testing.assert_array_equal(data.pokes[2:], pokes[[0, 1, 1, 1, 2, 3]])

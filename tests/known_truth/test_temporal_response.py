@@ -6,7 +6,7 @@ import numpy as np
 import planted_loop as planted
 import pytest
 
-from escape_hw.calibration.lag_sums import LagSums, ResponseEstimate
+from escape_hw.calibration.docrime.response import LagSums, ResponseEstimate
 
 SEEDS = 16
 
@@ -60,8 +60,8 @@ def test_estimates_are_weighed_by_their_covariances():
     free = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]]).T
     good = ResponseEstimate(np.array([0.2, 0.6, 0.2]), free @ np.diag([1e-4, 4e-4]) @ free.T)
     poor = ResponseEstimate(np.array([0.9, -0.7, 0.8]), 99 * good.covariance)
-    both = poor.combined(good)
+    both = poor.combine_with(good)
     np.testing.assert_allclose(both.weights, 0.99 * good.weights + 0.01 * poor.weights, atol=1e-6)
     np.testing.assert_allclose(both.covariance, 0.99 * good.covariance, rtol=1e-4, atol=1e-10)
-    np.testing.assert_allclose(good.combined(poor).weights, both.weights, atol=1e-6)
+    np.testing.assert_allclose(good.combine_with(poor).weights, both.weights, atol=1e-6)
     assert both.weights.sum() == pytest.approx(1)

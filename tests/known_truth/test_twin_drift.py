@@ -9,15 +9,14 @@ import pytest
 from small_pyramid import configuration as pyramid
 
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_hw.config.load import load_system
-from escape_hw.config.twin_drift import TwinDrift, TwinDriftRate, TwinDriftSwing, TwinSeeing
+from escape_hw.config.loader import load_system
+from escape_hw.config.twin import TwinDrift, TwinDriftRate, TwinDriftSwing, TwinSeeing
 from escape_hw.errors import ConfigError
-from escape_hw.runtime.records import BenchRecord
-from escape_hw.runtime.system import System
-from escape_sim.flexure import FlexingSurface, Flexure
-from escape_sim.mirror_surface import mirror_surface
-from escape_sim.seeing import Seeing
-from escape_sim.sim_bench import SimBench
+from escape_hw.runtime.session.record import BenchRecord
+from escape_hw.runtime.session.system import System
+from escape_sim.atmosphere.layers import Seeing
+from escape_sim.devices.bench import SimBench
+from escape_sim.mirror.surface import DriftingSurface, Flexure, make_mirror_surface
 
 START = Registration(5.0, -7.0, 0.3, 1.0, -0.5)
 DRIFT = TwinDrift(
@@ -44,25 +43,27 @@ def test_the_surface_is_that_of_the_registration_of_the_moment():
     twin = bench()
     x, sub = twin.pupil.coordinates_m, twin.pupil.sub_aperture_m
     flexure = Flexure(START, DRIFT)
-    moving = FlexingSurface(twin.influence, flexure, sub, x, x)
+    moving = DriftingSurface(twin.influence, flexure, sub, x, x)
     command = np.random.default_rng(1).uniform(-1, 1, 97)
     scale = moving(command, 0.0).std()
     for time_s in (0.0, 3.3, 7.9, 1.2):
-        exact = mirror_surface(twin.influence, flexure.at(time_s), sub, x, x)(command)
+        exact = make_mirror_surface(twin.influence, flexure.at(time_s), sub, x, x)(command)
         # What is left is little beside what 1 % of a sub-aperture does.
         nudged = Registration.from_array(flexure.at(time_s).to_array() + np.eye(5)[0])
-        moved = mirror_surface(twin.influence, nudged, sub, x, x)(command) - exact
+        moved = make_mirror_surface(twin.influence, nudged, sub, x, x)(command) - exact
         assert np.abs(moving(command, time_s) - exact).std() < 0.05 * moved.std() < 0.1 * scale
-    again = FlexingSurface(twin.influence, flexure, sub, x, x)
+    again = DriftingSurface(twin.influence, flexure, sub, x, x)
     np.testing.assert_array_equal(again(command, 1.2), moving(command, 1.2))
 
 
 def test_a_bench_that_stands_still_is_derived_once(monkeypatch):
     twin = bench()
-    monkeypatch.setattr("escape_sim.flexure.mirror_surface", lambda *_: pytest.fail("derived again"))
+    monkeypatch.setattr(
+        "escape_sim.mirror.surface.make_mirror_surface", lambda *_: pytest.fail("derived again")
+    )
     twin.optical_path(0.0, 2e-3)
     twin.optical_path(1e4, 1e4 + 2e-3)
-    assert math.isinf(twin.flexure.step_s)
+    assert math.isinf(twin.flexure.update_interval_s)
 
 
 def test_the_bench_moves_with_its_clock():
@@ -112,12 +113,12 @@ def test_models_know_nothing_of_it(load):
     with System.from_config(load()) as system:
         grid = system.find_sensor(frames=5).grid
         still = system.model(grid).zonal_matrix(registration)
-        assert BenchRecord.of(system).planted is not None
+        assert BenchRecord.from_bench(system).planted is not None
     with System.from_config(load(*words)) as system:
         system.wfs.next_frame(1.0)
         np.testing.assert_array_equal(system.model(grid).zonal_matrix(registration), still)
         # Nor does a report hold one number against a registration that moves.
-        assert BenchRecord.of(system).planted is None
+        assert BenchRecord.from_bench(system).planted is None
 
 
 def test_what_the_configuration_refuses():

@@ -29,7 +29,7 @@ def test_importing_the_package_is_cheap() -> None:
 @pytest.mark.parametrize(
     "statement",
     [
-        "import escape_hw.runtime.system, escape_hw.bench, escape_hw.config.registry",
+        "import escape_hw.runtime.session.system, escape_hw.bench, escape_hw.config.registry",
         "import escape_drivers",
         "import escape_gui",
     ],
@@ -40,8 +40,8 @@ def test_no_vendor_library_and_no_qt_before_something_opens(statement: str) -> N
 
 def test_public_names_are_listed_and_load() -> None:
     assert set(escape_hw.__all__) <= set(dir(escape_hw))
-    assert set(escape_hw._HOME) == set(escape_hw.__all__) - {"__version__"}
+    assert set(escape_hw._PUBLIC_MODULES) == set(escape_hw.__all__) - {"__version__"}
     for name in escape_hw.__all__:
         assert getattr(escape_hw, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'opne_system'"):
-        escape_hw.opne_system  # noqa: B018
+        escape_hw.opne_system

@@ -61,7 +61,7 @@ def is_checkout(folder):
 sys.path[:] = [folder for folder in sys.path if not is_checkout(folder)]
 import importlib.metadata, importlib.resources, importlib.util, json
 import escape_hw
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 print(json.dumps({{
     "homes": {{n: importlib.util.find_spec(n).origin for n in {sorted(PACKAGES)!r}}},
     "folders": [n for n in ("drivers", "sim_backends", "tests") if importlib.util.find_spec(n)],

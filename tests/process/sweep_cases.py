@@ -15,13 +15,13 @@ from pathlib import Path
 from small_system import configuration
 
 import escape_hw
-from escape_hw.runtime.records import BenchRecord
-from escape_hw.runtime.system import System
+from escape_hw.runtime.session.record import BenchRecord
+from escape_hw.runtime.session.system import System
 
 ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
 #: Short loops: a few tens of them run in some seconds.
 SHORT = (
-    "--trials", "12", "--candidates", "1", "--heats", "1", "--finals", "6", "--frames", "270", "--quiet",
+    "--trials", "12", "--candidates", "1", "--replicates", "1", "--final-replicates", "6", "--frames", "270", "--quiet",
     "--json",
 )  # fmt: skip
 #: 12 drawn, one heat and six finals of two matrices.
@@ -36,7 +36,7 @@ def matrices(folder: Path) -> tuple[str, ...]:
         for method, name in (("push-pull", "pp"), ("docrime", "dc")):
             frames = 500 if method == "docrime" else None
             found = bench.calibrate(method, frames=frames)
-            escape_hw.save_matrix(folder / f"{name}.fits", found, BenchRecord.of(bench).origin())
+            escape_hw.save_matrix(folder / f"{name}.fits", found, BenchRecord.from_bench(bench).origin())
     ims = [str(folder / f"{name}.fits") for name in ("pp", "dc")]
     return (str(folder / "small.toml"), "--im", ims[0], "--im", ims[1], *SHORT)
 

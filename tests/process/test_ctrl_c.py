@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from escape_hw.io.fits import load_matrix
-from escape_hw.io.psf import load_loop
+from escape_hw.io.fits.loop import load_loop
+from escape_hw.io.fits.matrix import load_matrix
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads processor time in /proc")
 

@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from escape_hw.io.fits import load_matrix
-from escape_hw.io.state_file import load_state
+from escape_hw.io.fits.matrix import load_matrix
+from escape_hw.io.fits.run_state import load_state
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads processor time in /proc")
 

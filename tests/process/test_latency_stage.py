@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from escape_hw.cli.benchmarks import latency, latency_loop
-from escape_hw.cli.benchmarks.latency_loop import LIMITS, BookingMirror, Run, run_loop
+from escape_benchmarks.real_time import latency
+from escape_benchmarks.real_time.latency import LIMITS, LatencyResult, TimestampingMirror, run_loop
 from escape_hw.streams import segments
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="shared memory as on Linux")
@@ -29,7 +29,7 @@ def of_others(one: segments.Segment) -> bool:
 
 @pytest.mark.parametrize("streams", [False, True])
 def test_frames_of_another_process_are_answered(monkeypatch, streams):
-    monkeypatch.setattr(latency_loop, "WARM_UP", 20)
+    monkeypatch.setattr(latency, "WARM_UP", 20)
     case = latency.make_case(4, 8, 12, 200.0)
     before = segments.segments("perf")
     found = run_loop(case, 0.5, streams=streams)
@@ -42,7 +42,7 @@ def test_frames_of_another_process_are_answered(monkeypatch, streams):
 
 def test_every_rule_of_the_guard_is_in_the_way():
     assert None not in (LIMITS.max_slew, LIMITS.max_mean, LIMITS.max_neighbour)
-    with BookingMirror(97) as mirror:
+    with TimestampingMirror(97) as mirror:
         sent = mirror.send(np.full(97, 0.7)).sent
         assert np.abs(sent).max() < 0.6
         assert len(mirror.times) == 1
@@ -50,15 +50,15 @@ def test_every_rule_of_the_guard_is_in_the_way():
 
 def test_rows_tell_losses_and_a_peer_that_failed():
     case = latency.make_case(4, 8, 12, 200.0)
-    ours = Run(np.arange(1.0, 101.0), 200.0, 3, ("no real-time priority",))
-    rows = latency._rows(case, ours, Run(np.array([150.0, 400.0]), 180.0, 0))
+    ours = LatencyResult(np.arange(1.0, 101.0), 200.0, 3, ("no real-time priority",))
+    rows = latency._rows(case, ours, LatencyResult(np.array([150.0, 400.0]), 180.0, 0))
     assert [(row.ours, row.peer) for row in rows] == [
         (50.5, 150.0),
         (pytest.approx(99.01), 400.0),
         (100.0, None),
     ]
     assert "3 lost; no real-time priority; the peer answered 180 frames per second" in rows[0].note
-    failed = latency._rows(case, ours, Run(np.array([]), 0.0, 0, ("timed out",)))
+    failed = latency._rows(case, ours, LatencyResult(np.array([]), 0.0, 0, ("timed out",)))
     assert [row.peer for row in failed] == [None, None, None]
     assert failed[0].note.endswith("timed out")
     assert "pyrtcao is not installed" in latency._rows(case, ours, None)[0].note

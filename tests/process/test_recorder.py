@@ -17,11 +17,11 @@ import pytest
 
 from escape_hw.cli import main
 from escape_hw.errors import ProductError
-from escape_hw.streams import recorder as module
 from escape_hw.streams import segments
-from escape_hw.streams.block_file import HEADER, read_recording, write_block
-from escape_hw.streams.record_process import RecordProcess
-from escape_hw.streams.recorder import Recorder
+from escape_hw.streams.recording import recorder as module
+from escape_hw.streams.recording.block_file import HEADER, read_recording, write_block
+from escape_hw.streams.recording.process import RecorderProcess
+from escape_hw.streams.recording.recorder import StreamRecorder
 from escape_hw.streams.ring import RingReader, RingWriter
 from escape_hw.streams.segments import segment_name
 
@@ -48,7 +48,7 @@ def entries(writer: RingWriter, first: int, count: int, *, size: int = 100, wait
 def recorded(tmp_path, writer, produce, **options):
     """Record in a thread while ``produce`` runs."""
     stop = threading.Event()
-    recorder = Recorder(tmp_path, {"slopes": writer.name}, **options)
+    recorder = StreamRecorder(tmp_path, {"slopes": writer.name}, **options)
     thread = threading.Thread(target=recorder.run, args=(stop.is_set,))
     thread.start()
     produce()
@@ -63,7 +63,7 @@ def test_every_entry_is_read_back(tmp_path, writer):
     state = recorded(tmp_path, writer, lambda: entries(writer, 10, 500, wait_s=0.0005))
     assert (state.written, state.dropped, state.fault) == (500, 0, "")
     (part,) = read_recording(tmp_path / "slopes.blocks")
-    assert part.whole
+    assert part.complete
     np.testing.assert_array_equal(part.index, np.arange(10, 510))
     np.testing.assert_array_equal(part.exposed_ns, 10 * np.arange(10, 510))
     assert (np.diff(part.arrived_ns) > 0).all()
@@ -86,7 +86,7 @@ def test_entries_of_other_shapes_make_parts(tmp_path, writer):
 
 def test_what_was_overwritten_is_counted(tmp_path, writer):
     stop = threading.Event()
-    recorder = Recorder(tmp_path, {"slopes": writer.name})
+    recorder = StreamRecorder(tmp_path, {"slopes": writer.name})
     entries(writer, 0, 3 * SLOTS)
     stop.set()
     state = recorder.run(stop.is_set)
@@ -136,7 +136,7 @@ def test_a_full_disk_ends_the_recording_and_leaves_whole_blocks(tmp_path, writer
     assert state.written == sum(blocks[:2])
     (part,) = read_recording(tmp_path / "slopes.blocks")
     np.testing.assert_array_equal(part.index, np.arange(state.written))
-    assert not part.whole
+    assert not part.complete
 
 
 def test_room_is_left_to_others(tmp_path, writer):
@@ -162,10 +162,10 @@ def test_half_a_block_is_taken_back_when_the_disk_is_full(tmp_path):
             write_block(file, *block)
         with pytest.raises(OSError, match="No space left"):
             write_block(file, *[np.concatenate([part] * 3) for part in block])
-    whole = path.stat().st_size // size
-    assert path.stat().st_size == whole * size
+    complete = path.stat().st_size // size
+    assert path.stat().st_size == complete * size
     (part,) = read_recording(path)
-    assert (len(part.data), part.whole) == (10 * whole, True)
+    assert (len(part.data), part.complete) == (10 * complete, True)
 
 
 def test_damage_is_told(tmp_path, writer):
@@ -176,7 +176,7 @@ def test_damage_is_told(tmp_path, writer):
         read_recording(tmp_path / "cut.blocks")
     (tmp_path / "two.blocks").write_bytes(content + content[:-5])
     (part,) = read_recording(tmp_path / "two.blocks")
-    assert (len(part.data), part.whole) == (50, False)
+    assert (len(part.data), part.complete) == (50, False)
     np.save(tmp_path / "other.npy", np.zeros((4, 4)))
     (tmp_path / "foreign.blocks").write_bytes((tmp_path / "other.npy").read_bytes() * 2)
     with pytest.raises(ProductError, match="no recording"):
@@ -193,7 +193,7 @@ def _until(true, seconds=20.0):
 
 
 def test_a_process_records_beside_its_writer(tmp_path, writer):
-    recorder = RecordProcess(tmp_path, {"slopes": writer.name})
+    recorder = RecorderProcess(tmp_path, {"slopes": writer.name})
     path, sent = tmp_path / "slopes.blocks", 0
     try:
         _until(path.exists)
@@ -214,7 +214,7 @@ def test_a_process_records_beside_its_writer(tmp_path, writer):
 
 def test_a_process_ends_with_its_streams(tmp_path):
     writer = RingWriter(segment_name(SYSTEM, "modes"), 800)
-    recorder = RecordProcess(tmp_path, {"modes": writer.name})
+    recorder = RecorderProcess(tmp_path, {"modes": writer.name})
     try:
         _until((tmp_path / "modes.blocks").exists)
         writer.close()
@@ -225,7 +225,7 @@ def test_a_process_ends_with_its_streams(tmp_path):
 
 
 def test_a_process_that_cannot_begin_says_so(tmp_path, capfd):
-    recorder = RecordProcess(tmp_path, {"slopes": segment_name(SYSTEM, "absent")})
+    recorder = RecorderProcess(tmp_path, {"slopes": segment_name(SYSTEM, "absent")})
     _until(lambda: not recorder.running)
     assert "the recorder ended with code" in recorder.stop().fault
     assert "no such stream" in capfd.readouterr().err
@@ -274,9 +274,9 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
     found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     name = found.stdout.strip()
-    assert segments.examine(name) is not None
+    assert segments.read_identity(name) is not None
     with pytest.raises(SystemExit):
         main(["streams", "--json", "--reap"])
     assert name in document(capsys)["removed"]
-    assert segments.examine(name) is None
-    assert segments.examine(writer.name) is not None
+    assert segments.read_identity(name) is None
+    assert segments.read_identity(writer.name) is not None

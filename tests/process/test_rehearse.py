@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from running import ESCAPE
 
-from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build
+from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build_library
 
 #: On the increments of the real camera.
 REGION = "devices.wfs.region=[216,152,208,208]"
@@ -23,7 +23,7 @@ def _compiled() -> None:
     """Skip where there is no compiler, and say so."""
     try:
         for name in LIBRARIES:
-            build(name)
+            build_library(name)
     except StandInUnavailable as reason:
         pytest.skip(str(reason))
 

@@ -79,7 +79,7 @@ def test_no_frame_is_torn_at_full_speed(slots: int) -> None:
         # Both took part: this proves nothing otherwise.
         assert read > 20
         assert reader.written >= read
-    assert [one.pid for one in segments.reap(writer.pid)] == [writer.pid]
+    assert [one.pid for one in segments.remove_orphaned(writer.pid)] == [writer.pid]
 
 
 def test_a_recorder_in_another_process_gets_frames_whole_and_counts_the_rest() -> None:
@@ -95,7 +95,7 @@ def test_a_recorder_in_another_process_gets_frames_whole_and_counts_the_rest() -
                 last = sample.index
         assert got > 20
         assert reader.position == first + got + reader.missed
-    segments.reap(writer.pid)
+    segments.remove_orphaned(writer.pid)
 
 
 @pytest.mark.parametrize("end", ["exit", "kill"])
@@ -109,7 +109,7 @@ def test_the_end_of_a_reader_disturbs_nobody(end: str) -> None:
                 reader.send_signal(signal.SIGKILL)
             reader.wait(30)
         assert [one.name for one in segments.segments(SYSTEM, os.getpid())] == [writer.name]
-        assert segments.reap(os.getpid()) == ()
+        assert segments.remove_orphaned(os.getpid()) == ()
         writer.write(np.ones(4), 2)
         sample = other.latest()
         assert sample is not None
@@ -128,9 +128,9 @@ def test_the_segments_of_a_killed_owner_are_reaped_and_no_others() -> None:
         found = {one.name: one.alive for one in segments.segments(SYSTEM)}
         assert found[name] is False
         assert found[mine.name] is True
-        assert name in [one.name for one in segments.reap()]
-        assert segments.examine(name) is None
-        assert segments.examine(mine.name) is not None
+        assert name in [one.name for one in segments.remove_orphaned()]
+        assert segments.read_identity(name) is None
+        assert segments.read_identity(mine.name) is not None
 
 
 def test_a_process_number_that_came_round_again_is_not_taken_for_the_owner() -> None:
@@ -141,7 +141,7 @@ def test_a_process_number_that_came_round_again_is_not_taken_for_the_owner() -> 
         content = bytearray((segments.SHARED / name).read_bytes())
     segments.IDENTITY.pack_into(content, 0, segments.MAGIC, segments.SCHEMA, os.getpid(), began - 1)
     (segments.SHARED / name).write_bytes(content)
-    found = segments.examine(name)
+    found = segments.read_identity(name)
     assert found is not None
     assert not found.alive
     # The name is free for its new bearer.

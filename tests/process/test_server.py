@@ -16,8 +16,8 @@ from serving import SYSTEM, Served, serving, until_idle, wait_for
 
 from escape_hw.errors import Aborted, ConfigError, LeaseHeld, ProductError, RequestRefused
 from escape_hw.remote.client import Connection
-from escape_hw.remote.state import Finish, Health, Phase
-from escape_hw.runtime.procedures import METHODS
+from escape_hw.remote.state import DeviceHealth, Finish, Phase
+from escape_hw.runtime.procedures.calibration import METHODS
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_state_devices_geometry_and_frames(bench: Connection, matrix: str) -> No
     assert state.system == SYSTEM
     assert state.simulated
     assert [one.name for one in state.devices] == ["dm", "wfs", "science", "screen"]
-    assert {one.health for one in state.devices} == {Health.OK}
+    assert {one.health for one in state.devices} == {DeviceHealth.OK}
     first = bench.latest("frames")
     assert first is not None
     assert first.data.shape == (200, 200)

@@ -16,34 +16,34 @@ from serving import Served, Spy, serving, until_idle, wait_for
 from small_system import configuration
 
 from escape_hw.errors import CalibrationError, RequestRefused, ServerGone
-from escape_hw.io.fits import load_matrix
-from escape_hw.remote.address import Listing, list_server, local_endpoint, unlist_server
+from escape_hw.io.fits.matrix import load_matrix
+from escape_hw.remote.address import ServerListing, local_endpoint, register_server, unregister_server
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Phase
 from escape_hw.streams.segments import process_start, segments
-from escape_sim.devices import shared_bench
-from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build
-from escape_sim.stand_ins.bench_server import BenchServer
+from escape_sim.devices.twins import shared_bench
+from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build_library
+from escape_sim.stand_ins.bench_server import StandInBench
 
 #: On the increments of the real camera, and with a state kept often.
 OPTIONS = ("devices.wfs.region=[216,152,208,208]", "calibration.checkpoint_s=0.3")
 
 
 @pytest.fixture
-def bench() -> Iterator[tuple[BenchServer, Spy]]:
+def bench() -> Iterator[tuple[StandInBench, Spy]]:
     """The simulated bench, in this process, that the server's real drivers reach."""
     try:
         for name in LIBRARIES:
-            build(name)
+            build_library(name)
     except StandInUnavailable as reason:
         pytest.skip(str(reason))
-    server = BenchServer(configuration(*OPTIONS))
+    server = StandInBench(configuration(*OPTIONS))
     spy = Spy(shared_bench(server.config, server.shared))
     with server:
         yield server, spy
 
 
-def on_metal(system: Path, server: BenchServer, folder: Path) -> AbstractContextManager[Served]:
+def on_metal(system: Path, server: StandInBench, folder: Path) -> AbstractContextManager[Served]:
     options = [word for option in OPTIONS for word in ("--set", option)]
     return serving(system, "--mode", "hardware", *options, folder=folder, more=server.environment)
 
@@ -86,7 +86,7 @@ def guarded(client: Connection) -> bool:
 
 def guardian_of(served: Served) -> int:
     """Process of the guardian; 0: there is none."""
-    words = ("-f", "escape_hw.server.guardian", "-P", str(served.pid))
+    words = ("-f", "escape_hw.server.safety.failsafe", "-P", str(served.pid))
     found = subprocess.run(("pgrep", *words), capture_output=True, text=True, check=False).stdout.split()
     return int(found[0]) if found else 0
 
@@ -108,7 +108,7 @@ def test_a_guardian_that_was_killed_is_replaced_and_does_its_work(system, bench,
 
 
 def load_state_frames(path: Path) -> int:
-    from escape_hw.io.state_file import load_state
+    from escape_hw.io.fits.run_state import load_state
 
     return int(load_state(path).values["fed"])
 
@@ -123,14 +123,14 @@ def test_the_command_line_is_told_that_a_server_holds_the_hardware(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     name, pid = server.config.system.name, os.getpid()
     sockets = local_endpoint(name, pid)
-    listing = Listing(name, pid, process_start(pid), sockets.requests, sockets.events)
-    list_server(listing)
+    listing = ServerListing(name, pid, process_start(pid), sockets.requests, sockets.events)
+    register_server(listing)
     words = ["calibrate", str(system), "--mode", "hardware", "--out", str(tmp_path / "run"), "--json"]
     with pytest.raises(SystemExit) as ended:
         main(words)
     assert ended.value.code == 2
     assert f"is served by process {pid}, which holds its devices" in capsys.readouterr().out
-    unlist_server(listing)
+    unregister_server(listing)
 
 
 def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, tmp_path) -> None:

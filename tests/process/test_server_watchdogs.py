@@ -15,9 +15,9 @@ from small_system import configuration
 from escape_hw.errors import RequestRefused
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Finish, Phase
-from escape_sim.devices import shared_bench
-from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, bench_server, build
-from escape_sim.stand_ins.bench_server import BenchServer
+from escape_sim.devices.twins import shared_bench
+from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, bench_server, build_library
+from escape_sim.stand_ins.bench_server import StandInBench
 
 #: On the increments of the real camera.
 REGION = "devices.wfs.region=[216,152,208,208]"
@@ -30,14 +30,14 @@ LIMITS = {
 
 
 @pytest.fixture(scope="module")
-def mirror() -> Iterator[tuple[BenchServer, Spy]]:
+def mirror() -> Iterator[tuple[StandInBench, Spy]]:
     """The simulated bench, in this process, and what its mirror really does."""
     try:
         for name in LIBRARIES:
-            build(name)
+            build_library(name)
     except StandInUnavailable as reason:
         pytest.skip(str(reason))
-    server = BenchServer(configuration(REGION))
+    server = StandInBench(configuration(REGION))
     spy = Spy(shared_bench(server.config, server.shared))
     with server:
         yield server, spy
@@ -45,7 +45,7 @@ def mirror() -> Iterator[tuple[BenchServer, Spy]]:
 
 @pytest.fixture(scope="module")
 def held(
-    system: Path, mirror: tuple[BenchServer, Spy], tmp_path_factory: pytest.TempPathFactory
+    system: Path, mirror: tuple[StandInBench, Spy], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Connection, Connection, str]]:
     """Who may write, who looks on, and the name of a matrix."""
     words = ["--set", REGION]
@@ -112,12 +112,12 @@ def test_a_matrix_of_stand_ins_serves_every_procedure_there(held) -> None:
 def late(camera: object, wait_s: float) -> tuple[int, bytes]:
     """A camera whose frames do not come."""
     time.sleep(min(0.05, wait_s))
-    return bench_server._LATE, b""
+    return bench_server._TIMEOUT, b""
 
 
 def test_no_frames(closed, mirror, monkeypatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(bench_server._CameraEnd, "_frame", late)
+        patch.setattr(bench_server._CameraEndpoint, "_frame", late)
         wait_for(lambda: closed.state.fault is not None, "the fault")
     made_safe(closed, mirror[1], "in closed loop (limit 2.5 s)")
 
@@ -131,7 +131,7 @@ def shaken(camera: Any, wait_s: float) -> tuple[int, bytes]:
     """A camera that shakes by two pixels from frame to frame, too fast for any loop."""
     frame = camera._camera.next_frame(max(wait_s, 1e-3))
     image = np.roll(frame.data, 2 if frame.index % 2 else -2, axis=1)
-    return bench_server._GOOD, bench_server._FRAME_HEAD.pack(frame.index, frame.exposed_ns) + image.tobytes()
+    return bench_server._OK, bench_server._FRAME_HEAD.pack(frame.index, frame.exposed_ns) + image.tobytes()
 
 
 def test_a_diverging_residual(closed, mirror, monkeypatch) -> None:
@@ -139,7 +139,7 @@ def test_a_diverging_residual(closed, mirror, monkeypatch) -> None:
     seen = {closed.state.serial}
     wait_for(lambda: len(seen) > 40 or seen.add(closed.state.serial), "states")
     with monkeypatch.context() as patch:
-        patch.setattr(bench_server._CameraEnd, "_frame", shaken)
+        patch.setattr(bench_server._CameraEndpoint, "_frame", shaken)
         wait_for(lambda: closed.state.fault is not None, "the fault")
     made_safe(closed, mirror[1], "the residual grew")
 

@@ -230,12 +230,12 @@ def escape_keys(home: Path, *words: str) -> dict:
 def test_with_keys_from_another_machine_and_nothing_without(
     system: Path, homes: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    servers, clients = homes
+    running_servers, clients = homes
     port = PORT + 10
     address = f"tcp://127.0.0.2:{port}"
     server, client = (escape_keys(home, "make")["public"].encode() for home in homes)
-    escape_keys(servers, "allow", "client", client.decode())
-    more = {"XDG_CONFIG_HOME": str(servers)}
+    escape_keys(running_servers, "allow", "client", client.decode())
+    more = {"XDG_CONFIG_HOME": str(running_servers)}
     with (
         serving(system, "--port", port, "--bind", "0.0.0.0", folder=tmp_path / "s", more=more) as served,
         served.connect() as local,
@@ -257,11 +257,11 @@ def test_with_keys_from_another_machine_and_nothing_without(
         ):
             assert heard(address, public, hidden, other) == 0
         # Whom the operator lets in is in at once, and out again.
-        escape_keys(servers, "allow", "stranger", stranger[0].decode())
+        escape_keys(running_servers, "allow", "stranger", stranger[0].decode())
         wait_for(lambda: heard(address, *stranger, server) > 0, "the stranger is let in")
-        escape_keys(servers, "forget", "stranger")
+        escape_keys(running_servers, "forget", "stranger")
         assert heard(address, *stranger, server) == 0
-        escape_keys(servers, "forget", "client")
+        escape_keys(running_servers, "forget", "client")
         with pytest.raises(ServerGone, match=r"Does it let this key in \(there: escape keys allow NAME"):
             connect(address)
         assert local.state.fault is None

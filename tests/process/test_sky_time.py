@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from escape_hw.api.procedure import run
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import Aborted, CalibrationError
-from escape_hw.runtime import sky_time as campaign
-from escape_hw.runtime.sky_time import PlantErrors, sky_time, twins_of
+from escape_hw.paper import sky_time as campaign
+from escape_hw.paper.sky_time import RealisationErrors, simulated_config, sky_time
 
 FRAMES = (300,)
 
 
-def plant(system: str, number: int, frames: Any, overrides: Any) -> PlantErrors:
+def plant(system: str, number: int, frames: Any, overrides: Any) -> RealisationErrors:
     """A plant that is done at once, or, told so, takes its process with it."""
     place, lasting = Path(overrides[0]), int(overrides[1])
     if number >= lasting:
@@ -33,16 +33,16 @@ def plant(system: str, number: int, frames: Any, overrides: Any) -> PlantErrors:
         time.sleep(0.1)
     (place / str(number)).touch()
     small = np.full((len(campaign.ESTIMATORS), len(frames), 5), 0.001)
-    return PlantErrors(small, small, small[0], small[0])
+    return RealisationErrors(small, small, small[0], small[0])
 
 
-def fails(*_: Any) -> PlantErrors:
+def fails(*_: Any) -> RealisationErrors:
     raise CalibrationError("no spots on the wavefront sensor")
 
 
 @pytest.fixture(autouse=True)
 def _stand_in(monkeypatch):
-    monkeypatch.setattr(campaign, "run_plant", plant)
+    monkeypatch.setattr(campaign, "run_realisation", plant)
 
 
 def test_a_killed_process_ends_the_campaign_and_finished_plants_are_kept(tmp_path):
@@ -79,15 +79,15 @@ def test_stopped_it_keeps_the_finished_plants(tmp_path):
 
 
 def test_an_error_in_a_plant_is_told(monkeypatch, tmp_path):
-    monkeypatch.setattr(campaign, "run_plant", fails)
+    monkeypatch.setattr(campaign, "run_realisation", fails)
     with pytest.raises(CalibrationError, match="no spots"):
         run(sky_time("razor-shwfs", plants=2, frames=FRAMES, overrides=[str(tmp_path), "1"]))
 
 
 def test_only_twins_are_used_whatever_the_file_says():
     config = load_system("razor-shwfs", mode="hardware", overrides=["devices.dm.mode=hardware"])
-    twins = twins_of(config, ["loop.gain=0.3"], seed=5)
+    twins = simulated_config(config, ["loop.gain=0.3"], seed=5)
     assert twins.system.mode == "sim"
     assert twins.devices.dm.mode == "sim"
     assert (twins.loop.gain, twins.system.seed) == (0.3, 5)
-    assert twins_of("razor-shwfs").devices.dm.mode is None
+    assert simulated_config("razor-shwfs").devices.dm.mode is None

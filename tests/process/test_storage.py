@@ -11,7 +11,7 @@ import sys
 import pytest
 from running import ESCAPE
 
-from escape_hw.io.fits import load_matrix
+from escape_hw.io.fits.matrix import load_matrix
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits and devices of Linux")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from escape_hw.config.load import load_text
+from escape_hw.config.loader import load_text
 from escape_hw.errors import ConfigError
 
 

@@ -9,22 +9,22 @@ import fake_results as fake
 import pytest
 
 from escape_hw.cli import main
-from escape_hw.io.fits import save_matrix
-from escape_hw.report.build import write_report
+from escape_hw.io.fits.matrix import save_matrix
+from escape_hw.report.run_report import write_report
 
 
 @pytest.fixture
 def bench(monkeypatch, tmp_path):
     """Fake devices and procedures, and no time spent on figures."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.setattr("escape_hw.runtime.keep.write_report", lambda folder: folder)
+    monkeypatch.setattr("escape_hw.runtime.procedures.products.write_report", lambda folder: folder)
     return fake_bench.install(monkeypatch)
 
 
 @pytest.fixture
 def reports(bench, monkeypatch):
     """The real report after all."""
-    monkeypatch.setattr("escape_hw.runtime.keep.write_report", write_report)
+    monkeypatch.setattr("escape_hw.runtime.procedures.products.write_report", write_report)
 
 
 @pytest.fixture

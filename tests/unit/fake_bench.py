@@ -13,7 +13,7 @@ import fake_results as fake
 import pytest
 
 from escape_hw.api.procedure import Progress
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import Aborted
 
 
@@ -81,12 +81,12 @@ class FakeProcedures:
     def escape(self, bench: FakeBench, **options: Any):
         return self._calibrate(bench, "escape", **options)
 
-    def sprint_steps(self, matrix: Any, model: Any, **options: Any):
+    def estimate_registration(self, matrix: Any, model: Any, **options: Any):
         self.calls.append(("sprint", {"method": matrix.method, **options}))
         yield from steps("SPRINT")
         return fake.registration()
 
-    def closed_loop(self, bench: FakeBench, matrix: Any, grid: Any, **options: Any):
+    def close_loop(self, bench: FakeBench, matrix: Any, grid: Any, **options: Any):
         self.calls.append(("closed_loop", {"method": matrix.method, **options}))
         bench.screen_seen["loop"] = bench.screen.state.inserted
         try:
@@ -106,7 +106,7 @@ class FakeProcedures:
         self.calls.append(("simulated", {}))
         return fake.calibration("simulated")
 
-    def synthetic_of(self, measured: Any, model: Any, estimate: Any):
+    def synthesise_from_measurement(self, measured: Any, model: Any, estimate: Any):
         matrix = replace(measured.matrix, method="escape")
         return replace(measured, matrix=matrix, registration=estimate)
 
@@ -136,14 +136,14 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         for name in names:
             setattr(stand_in, name, getattr(made, name))
         if module == "docrime":
-            stand_in.require_frames = lambda *_: None
-            stand_in.least_frames = lambda settings, n_modes: 2 * n_modes
+            stand_in.require_enough_frames = lambda *_: None
+            stand_in.minimum_frames = lambda settings, n_modes: 2 * n_modes
         monkeypatch.setitem(sys.modules, stand_in.__name__, stand_in)
 
     def open_system(system: str, *, set: Any = (), seed: Any = None, mode: Any = None) -> FakeBench:
         made.benches.append(FakeBench(load_system(system, overrides=set, seed=seed, mode=mode)))
         return made.benches[-1]
 
-    monkeypatch.setattr("escape_hw.runtime.system.open_system", open_system)
+    monkeypatch.setattr("escape_hw.runtime.session.system.open_system", open_system)
     monkeypatch.setattr("escape_hw.config.registry.model_factory", lambda name: lambda config, grid: None)
     return made

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.api.adaptive_secondary import LADDER, AdaptiveSecondary, ShellState
-from escape_hw.config.load import load_system
+from escape_hw.api.adaptive_secondary import STATE_ORDER, AdaptiveSecondary, ShellState
+from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceError, NotOpen
-from escape_sim.shell import GAP_M
-from escape_sim.sim_secondary import SimAdaptiveSecondary, make_secondary
+from escape_sim.devices.twins import SimAdaptiveSecondary, make_secondary
+from escape_sim.mirror.shell import FLOATING_GAP_M
 
 QUICK = [
     "devices.dm.layout=rings-336",
@@ -49,13 +49,13 @@ def test_without_lift_it_stays_where_it_is_and_refuses_commands() -> None:
         assert mirror.sent_count == 0
 
 
-@pytest.mark.parametrize("state", LADDER)
+@pytest.mark.parametrize("state", STATE_ORDER)
 def test_it_goes_to_every_state_and_back(state: ShellState) -> None:
     with twin() as mirror:
-        mirror.go(state)
+        mirror.go_to(state)
         assert mirror.state is mirror.health.state is state
-        mirror.go(ShellState.RUNNING)
-        assert mirror.send(np.full(336, 0.05)).guard.untouched
+        mirror.go_to(ShellState.RUNNING)
+        assert mirror.send(np.full(336, 0.05)).guard.is_unchanged
 
 
 def test_positions_follow_commands() -> None:
@@ -84,23 +84,23 @@ def test_measuring_does_not_make_time_pass() -> None:
 
 def test_health_shows_the_gap() -> None:
     with twin() as mirror:
-        assert mirror.health.gap_m == pytest.approx(GAP_M, rel=0.01)
+        assert mirror.health.gap_m == pytest.approx(FLOATING_GAP_M, rel=0.01)
         mirror.send(np.full(336, 0.3))
         wait(mirror)
         lifted = mirror.health
-        assert lifted.gap_m == pytest.approx(GAP_M + 0.3 * mirror.info.stroke_m, rel=0.01)
+        assert lifted.gap_m == pytest.approx(FLOATING_GAP_M + 0.3 * mirror.info.stroke_m, rel=0.01)
         assert lifted.current_a > 0.1
-        mirror.go(ShellState.RESTED)
-        assert mirror.health.gap_m < 0.1 * GAP_M
+        mirror.go_to(ShellState.RESTED)
+        assert mirror.health.gap_m < 0.1 * FLOATING_GAP_M
         assert mirror.health.current_a == 0
 
 
 def test_resting_flattens_first_and_the_guard_starts_from_flat() -> None:
     with twin("devices.dm.limits.max_slew=0.2") as mirror:
         mirror.send(np.full(336, 0.2))
-        mirror.go(ShellState.RESTED)
+        mirror.go_to(ShellState.RESTED)
         assert not mirror.shape.any()
-        mirror.go(ShellState.RUNNING)
+        mirror.go_to(ShellState.RUNNING)
         assert mirror.send(np.full(336, 0.4)).sent == pytest.approx(0.2)
 
 
@@ -112,7 +112,7 @@ def test_a_fault_is_latched() -> None:
     wait(mirror)
     assert mirror.measured_positions() == pytest.approx(0, abs=0.02)
     assert mirror.health.fault == "coil 17 over current"
-    for attempt in (lambda: mirror.send(np.zeros(336)), lambda: mirror.go(ShellState.RUNNING)):
+    for attempt in (lambda: mirror.send(np.zeros(336)), lambda: mirror.go_to(ShellState.RUNNING)):
         with pytest.raises(DeviceError, match=r"asm: fault latched: coil 17 over current; .* recover\(\)"):
             attempt()
     mirror.flatten()
@@ -124,14 +124,14 @@ def test_a_fault_is_latched() -> None:
 
 def test_recovery_leads_to_rest_and_nothing_rises_by_itself() -> None:
     with twin("devices.dm.options.lift=false") as mirror:
-        mirror.go(ShellState.RUNNING)
+        mirror.go_to(ShellState.RUNNING)
         mirror.trip("dust")
         mirror.recover()
         assert mirror.state is ShellState.RESTED
         assert mirror.health.fault == ""
         mirror.recover()
-        mirror.go(ShellState.RUNNING)
-        assert mirror.send(np.full(336, 0.1)).guard.untouched
+        mirror.go_to(ShellState.RUNNING)
+        assert mirror.send(np.full(336, 0.1)).guard.is_unchanged
 
 
 def test_a_fault_that_persists_is_reported() -> None:
@@ -158,12 +158,12 @@ def test_a_step_that_fails_is_reported() -> None:
 
 def test_nobody_goes_to_a_fault() -> None:
     with twin() as mirror, pytest.raises(ValueError, match="choose off"):
-        mirror.go(ShellState.FAULT)
+        mirror.go_to(ShellState.FAULT)
 
 
 def test_positions_of_the_wrong_number_are_refused() -> None:
     class Short(SimAdaptiveSecondary):
-        def _measure(self) -> np.ndarray:
+        def _measure_positions(self) -> np.ndarray:
             return np.zeros(3)
 
     with Short("asm", twin()._bench) as mirror, pytest.raises(DeviceError, match=r"shape \(3,\) for 336"):
@@ -177,7 +177,7 @@ def test_everything_needs_an_open_mirror() -> None:
         lambda: mirror.health,
         mirror.measured_positions,
         mirror.recover,
-        lambda: mirror.go(ShellState.SET),
+        lambda: mirror.go_to(ShellState.SET),
     ):
         with pytest.raises(NotOpen):
             use()

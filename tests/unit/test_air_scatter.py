@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from escape_sim import air_scatter as module
-from escape_sim.air_scatter import air_scatter
+from escape_sim.models import pyramid_turbulence as module
+from escape_sim.models.pyramid_turbulence import turbulence_registration_scatter
 
 STATES, SHAPES, N_SLOPES = 400, 10, 30
 
@@ -35,9 +35,9 @@ def test_only_what_shapes_of_one_state_have_in_common_is_the_airs(monkeypatch, b
 
     monkeypatch.setattr(module, "slopes_of_image", slopes)
     optics = SimpleNamespace(wavelength_m=2 * np.pi, frame=lambda phase: phase.astype(float))
-    found = air_scatter(optics, None, phases, commands, influence, jacobian)
+    found = turbulence_registration_scatter(optics, None, phases, commands, influence, jacobian)
     # Ten shapes average what the pokes do to a tenth in variance, and no further.
-    least = np.sqrt(module._LEAST * (by_air**2 + by_pokes**2 / SHAPES))
+    least = np.sqrt(module._MIN_SHARE * (by_air**2 + by_pokes**2 / SHAPES))
     assert found == pytest.approx(np.full(5, max(by_air, least)), rel=0.2)
     naive = np.sqrt(by_air**2 + by_pokes**2 / SHAPES)
     if by_pokes:

@@ -7,8 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from escape_hw.calibration import background
-from escape_hw.calibration.background import BackgroundEstimator
+from escape_hw.calibration.docrime import estimator_thread as background
+from escape_hw.calibration.docrime.estimator_thread import EstimatorThread
 
 N_SLOPES, N_MODES = 3, 2
 
@@ -22,12 +22,12 @@ class Recorder:
         self.index, self.rows, self.go, self.error = [], [], threading.Event(), None
         self.go.set()
 
-    def extend(self, index, slopes, driven):
+    def extend(self, index, slopes, excitation):
         self.go.wait(10)
         if self.error is not None:
             raise self.error
         self.index += index.tolist()
-        self.rows += np.concatenate([slopes, driven], axis=1).tolist()
+        self.rows += np.concatenate([slopes, excitation], axis=1).tolist()
 
 
 def feed(beside, frames, first=0):
@@ -39,15 +39,15 @@ def feed(beside, frames, first=0):
 def test_every_frame_arrives_once_and_in_order(frames):
     looked = []
     recorder = Recorder()
-    with BackgroundEstimator(recorder, patient=True, look=lambda e: looked.append(len(e.index))) as beside:
+    with EstimatorThread(recorder, blocking=True, on_block=lambda e: looked.append(len(e.index))) as beside:
         feed(beside, frames)
         assert beside.finish() is recorder
     assert recorder.index == list(range(frames))
     assert recorder.rows == [[k] * 3 + [k + 0.25] * 2 + [k + 0.5] * 2 for k in range(frames)]
     if frames > 1:
-        motion = beside.motion.state()
-        assert motion[0] == pytest.approx(np.sum(np.arange(frames)))
-        assert motion[1] == pytest.approx(np.sum(np.square(np.arange(frames))), rel=1e-5)
+        slope_statistics = beside.slope_statistics.state()
+        assert slope_statistics[0] == pytest.approx(np.sum(np.arange(frames)))
+        assert slope_statistics[1] == pytest.approx(np.sum(np.square(np.arange(frames))), rel=1e-5)
     assert len(looked) == -(-frames // background.BLOCK)
     assert beside.skipped == 0
 
@@ -55,7 +55,7 @@ def test_every_frame_arrives_once_and_in_order(frames):
 def test_a_patient_loop_waits_and_another_skips_whole_blocks():
     recorder = Recorder()
     recorder.go.clear()
-    with BackgroundEstimator(recorder, patient=False) as beside:
+    with EstimatorThread(recorder, blocking=False) as beside:
         feed(beside, 40 * background.BLOCK)
         recorder.go.set()
         beside.finish()
@@ -65,10 +65,10 @@ def test_a_patient_loop_waits_and_another_skips_whole_blocks():
     assert recorder.index == sorted(recorder.index)
     slow = Recorder()
     slow.go.clear()
-    with BackgroundEstimator(slow, patient=True) as beside:
+    with EstimatorThread(slow, blocking=True) as beside:
         threading.Timer(0.05, slow.go.set).start()
         feed(beside, 40 * background.BLOCK)
-        beside.catch_up()
+        beside.wait_until_summed()
         assert len(slow.index) == 40 * background.BLOCK
     assert beside.skipped == 0
 
@@ -76,12 +76,12 @@ def test_a_patient_loop_waits_and_another_skips_whole_blocks():
 def test_an_error_of_the_estimator_reaches_the_loop():
     recorder = Recorder()
     recorder.error = ValueError("not finite")
-    with BackgroundEstimator(recorder, patient=True) as beside:
+    with EstimatorThread(recorder, blocking=True) as beside:
         feed(beside, 2 * background.BLOCK - 1)
-        beside.catch_up()
+        beside.wait_until_summed()
         with pytest.raises(ValueError, match="not finite"):
             feed(beside, 1, 2 * background.BLOCK - 1)
-    with BackgroundEstimator(recorder, patient=True) as beside:
+    with EstimatorThread(recorder, blocking=True) as beside:
         feed(beside, 5)
         with pytest.raises(ValueError, match="not finite"):
             beside.finish()

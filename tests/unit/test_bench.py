@@ -10,14 +10,13 @@ import pytest
 
 import escape_hw
 import escape_hw.bench
-from escape_hw.api.camera import Camera
-from escape_hw.api.frames import CameraInfo, CameraSettings, Frame
+from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
 from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.api.phase_screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.api.procedure import Procedure, Progress
-from escape_hw.api.screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.bench import Bench, build_bench
-from escape_hw.config.load import load_system
-from escape_hw.config.models import SystemConfig
+from escape_hw.config.loader import load_system
+from escape_hw.config.system import SystemConfig
 from escape_hw.errors import Aborted, ConfigError, DeviceError, DeviceLost
 
 

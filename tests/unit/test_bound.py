@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.bound import correlated_information, registration_bound
-from escape_hw.calibration.misfit import Priors, normal_equations
-from escape_hw.calibration.noise_patterns import NoisePatterns
-from escape_hw.config.load import load_system
-from escape_sim.model import make_model, nominal_grid
+from escape_hw.calibration.sprint.covariance import LowRankNoise
+from escape_hw.calibration.sprint.cramer_rao_bound import compute_registration_bound, correlated_information
+from escape_hw.calibration.sprint.normal_equations import Priors, normal_equations
+from escape_hw.config.loader import load_system
+from escape_sim.models.shack_hartmann import make_model, nominal_grid
 
 N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES, N_TRENDS = 7, 10, 5, 4, 3, 2
 
@@ -79,7 +79,7 @@ def test_the_inverse_from_few_rows_is_that_of_the_truth(n_rows):
     spread = np.sqrt(np.diag(truth))
     sample = rng.multivariate_normal(np.zeros(p), truth, n_rows)
     # In units of the noise, as the mirror is handed on.
-    found = NoisePatterns.of(sample.T @ sample / n_rows, mirror / spread[:, None]).inverse()
+    found = LowRankNoise.of(sample.T @ sample / n_rows, mirror / spread[:, None]).inverse()
     trial = rng.standard_normal((p, 40))
     correlation = truth / np.outer(spread, spread)
     want = np.einsum("pk,pk->k", trial, np.linalg.solve(correlation, trial))
@@ -93,7 +93,7 @@ def test_the_inverse_from_few_rows_is_that_of_the_truth(n_rows):
 def test_patterns_beyond_what_noise_has_are_not_seen_as_less_than_it():
     rng, p = np.random.default_rng(6), 60
     sample = rng.standard_normal((2000, p))
-    noise = NoisePatterns.of(sample.T @ sample / 2000, rng.standard_normal((p, 5)))
+    noise = LowRankNoise.of(sample.T @ sample / 2000, rng.standard_normal((p, 5)))
     np.testing.assert_allclose(noise.inverse(), np.eye(p), atol=0.12)
     assert (noise.variances >= noise.level).all()
 
@@ -110,13 +110,13 @@ def test_the_bound_of_uncorrelated_slopes_is_the_same_by_either_way():
     pokes = 0.01 * rng.standard_normal((6, 8))
     variance = rng.uniform(0.005, 0.01, grid.n_slopes)
     simple, full = (
-        registration_bound(matrix, pokes.T @ pokes, noise, model, Registration(), Priors())
+        compute_registration_bound(matrix, pokes.T @ pokes, noise, model, Registration(), Priors())
         for noise in (variance, np.diag(variance))
     )
     np.testing.assert_allclose(simple.exact, full.exact, rtol=1e-3)
     np.testing.assert_allclose(simple.hybrid, full.hybrid, rtol=1e-3)
     # What is not known costs something, and twice the frames halve the variance of what is.
     assert (simple.hybrid > simple.exact).all()
-    twice = registration_bound(matrix, 2 * pokes.T @ pokes, variance, model, Registration(), Priors())
+    twice = compute_registration_bound(matrix, 2 * pokes.T @ pokes, variance, model, Registration(), Priors())
     np.testing.assert_allclose(simple.exact / twice.exact, np.sqrt(2), rtol=1e-6)
     assert (simple.hybrid / twice.hybrid < np.sqrt(2)).all()

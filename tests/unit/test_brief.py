@@ -11,17 +11,17 @@ import pytest
 from made_up_sweep import SWEPT, made_up
 
 import escape_hw
-from escape_hw.api.brief import brief, said
-from escape_hw.api.frames import CameraSettings, Frame, Region
+from escape_hw.api.camera import CameraSettings, Frame, Region
+from escape_hw.api.representation import describe_value, short_repr
 from escape_hw.api.tracking import TrackResult
-from escape_hw.calibration.gain_bootstrap import GainsRun
-from escape_hw.calibration.sensor_setup import SensorSetup
-from escape_hw.io.fits import load_matrix, save_matrix
-from escape_hw.io.images import RecordedFrames
-from escape_hw.io.psf import load_loop, save_loop
-from escape_hw.io.telemetry import LoopTelemetry
-from escape_hw.runtime.reproduce import Comparison
-from escape_hw.runtime.sweep.result import conclude
+from escape_hw.calibration.acquisition.sensor_setup import SensorSetup
+from escape_hw.calibration.optical_gain.bootstrap import GainsRun
+from escape_hw.io.fits.frames import RecordedFrames
+from escape_hw.io.fits.loop import load_loop, save_loop
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
+from escape_hw.io.fits.telemetry import LoopTelemetry
+from escape_hw.paper.experiments import CalibrationComparison
+from escape_hw.runtime.sweep.result import analyse_sweep
 
 
 def track() -> TrackResult:
@@ -55,7 +55,7 @@ RESULTS = {
     "GainsResult": (fake.gains_result, 1, ("of escape: 2 rounds", "converged")),
     "GainsRun": (lambda: GainsRun(fake.gains_result(), fake.calibration()), 2, ("rescaled",)),
     "SweepResult": (
-        lambda: conclude(SWEPT, made_up(0.05), 0.01), 6, ("128 loops", "ESCAPE better", "at its best"),
+        lambda: analyse_sweep(SWEPT, made_up(0.05), 0.01), 6, ("128 loops", "ESCAPE better", "at its best"),
     ),
     "SensorSetup": (lambda: SensorSetup(fake.grid(), np.zeros((400, 400), np.float32)), 1, ("400",)),
     "SubApertureGrid": (fake.grid, 1, ("pitch_px=15.55", "bool[24, 24]")),
@@ -63,10 +63,10 @@ RESULTS = {
     "RecordedFrames": (frames, 1, ("uint16[3, 400, 400]", "'S1'")),
     "Frame": (lambda: Frame(np.zeros((400, 400), np.uint16), 7, 1, 2), 1, ("index=7",)),
     "Comparison": (
-        lambda: Comparison({f"matrix {n}": fake.calibration() for n in range(3)}), 1, ("dict of 3",),
+        lambda: CalibrationComparison({f"matrix {n}": fake.calibration() for n in range(3)}), 1, ("dict of 3",),
     ),
     "TemporalResponse": (lambda: fake.calibration().response, 1, ("float64[4]",)),
-    "MirrorDepartures": (lambda: fake.registration().departures, 1, ("float64[97]",)),
+    "MirrorDepartures": (lambda: fake.registration().actuator_corrections, 1, ("float64[97]",)),
 }  # fmt: skip
 
 
@@ -102,13 +102,13 @@ def test_no_public_class_prints_its_arrays(name: str) -> None:
 
 
 def test_values_in_a_few_words() -> None:
-    assert said(np.zeros((3, 4), np.float32)) == "float32[3, 4]"
-    assert said(1 / 3) == "0.333333"
-    assert said("x" * 500) == "500 characters"
-    assert said("short") == "'short'"
-    assert said([1, 2]) == "[1, 2]"
-    assert said(list(range(50))) == "list of 50"
-    assert said({"a": np.zeros(1000)}) == "dict of 1"
-    assert said(None) == "None"
-    assert said(Region(1, 2, 3, 4)) == "Region(x=1, y=2, width=3, height=4)"
-    assert brief(Region(1, 2, 3, 4)) == repr(Region(1, 2, 3, 4))
+    assert describe_value(np.zeros((3, 4), np.float32)) == "float32[3, 4]"
+    assert describe_value(1 / 3) == "0.333333"
+    assert describe_value("x" * 500) == "500 characters"
+    assert describe_value("short") == "'short'"
+    assert describe_value([1, 2]) == "[1, 2]"
+    assert describe_value(list(range(50))) == "list of 50"
+    assert describe_value({"a": np.zeros(1000)}) == "dict of 1"
+    assert describe_value(None) == "None"
+    assert describe_value(Region(1, 2, 3, 4)) == "Region(x=1, y=2, width=3, height=4)"
+    assert short_repr(Region(1, 2, 3, 4)) == repr(Region(1, 2, 3, 4))

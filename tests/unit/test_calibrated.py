@@ -11,19 +11,19 @@ import pytest
 from small_system import SMALL
 
 import escape_hw
-from escape_hw.calibration.gain_bootstrap import GainsRun
-from escape_hw.io.fits import load_matrix, save_matrix
-from escape_hw.runtime.calibrated import calibration_of, matrix_and_grid
+from escape_hw.calibration.optical_gain.bootstrap import GainsRun
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
+from escape_hw.runtime.session.system import as_calibration, as_matrix_and_grid
 
 
 def test_a_product_stands_for_its_calibration(tmp_path: Path) -> None:
     found = fake.calibration()
     product = load_matrix(save_matrix(tmp_path / "im.fits", found))
-    assert calibration_of(found) is found
-    assert calibration_of(product) is product.result
-    assert matrix_and_grid(product, None) == (product.matrix, product.grid)
-    assert matrix_and_grid(found, product.grid) == (found.matrix, product.grid)
-    assert matrix_and_grid(found.matrix, found.grid) == (found.matrix, found.grid)
+    assert as_calibration(found) is found
+    assert as_calibration(product) is product.result
+    assert as_matrix_and_grid(product, None) == (product.matrix, product.grid)
+    assert as_matrix_and_grid(found, product.grid) == (found.matrix, product.grid)
+    assert as_matrix_and_grid(found.matrix, found.grid) == (found.matrix, found.grid)
 
 
 @pytest.mark.parametrize(
@@ -39,12 +39,12 @@ def test_a_product_stands_for_its_calibration(tmp_path: Path) -> None:
 )
 def test_what_is_no_calibration_is_refused_with_the_way_out(given: object, words: str) -> None:
     with pytest.raises(TypeError, match=words):
-        calibration_of(given)
+        as_calibration(given)
 
 
 def test_a_matrix_needs_its_geometry() -> None:
     with pytest.raises(TypeError, match="give the grid as well"):
-        matrix_and_grid(fake.matrix(), None)
+        as_matrix_and_grid(fake.matrix(), None)
 
 
 def test_a_script_may_pass_what_it_loaded(tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_a_script_may_pass_what_it_loaded(tmp_path: Path) -> None:
         estimate = bench.find_registration(product)
         pull = estimate.registration.to_array() - product.registration.registration.to_array()
         assert np.all(np.abs(pull) < 6 * np.hypot(estimate.sigma, product.registration.sigma))
-        small = bench.calibrate("docrime", frames=400, poke=0.002, closing=product)
+        small = bench.calibrate("docrime", frames=400, poke=0.002, closed_loop=product)
         assert small.matrix.method.startswith("docrime-closed")
         with pytest.raises(TypeError, match=r"load_matrix\('im.fits'\)"):
             bench.track("im.fits", seconds=1)  # type: ignore[arg-type]

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from escape_hw.api.frames import CameraInfo, CameraSettings, Frame, FrameStatus, Region
+from escape_hw.api.camera import CameraInfo, CameraSettings, Frame, FrameStatus, Region
 from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
-from escape_hw.testing.reference import SyntheticCamera
+from escape_hw.testing.reference_devices import SyntheticCamera
 
 
 class Scripted(SyntheticCamera):

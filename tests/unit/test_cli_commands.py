@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import fake_results as fake
 
-from escape_hw.io.fits import load_matrix
-from escape_hw.io.psf import load_loop
+from escape_hw.io.fits.loop import load_loop
+from escape_hw.io.fits.matrix import load_matrix
 
 REGISTRATION = {"shift_x", "shift_y", "rotation", "radial_scaling", "tangential_scaling"}
 

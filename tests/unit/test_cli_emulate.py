@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from escape_hw.cli import emulate
+from escape_hw.cli.devices import emulate
 from escape_hw.config.registry import EMULATORS, available
 
 
@@ -34,18 +34,18 @@ def test_a_serial_line_is_offered(document):
 
 
 def test_complaints_are_told_and_cost_the_exit_code(document, monkeypatch):
-    told = emulate._tell_new
+    told = emulate._report_new_complaints
 
     def careless(one, name, emulator, number):
-        if emulator.controller.seen:
+        if emulator.controller.received_commands:
             return told(one, name, emulator, number)
         with socket.create_connection(("127.0.0.1", emulator.server.port), timeout=5) as wire:
             wire.sendall(b"MOV 1 5000\nERR?\n")
             assert wire.recv(64) == b"5\n"
         return told(one, name, emulator, number)
 
-    monkeypatch.setattr(emulate, "_tell_new", careless, raising=True)
-    monkeypatch.setattr(emulate, "_LOOK_S", 0.5)
+    monkeypatch.setattr(emulate, "_report_new_complaints", careless, raising=True)
+    monkeypatch.setattr(emulate, "_POLL_S", 0.5)
     code, found, err = document("emulate", "e727", "--port", 0, "--seconds", 0.05)
     assert code == 1
     assert found["complaints"][0] == "MOV 1 5000: error 5 (servo off or axis unreferenced)"

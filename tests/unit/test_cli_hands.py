@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from escape_hw.api.emulator import EmulatorRequest
-from escape_hw.io import fits_file
-from escape_sim.emulators.asm import AsmEmulator, make_emulator
+from escape_hw.io.fits import file as fits_file
+from escape_sim.emulators.asm.emulator import AsmEmulator, make_emulator
 
 LINKED = ("--set", "devices.dm.mode=hardware", "--set", "devices.dm.options.reply_s=10.0")
 
@@ -69,7 +69,7 @@ def test_a_poke_reaches_the_mirror_and_nothing_is_left(escape, asm):
     assert np.flatnonzero(poked[0]).tolist() == [40]
     assert poked[0][40] == pytest.approx(0.03 * 1e-5)
     assert not shapes[-1].any()
-    assert str(made.body.shell.state) == "rested"
+    assert str(made.controller.shell.state) == "rested"
     assert "flat" in out
 
 
@@ -77,7 +77,7 @@ def test_a_shell_that_floated_floats_on(escape, asm):
     made, options = asm
     assert escape("asm", "set", *options)[0] == 0
     assert escape("dm", "flat", *options)[0] == 0
-    assert str(made.body.shell.state) == "set"
+    assert str(made.controller.shell.state) == "set"
 
 
 # --------------------------------------------------------------------- adaptive secondary
@@ -89,12 +89,12 @@ def test_asm_verbs_lead_the_mirror_and_tell(document, asm):
     code, found, err = document("asm", "set", *options)
     assert (code, found["before"], found["after"], found["changed"]) == (0, "off", "set", True)
     assert "this changes hardware" in err
-    assert str(made.body.shell.state) == "set"
+    assert str(made.controller.shell.state) == "set"
     assert document("asm", "status", *options)[1]["gap_m"] == pytest.approx(50e-6, rel=0.01)
     assert document("asm", "set", *options)[1]["changed"] is False
     code, found, _ = document("asm", "rest", *options)
     assert (code, found["after"]) == (0, "rested")
-    assert str(made.body.shell.state) == "rested"
+    assert str(made.controller.shell.state) == "rested"
 
 
 def test_a_fault_is_cleared_only_by_who_says_that_it_was_seen_to(document, escape, asm, monkeypatch):
@@ -107,7 +107,7 @@ def test_a_fault_is_cleared_only_by_who_says_that_it_was_seen_to(document, escap
     code, _, err = escape("asm", "clear", *options)
     assert code == 2
     assert "say so with --yes" in err
-    assert str(made.body.shell.state) == "fault"
+    assert str(made.controller.shell.state) == "fault"
     code, found, _ = document("asm", "clear", *options, "--yes")
     assert (code, found["before"], found["after"]) == (0, "fault", "rested")
     assert found["fault"] == "panic, as arranged"
@@ -130,8 +130,8 @@ def other_owner(made: AsmEmulator):
     """Have another client control the mirror."""
     import socket
 
-    from escape_drivers.asm_codec import AsmCodec
-    from escape_drivers.asm_messages import Hello, Role
+    from escape_drivers.asm.codec import AsmCodec
+    from escape_drivers.asm.messages import Hello, Role
 
     client = socket.create_connection(("127.0.0.1", int(made.start().rpartition(":")[2])))
     client.sendall(AsmCodec().request(1, 1, Hello(Role.CONTROL, 0, "somebody else")))

@@ -10,8 +10,8 @@ from pathlib import Path
 import fake_bench
 import pytest
 
-from escape_hw.io.fits import load_matrix
-from escape_hw.io.psf import load_loop
+from escape_hw.io.fits.loop import load_loop
+from escape_hw.io.fits.matrix import load_matrix
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from escape_hw.api.emulator import EmulatorRequest
-from escape_sim.emulators.e727 import make_emulator
+from escape_sim.emulators.e727.emulator import make_emulator
 
 HARDWARE = ("--set", "devices.modulator.mode=hardware")
 
@@ -78,12 +78,12 @@ def test_what_it_cannot_do_is_refused_before_it_turns(document, stage):
     assert code == 3
     assert found["error"]["type"] == "SettingRejected"
     assert "it does 0 to 0.001 rad" in err
-    assert not [line for line in emulator.controller.seen if line.startswith("WGO ")]
+    assert not [line for line in emulator.controller.received_commands if line.startswith("WGO ")]
     assert emulator.controller.state.describe() == "at rest"
 
 
 def test_a_controller_in_use_is_told(document, stage):
-    from escape_drivers.pi_transports import TcpTransport
+    from escape_drivers.pi.transports import TcpTransport
 
     emulator, here = stage
     other = TcpTransport("127.0.0.1", emulator.server.port, 1.0, 1.0)

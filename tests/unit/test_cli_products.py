@@ -7,8 +7,8 @@ from pathlib import Path
 import fake_results as fake
 import pytest
 
-from escape_hw.io.fits import save_matrix
-from escape_hw.io.psf import save_loop
+from escape_hw.io.fits.loop import save_loop
+from escape_hw.io.fits.matrix import save_matrix
 
 
 def test_show_and_compare(escape, document, im, tmp_path):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import fake_results as fake
 import pytest
 
-from escape_hw.io.fits import save_matrix
+from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.io.provenance import Provenance
 
 

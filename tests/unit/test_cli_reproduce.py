@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from escape_hw.io.psf import load_loop
-from escape_hw.runtime.paper import CASES
+from escape_hw.io.fits.loop import load_loop
+from escape_hw.paper.cases import CASES
 
 
 @pytest.mark.usefixtures("reports")
@@ -104,7 +104,7 @@ def test_too_small_a_share_is_refused_before_anything_runs(document, bench, tmp_
     )
     kind, least, name, got, full = said[1], int(said[2]), said[3], int(said[4]), int(said[5])
     assert CASES[kind].frames[name] == full
-    assert got == CASES[kind].shortened(0.005)[name] < least
+    assert got == CASES[kind].scaled_frames(0.005)[name] < least
     assert bench.benches == []
     assert not (tmp_path / "all").exists()
     # What it says is enough is enough, and no more than that.

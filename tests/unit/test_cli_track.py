@@ -10,10 +10,10 @@ from rich.console import Console
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.tracking import TrackResult
-from escape_hw.cli.track import _show
-from escape_hw.config.load import load_system
-from escape_hw.io.track_document import track_document
-from escape_hw.runtime.track_task import UNKNOWN, planted
+from escape_hw.cli.calibration.track import _show
+from escape_hw.config.loader import load_system
+from escape_hw.io.documents import track_document
+from escape_hw.runtime.procedures.track import INJECTED_UNKNOWN, injected_registration
 
 PLANTED = {
     "shift_x": -16.0,
@@ -54,31 +54,33 @@ def test_the_registration_stands_beside_the_planted_one(planted: dict[str, float
 
 def test_a_truth_that_cannot_be_known_is_left_out_and_told() -> None:
     config = load_system("razor-shwfs", overrides=("twin.drift.rate.shift_x=2.0",))
-    assert planted(config) is not None
+    assert injected_registration(config) is not None
     behind = load_system("razor-shwfs", overrides=("twin.drift.rate.shift_x=2.0",), mode="hardware")
-    assert planted(behind) is None
-    text = shown(track(), None, UNKNOWN)
+    assert injected_registration(behind) is None
+    text = shown(track(), None, INJECTED_UNKNOWN)
     assert "planted" not in text
     assert "a clock of its own" in text
 
 
 def test_without_a_drift_the_truth_needs_no_clock() -> None:
-    known = planted(load_system("razor-shwfs", mode="hardware"))
+    known = injected_registration(load_system("razor-shwfs", mode="hardware"))
     assert known is not None
     assert known.at(1e6).to_dict() == pytest.approx(known.at(0.0).to_dict())
 
 
 def test_the_course_of_a_mirror_seen_askew_is_along_the_axes() -> None:
-    leaning = Registration(1.0, 2.0, 0.5, 2.5, -1.2).sheared(1.5)
+    leaning = Registration(1.0, 2.0, 0.5, 2.5, -1.2).with_shear(1.5)
     overrides = [f"twin.registration.{name}={value!r}" for name, value in leaning.to_dict().items()]
-    known = planted(load_system("razor-shwfs", overrides=(*overrides, "twin.drift.rate.shift_x=2.0")))
+    known = injected_registration(
+        load_system("razor-shwfs", overrides=(*overrides, "twin.drift.rate.shift_x=2.0"))
+    )
     assert known is not None
-    course = known.course(10.0, [0.0, 3.0])
-    assert course["shift_x"] == pytest.approx([21.0, 27.0])
-    assert course["radial_scaling"] == pytest.approx([2.5, 2.5])
-    assert course["tangential_scaling"] == pytest.approx([-1.2, -1.2])
-    assert known.at(13.0).along_axes[1] == pytest.approx(1.5)
-    assert known.course(10.0, [])["shift_x"] == []
+    trajectory = known.trajectory(10.0, [0.0, 3.0])
+    assert trajectory["shift_x"] == pytest.approx([21.0, 27.0])
+    assert trajectory["radial_scaling"] == pytest.approx([2.5, 2.5])
+    assert trajectory["tangential_scaling"] == pytest.approx([-1.2, -1.2])
+    assert known.at(13.0).axis_scalings_and_shear[1] == pytest.approx(1.5)
+    assert known.trajectory(10.0, [])["shift_x"] == []
 
 
 def test_a_track_without_a_row_shows_no_table() -> None:

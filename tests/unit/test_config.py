@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from escape_hw.config.bundled import bundled_systems, bundled_text
-from escape_hw.config.load import load_system, load_text
-from escape_hw.config.models import SystemConfig
-from escape_hw.config.outline import all_keys, fields_of, place_of, sections_of
-from escape_hw.config.starter import starter_text
+from escape_hw.config.key_tree import all_keys, fields_of, locate_key, sections_of
+from escape_hw.config.loader import load_system, load_text
+from escape_hw.config.system import SystemConfig
+from escape_hw.config.templates import starter_text
 from escape_hw.errors import ConfigError
 
 RAZOR = bundled_text("razor-shwfs")
@@ -374,11 +374,11 @@ def test_every_key_has_a_description() -> None:
 
     walk(SystemConfig)
     assert "twin.registration.shift_x" in all_keys()
-    assert all(place_of(tuple(key.split("."))).field is not None for key in all_keys())
+    assert all(locate_key(tuple(key.split("."))).field is not None for key in all_keys())
 
 
 def test_schema_carries_ranges_and_refuses_unknown_keys() -> None:
-    from escape_hw.config.schema import json_schema
+    from escape_hw.config.templates import json_schema
 
     schema = json_schema()
     loop = schema["$defs"]["LoopSection"]

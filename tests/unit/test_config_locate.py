@@ -1,6 +1,6 @@
 """Lines of keys, whatever way TOML allows to write them."""
 
-from escape_hw.config.locate import key_lines, line_of
+from escape_hw.config.toml_text import key_lines, line_of
 
 TEXT = '''# comment with [brackets] and = signs
 top = 1

@@ -6,14 +6,18 @@ import re
 
 import pytest
 
-from escape_drivers.pi_modulator import PiModulator
-from escape_drivers.pi_transports import SerialTransport, TcpTransport
-from escape_drivers.pi_usb import UsbTransport
-from escape_drivers.pi_wire import EmulatedTransport, make_transport
+from escape_drivers.pi.modulator import PiModulator
+from escape_drivers.pi.transports import (
+    EmulatedTransport,
+    SerialTransport,
+    TcpTransport,
+    UsbTransport,
+    make_transport,
+)
 from escape_hw.api.modulator import TipTiltModulator
-from escape_hw.api.screen import PhaseScreen
+from escape_hw.api.phase_screen import PhaseScreen
 from escape_hw.bench import build_device
-from escape_hw.config.load import load_system, load_text
+from escape_hw.config.loader import load_system, load_text
 from escape_hw.errors import ConfigError
 
 

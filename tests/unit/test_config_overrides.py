@@ -2,8 +2,7 @@
 
 import pytest
 
-from escape_hw.config.load import load_system
-from escape_hw.config.overrides import parse_override
+from escape_hw.config.loader import load_system, parse_override
 from escape_hw.errors import ConfigError
 
 

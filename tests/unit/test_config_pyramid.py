@@ -7,9 +7,9 @@ from config_text import complaint, line_with
 
 from escape_hw.api.registration import Registration
 from escape_hw.config.bundled import bundled_text
-from escape_hw.config.load import load_system, load_text
-from escape_hw.config.schema import json_schema
-from escape_hw.config.sensor_models import PyramidSection, ShackHartmannSection
+from escape_hw.config.loader import load_system, load_text
+from escape_hw.config.sensor import PyramidSection, ShackHartmannSection
+from escape_hw.config.templates import json_schema
 from escape_hw.errors import ConfigError
 
 PYWFS = bundled_text("razor-pywfs")

@@ -9,7 +9,7 @@ import pytest
 
 from escape_hw.bench import build_bench
 from escape_hw.config import registry
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 
 FACTORY_SOURCE = """
@@ -168,7 +168,7 @@ def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match="no device driver 'bench-mirror' is installed"):
         registry.device_factory("bench-mirror")
     for number in (1, 2):
-        factory = lambda name, config, shared, number=number: number  # noqa: E731
+        factory = lambda name, config, shared, number=number: number
         registry.register_device("bench-mirror", factory)
         assert registry.device_factory("bench-mirror") is factory
     assert "bench-mirror" in registry.available(registry.DEVICES)

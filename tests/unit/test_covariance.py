@@ -7,21 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from escape_hw.calibration.covariance import FLOOR, _gathered, _nearness, sandwich
-from escape_hw.calibration.weighted import WeightedMatrix
+from escape_hw.calibration.sprint.covariance import (
+    MODEL_ERROR_FLOOR,
+    _proximity,
+    _sum_by_proximity,
+    sandwich_covariance,
+)
+from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
 
 def test_sums_by_nearness_two_ways():
     rng = np.random.default_rng(2)
     valid = rng.random((7, 9)) > 0.3
     scores = rng.standard_normal((3, int(valid.sum())))
-    np.testing.assert_allclose(_gathered(valid, scores), scores @ _nearness(valid), atol=1e-12)
+    np.testing.assert_allclose(_sum_by_proximity(valid, scores), scores @ _proximity(valid), atol=1e-12)
 
 
 def test_nearness_falls_to_nothing_at_half_the_pupil():
-    near = _nearness(np.ones((1, 11), bool))
+    near = _proximity(np.ones((1, 11), bool))
     np.testing.assert_allclose(near[0], np.maximum(1 - np.arange(11) / 5.5, 0))
-    assert np.linalg.eigvalsh(_nearness(np.ones((6, 8), bool))).min() > -1e-12
+    assert np.linalg.eigvalsh(_proximity(np.ones((6, 8), bool))).min() > -1e-12
 
 
 @dataclass
@@ -35,7 +40,7 @@ class Linear:
         flat = self.derivatives.reshape(6, -1)
         return flat @ flat.T
 
-    def efficient(self):
+    def projected_jacobian(self):
         return self.derivatives
 
 
@@ -62,8 +67,8 @@ def test_stated_errors_are_those_of_fits_to_noise_that_neighbours_share(missed):
         found = np.linalg.solve(flat @ flat.T, flat @ data.ravel())
         left = data - np.tensordot(found, derivatives, 1)
         errors.append(found)
-        stated.append(np.diag(sandwich(weighted, Linear(derivatives, left), noise)))
-    floor = np.concatenate([[0.0], np.square(FLOOR)])
+        stated.append(np.diag(sandwich_covariance(weighted, Linear(derivatives, left), noise)))
+    floor = np.concatenate([[0.0], np.square(MODEL_ERROR_FLOOR)])
     ratio = (np.mean(stated, axis=0) - floor) / np.mean(np.square(errors), axis=0)
     assert (ratio > 0.8).all(), ratio
     assert (ratio < 1.6).all(), ratio
@@ -94,7 +99,8 @@ def test_a_matrix_without_errors_of_its_own_is_stated_those_that_its_residual_te
     # In units of the matrix instead of its noise.
     coarse = Linear(system.derivatives / 20, system.residual / 20)
     np.testing.assert_allclose(
-        sandwich(weights(valid, False), coarse, noise), sandwich(weights(valid, True), system, noise)
+        sandwich_covariance(weights(valid, False), coarse, noise),
+        sandwich_covariance(weights(valid, True), system, noise),
     )
 
 
@@ -103,5 +109,5 @@ def test_a_slope_that_never_moved_leaves_the_stated_errors_what_they_are():
     dead = noise.copy()
     dead[3], dead[:, 3] = 0.0, 0.0
     system.derivatives[:, 3], system.residual[3] = 0.0, 0.0
-    with_dead, with_live = (sandwich(weights(valid, True), system, one) for one in (dead, noise))
+    with_dead, with_live = (sandwich_covariance(weights(valid, True), system, one) for one in (dead, noise))
     np.testing.assert_allclose(with_dead, with_live)

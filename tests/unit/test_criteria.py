@@ -7,16 +7,18 @@ from dataclasses import replace
 
 import fake_results as fake
 
-from escape_hw.api.results import Measured, StrehlEstimate
+from escape_hw.api.results import Estimate, StrehlEstimate
 from escape_hw.report.tables import strehl_table
-from escape_hw.runtime import criteria
+from escape_hw.runtime.procedures import criteria
 
-UNKNOWN = Measured(0.6, math.nan)
+UNKNOWN = Estimate(0.6, math.nan)
 
 
 def met(escape=None) -> list[bool]:
     """Which of the criteria a loop with ESCAPE's matrix meets beside a usual one with push-pull's."""
-    found = criteria.loops({"push-pull": fake.loop("push-pull"), "ESCAPE": escape or fake.loop("escape")})
+    found = criteria.loop_criteria(
+        {"push-pull": fake.loop("push-pull"), "ESCAPE": escape or fake.loop("escape")}
+    )
     return [check["met"] for check in found]
 
 

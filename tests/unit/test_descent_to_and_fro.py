@@ -9,8 +9,8 @@ import pytest
 
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.misfit import Priors
-from escape_hw.calibration.solvers import Descent, _with_effects
+from escape_hw.calibration.sprint.normal_equations import Priors
+from escape_hw.calibration.sprint.solvers import SolverContext, _fit_mixed_effects
 
 
 @dataclass
@@ -64,29 +64,29 @@ class Overshooting:
     def offset(self, state):
         return np.zeros(6)
 
-    def extras_found(self, state):
+    def extra_parameter_values(self, state):
         return ()
 
 
 def descend(problem, most=40, learning_rate=1.0):
-    descent = Descent(None, None, np.arange(3), "effects", learning_rate, most, Priors())
-    return run(_with_effects(problem, Registration(shift_x=1.0, shift_y=-0.5), descent))
+    context = SolverContext(None, None, np.arange(3), "effects", learning_rate, most, Priors())
+    return run(_fit_mixed_effects(problem, Registration(shift_x=1.0, shift_y=-0.5), context))
 
 
 @pytest.mark.parametrize("too_far", [1.0, 1.7, 2.4, 5.0])
 def test_steps_that_overshoot_are_shortened_until_they_do_not(too_far):
     found = descend(Overshooting(too_far))
-    assert found.settled
+    assert found.steps_converged
     assert np.abs(found.alpha).max() < 0.01
 
 
 def test_a_descent_that_goes_to_and_fro_for_ever_is_given_up_with_what_is_left():
     problem = Overshooting(30.0, at_least=0.05)
     found = descend(problem)
-    assert not found.settled
+    assert not found.steps_converged
     assert problem.steps < 40
-    assert found.left is not None
-    assert np.abs(found.left[0]) == pytest.approx(30 * np.abs(found.alpha[0]).clip(0.05), rel=1e-6)
+    assert found.remaining_step is not None
+    assert np.abs(found.remaining_step[0]) == pytest.approx(30 * np.abs(found.alpha[0]).clip(0.05), rel=1e-6)
 
 
 @pytest.mark.parametrize(("learning_rate", "most"), [(0.02, 3), (1.0, 0)])
@@ -94,6 +94,6 @@ def test_what_is_left_of_a_descent_that_was_cut_is_the_whole_step_not_the_share_
     learning_rate, most
 ):
     found = descend(Overshooting(1.0), most, learning_rate)
-    assert not found.settled
-    assert found.left == pytest.approx(-found.alpha)
+    assert not found.steps_converged
+    assert found.remaining_step == pytest.approx(-found.alpha)
     assert found.alpha[0] == pytest.approx((1 - learning_rate) ** most)

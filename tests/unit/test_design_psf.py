@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy import special
 
-from escape_hw.pipeline.design_psf import design_psf
-from escape_hw.pipeline.strehl import ratios
-from escape_sim.psf import FocalPlane
+from escape_hw.pipeline.psf.strehl import diffraction_psf, strehl_ratios
+from escape_sim.optics.focal_plane import FocalPlane
 
 
 def disk(n: int, hole: float = 0.0) -> np.ndarray:
@@ -21,7 +20,7 @@ def disk(n: int, hole: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize("hole", [0.0, 0.3])
 def test_it_is_the_airy_pattern(hole: float) -> None:
-    image = design_psf(disk(200, hole), 200.0, 3.0, (64, 96))
+    image = diffraction_psf(disk(200, hole), 200.0, 3.0, (64, 96))
     x = math.pi * (np.arange(96) - 48) / 3.0
     x[48] = 1e-9
 
@@ -34,7 +33,7 @@ def test_it_is_the_airy_pattern(hole: float) -> None:
 
 
 def test_its_light_sums_to_one() -> None:
-    assert design_psf(disk(60), 60.0, 2.5, (150, 150)).sum() == pytest.approx(1, abs=1e-5)
+    assert diffraction_psf(disk(60), 60.0, 2.5, (150, 150)).sum() == pytest.approx(1, abs=1e-5)
 
 
 def test_a_flat_wavefront_has_a_strehl_ratio_of_one() -> None:
@@ -42,4 +41,4 @@ def test_a_flat_wavefront_has_a_strehl_ratio_of_one() -> None:
     seen = FocalPlane(pupil.astype(np.float32), 60.0, 1.4e-6, 2.5, (128, 128)).image(
         np.zeros((60, 60), np.float32)
     )
-    assert ratios(seen, design_psf(pupil, 60.0, 2.5, (128, 128))) == pytest.approx(1.0, abs=1e-4)
+    assert strehl_ratios(seen, diffraction_psf(pupil, 60.0, 2.5, (128, 128))) == pytest.approx(1.0, abs=1e-4)

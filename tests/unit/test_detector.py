@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from escape_sim.detector import Detector
+from escape_sim.optics.detector import Detector
 
 SHAPE = (64, 80)
 DEFAULTS = {

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from escape_hw.server import jobs
-from escape_hw.server.channel import Channel, encode
-from escape_hw.server.desk import Desk
+from escape_hw.server.engine import runner as jobs
+from escape_hw.server.engine.request_handler import RequestHandler
+from escape_hw.server.ipc.channel import Channel, encode
 
 
 @pytest.fixture
@@ -26,13 +26,13 @@ def ends() -> Iterator[tuple[Channel, socket.socket]]:
 
 def test_what_waits_is_neither_silence_nor_the_end(ends: tuple[Channel, socket.socket]) -> None:
     channel, theirs = ends
-    assert not channel.waiting
+    assert not channel.has_unread
     theirs.sendall(encode({"alive": True}))
-    assert channel.waiting
+    assert channel.has_unread
     assert next(channel.messages()) == {"alive": True}
-    assert not channel.waiting
+    assert not channel.has_unread
     theirs.close()
-    assert not channel.waiting
+    assert not channel.has_unread
 
 
 def test_a_desk_that_had_no_time_to_listen_takes_nobody_for_silent(
@@ -41,11 +41,13 @@ def test_a_desk_that_had_no_time_to_listen_takes_nobody_for_silent(
     channel, theirs = ends
     reasons: list[str] = []
     monkeypatch.setattr(jobs, "make_safe_now", lambda engine, reason: reasons.append(reason))
-    board = SimpleNamespace(fault=None)
-    engine = SimpleNamespace(setup=SimpleNamespace(silence_s=0.1), board=board, channel=channel)
-    desk = Desk(engine, iter(()))
+    engine_state = SimpleNamespace(fault=None)
+    engine = SimpleNamespace(
+        setup=SimpleNamespace(front_end_timeout_s=0.1), engine_state=engine_state, channel=channel
+    )
+    request_handler = RequestHandler(engine, iter(()))
     theirs.sendall(encode({"alive": True}))
-    threading.Thread(target=desk._listen_for_silence, daemon=True).start()
+    threading.Thread(target=request_handler._watch_for_silence, daemon=True).start()
     time.sleep(0.5)
     assert not reasons
     # Taken, and nothing after it: now the front is silent.
@@ -53,5 +55,5 @@ def test_a_desk_that_had_no_time_to_listen_takes_nobody_for_silent(
     until = time.monotonic() + 10
     while not reasons and time.monotonic() < until:
         time.sleep(0.01)
-    board.fault = "latched"
+    engine_state.fault = "latched"
     assert "the server's front was silent for" in reasons[0]

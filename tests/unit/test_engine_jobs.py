@@ -14,22 +14,21 @@ import pytest
 
 from escape_hw.errors import DeviceLost, EscapeError, RequestRefused
 from escape_hw.remote.state import Finish, Phase
-from escape_hw.server import jobs
-from escape_hw.server.board import Board, LoopChoice
-from escape_hw.server.engine_process import EngineProcess
-from escape_hw.server.growing_pause import GrowingPause
-from escape_hw.server.pulse import Pulse
+from escape_hw.server.engine import runner as jobs
+from escape_hw.server.engine.state import EngineState, LoopSettings
+from escape_hw.server.engine.state_publisher import StatePublisher
+from escape_hw.server.frontend.engine_supervisor import Backoff, EngineProcess
 
 
 class Engine:
     """An engine whose camera has gone, as its jobs see it."""
 
     def __init__(self) -> None:
-        self.board = Board(LoopChoice(gain=0.4), phase=Phase.IDLE)
+        self.engine_state = EngineState(LoopSettings(gain=0.4), phase=Phase.IDLE)
         self.bench = SimpleNamespace(wfs=self, config=SimpleNamespace(to_toml=str))
         self.config = SimpleNamespace(system=SimpleNamespace(name="small"))
-        self.publisher = SimpleNamespace(forget_residual=lambda: None)
-        self.pulse = SimpleNamespace(beat=lambda: None)
+        self.publisher = SimpleNamespace(reset_residual=lambda: None)
+        self.state_publisher = SimpleNamespace(publish=lambda: None)
         self.posted: list[dict[str, Any]] = []
         self.channel = SimpleNamespace(post=self.posted.append)
         self.flat = 0
@@ -44,50 +43,50 @@ class Engine:
         self.flat += 1
 
     def make_safe(self, reason: str, way_out: str) -> None:
-        self.board.latch(reason, way_out)
-        self.board.phase, self.board.closed = Phase.FAULT, False
+        self.engine_state.latch_fault(reason, way_out)
+        self.engine_state.phase, self.engine_state.closed = Phase.FAULT, False
 
-    def answer_flat(self) -> None:
+    def send_flat_replies(self) -> None:
         """Nobody waits."""
 
 
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch) -> Engine:
-    monkeypatch.setattr(jobs, "fitting", lambda engine, name: SimpleNamespace(result=None))
-    monkeypatch.setattr(jobs, "LoopOrders", lambda *args, **options: SimpleNamespace(opened=False))
+    monkeypatch.setattr(jobs, "load_fitting_matrix", lambda engine, name: SimpleNamespace(result=None))
+    monkeypatch.setattr(jobs, "LoopControl", lambda *args, **options: SimpleNamespace(opened=False))
     return Engine()
 
 
 def test_a_loop_that_cannot_be_closed_is_told_and_none_is_thought_closed(engine: Engine) -> None:
     told: list[EscapeError | None] = []
-    jobs.close_loop(engine, LoopChoice("im"), told.append)
+    jobs.close_loop(engine, LoopSettings("im"), told.append)
     assert [str(error) for error in told] == ["wfs: the camera has gone"]
-    assert engine.board.fault is not None
-    assert (engine.board.orders, engine.board.closed) == (None, False)
+    assert engine.engine_state.fault is not None
+    assert (engine.engine_state.loop_control, engine.engine_state.closed) == (None, False)
 
 
 def test_a_run_that_cannot_begin_ends(
     engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(jobs, "_place", lambda engine, task, run: tmp_path / "run")
-    jobs.announce(engine, 3, "docrime", {}, loop=False)
-    jobs.do_task(engine, SimpleNamespace(kind="docrime"), engine.bench.config)
-    assert engine.board.running is None
-    assert engine.board.last.finish is Finish.FAILED
-    assert engine.board.last.message == "wfs: the camera has gone"
-    assert engine.board.phase is Phase.FAULT
+    monkeypatch.setattr(jobs, "_run_folder_path", lambda engine, task, run: tmp_path / "run")
+    jobs.begin_run(engine, 3, "docrime", {}, loop=False)
+    jobs.run_task(engine, SimpleNamespace(kind="docrime"), engine.bench.config)
+    assert engine.engine_state.running is None
+    assert engine.engine_state.last.finish is Finish.FAILED
+    assert engine.engine_state.last.message == "wfs: the camera has gone"
+    assert engine.engine_state.phase is Phase.FAULT
     assert engine.flat == 1
     assert engine.posted[-1]["ended"]["id"] == 3
 
 
 def test_a_loop_that_somebody_opens_is_none_to_return_to(engine: Engine) -> None:
-    board = engine.board
-    board.orders, board.phase = SimpleNamespace(opened=False), Phase.LOOP
-    assert jobs.loop_to_return_to(engine) == board.loop
-    board.stop.set()
-    assert jobs.loop_to_return_to(engine) is None
+    engine_state = engine.engine_state
+    engine_state.loop_control, engine_state.phase = SimpleNamespace(opened=False), Phase.LOOP
+    assert jobs.loop_to_restore(engine) == engine_state.loop
+    engine_state.stop.set()
+    assert jobs.loop_to_restore(engine) is None
     with pytest.raises(RequestRefused, match="the loop is closed"):
-        board.require_idle()
+        engine_state.require_idle()
 
 
 @pytest.fixture
@@ -95,7 +94,7 @@ def process() -> Any:
     """The front's side of an engine whose guardian is dead, and a clock."""
     made: Any = EngineProcess.__new__(EngineProcess)
     made.now = 1000.0
-    made._guardian, made._pause = SimpleNamespace(pid=4711), GrowingPause(lambda: made.now)
+    made._failsafe, made._backoff = SimpleNamespace(pid=4711), Backoff(lambda: made.now)
     return made
 
 
@@ -105,11 +104,11 @@ def test_a_guardian_that_cannot_be_started_is_no_end_of_the_server(
     def refuse(process: EngineProcess) -> None:
         raise BlockingIOError("Resource temporarily unavailable")
 
-    monkeypatch.setattr(EngineProcess, "_guard", refuse)
+    monkeypatch.setattr(EngineProcess, "_start_failsafe", refuse)
     process.now += 1
     with caplog.at_level(logging.ERROR):
-        process.mind_guardian(alive=False)
-    assert process._guardian.pid == 4711
+        process.maintain_failsafe(alive=False)
+    assert process._failsafe.pid == 4711
     assert "tried again in 2 s: Resource temporarily unavailable" in caplog.text
 
 
@@ -122,17 +121,17 @@ def test_a_guardian_that_dies_at_once_is_started_less_and_less_often(
         starts.append(process.now - 1000)
         return SimpleNamespace(pid=4712)
 
-    monkeypatch.setattr(EngineProcess, "_guard", start)
+    monkeypatch.setattr(EngineProcess, "_start_failsafe", start)
     with caplog.at_level(logging.ERROR):
         for _ in range(183):
             process.now += 1
-            process.mind_guardian(alive=False)
+            process.maintain_failsafe(alive=False)
     assert starts == [1, 3, 7, 15, 31, 63, 123, 183]
     assert caplog.text.count("died; another one takes its place") == len(starts)
     # One that lived for a minute and is then killed is replaced at once, as the first one was.
     for alive in [True] * 60 + [False]:
         process.now += 1
-        process.mind_guardian(alive)
+        process.maintain_failsafe(alive)
     assert starts[-1] == 244
 
 
@@ -141,7 +140,7 @@ def test_no_older_state_is_told_after_a_newer_one() -> None:
     told: list[int] = []
     begun, numbers = threading.Event(), itertools.count()
 
-    class Slow(Pulse):
+    class Slow(StatePublisher):
         def state(self) -> Any:
             number = next(numbers)
             begun.set()
@@ -149,10 +148,10 @@ def test_no_older_state_is_told_after_a_newer_one() -> None:
             return number
 
     nothing: Any = None
-    pulse = Slow(nothing, nothing, nothing, nothing, Path(), told.append)
-    first = threading.Thread(target=pulse.beat)
+    state_publisher = Slow(nothing, nothing, nothing, nothing, Path(), told.append)
+    first = threading.Thread(target=state_publisher.publish)
     first.start()
     assert begun.wait(60)
-    pulse.beat()
+    state_publisher.publish()
     first.join()
     assert told == [0, 1]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.calibration.fading_sums import FadingSums
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.calibration.docrime.forgetting_sums import ForgettingSums
 
 N_SLOPES, N_MODES = 24, 6
 
@@ -49,7 +49,7 @@ def truth():
 def test_instruments_are_right_where_least_squares_is_not(truth):
     rng = np.random.default_rng(2)
     y, x, z = closed_loop(rng, truth, 20_000)
-    sums = FadingSums.zeros(N_SLOPES, N_MODES)
+    sums = ForgettingSums.zeros(N_SLOPES, N_MODES)
     sums.add(y, x, z, truth.astype(np.float32))
     by_least_squares = np.linalg.lstsq(x, y)[0].T
 
@@ -64,7 +64,7 @@ def test_errors_of_faded_sums_are_honest(truth):
     rng = np.random.default_rng(4)
     chi2 = []
     for _ in range(30):
-        sums = FadingSums.zeros(N_SLOPES, N_MODES)
+        sums = ForgettingSums.zeros(N_SLOPES, N_MODES)
         for _ in range(12):
             y = rng.standard_normal((60, N_SLOPES))
             z = rng.uniform(-1, 1, (60, N_MODES))
@@ -81,7 +81,7 @@ def test_in_open_loop_they_are_least_squares(truth):
     rng = np.random.default_rng(5)
     z = rng.uniform(-1, 1, (300, N_MODES)).astype(np.float32)
     y = (z @ truth.T + rng.standard_normal((300, N_SLOPES))).astype(np.float32)
-    sums = FadingSums.zeros(N_SLOPES, N_MODES)
+    sums = ForgettingSums.zeros(N_SLOPES, N_MODES)
     sums.add(y, z, z, truth.astype(np.float32))
     centred = z - z.mean(axis=0)
     expected = np.linalg.lstsq(centred, y - y.mean(axis=0))[0].T
@@ -92,7 +92,7 @@ def test_forgetting_and_merging_are_weights(truth):
     rng = np.random.default_rng(6)
     parts = [closed_loop(rng, truth, 50) for _ in range(2)]
     thin = truth.astype(np.float32)
-    one, two, both = (FadingSums.zeros(N_SLOPES, N_MODES) for _ in range(3))
+    one, two, both = (ForgettingSums.zeros(N_SLOPES, N_MODES) for _ in range(3))
     one.add(*parts[0], thin)
     two.add(*parts[1], thin)
     both.add(*parts[0], thin)

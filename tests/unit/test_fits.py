@@ -17,12 +17,13 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from escape_hw.api.results import Measured
+from escape_hw.api.results import Estimate
 from escape_hw.errors import IncompatibleProduct, ProductError, StorageError
-from escape_hw.io import fits_file, provenance, storage
-from escape_hw.io.fits import load_matrix, save_matrix
+from escape_hw.io import provenance, storage
+from escape_hw.io.fits import file as fits_file
+from escape_hw.io.fits.loop import load_loop, save_loop
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
 from escape_hw.io.provenance import Provenance
-from escape_hw.io.psf import load_loop, save_loop
 
 CONFIG = 'schema = 1\n[system]\nname = "razor-shwfs"  # µ\n'
 ORIGIN = Provenance(
@@ -72,7 +73,7 @@ def test_matrix_comes_back_as_it_was(tmp_path):
     assert product.registration.warnings == result.registration.warnings
     assert product.registration.extras == {}
     np.testing.assert_array_equal(product.registration.covariance, result.registration.covariance)
-    mirrors = [dataclasses.asdict(r.registration.departures) for r in (product, result)]
+    mirrors = [dataclasses.asdict(r.registration.actuator_corrections) for r in (product, result)]
     np.testing.assert_equal(*mirrors)
     np.testing.assert_array_equal(product.result.response.weights, result.response.weights)
     np.testing.assert_array_equal(product.result.mean_frame, result.mean_frame)
@@ -80,13 +81,13 @@ def test_matrix_comes_back_as_it_was(tmp_path):
     assert product.result.sky_seconds == 20.0
     assert product.result.notes == result.notes
     assert product.config_text == CONFIG
-    assert product.sha256 == provenance.sha256_of(path)
+    assert product.sha256 == provenance.file_sha256(path)
 
 
 def test_what_was_fitted_beside_the_registration_comes_back(tmp_path):
     extras = {
-        "anamorphosis": Measured(1.5, 0.1, "% of the diameter"),
-        "pupil_shift_x": Measured(-3.0, 2.0, "% of a sub-aperture"),
+        "anamorphosis": Estimate(1.5, 0.1, "% of the diameter"),
+        "pupil_shift_x": Estimate(-3.0, 2.0, "% of a sub-aperture"),
     }
     plain = fake.calibration("escape")
     registration = dataclasses.replace(plain.registration, extras=extras)
@@ -115,12 +116,12 @@ def test_git_state_is_unknown_outside_a_checkout(tmp_path, monkeypatch):
     copy = tmp_path / "errors.py"
     copy.write_text("")
     monkeypatch.setattr(provenance.escape_hw.errors, "__file__", str(copy))
-    provenance.git_state.cache_clear()
-    assert provenance.git_state() == "unknown"
+    provenance.get_git_state.cache_clear()
+    assert provenance.get_git_state() == "unknown"
     monkeypatch.setenv("PATH", "")
-    provenance.git_state.cache_clear()
-    assert provenance.git_state() == "unknown"
-    provenance.git_state.cache_clear()
+    provenance.get_git_state.cache_clear()
+    assert provenance.get_git_state() == "unknown"
+    provenance.get_git_state.cache_clear()
 
 
 @pytest.mark.parametrize("value", [1.5, math.inf, 3, 2**60, True, None, "µ 'quoted' ", [1, [2.5, "x"]], ""])
@@ -134,12 +135,12 @@ def test_metrics_keep_value_and_type(tmp_path, small, value):
 
 def test_no_metrics_no_steps_no_config(tmp_path, small):
     matrix = dataclasses.replace(small.matrix, metrics={})
-    estimate = dataclasses.replace(small.registration, iterations=(), departures=None)
+    estimate = dataclasses.replace(small.registration, iterations=(), actuator_corrections=None)
     result = dataclasses.replace(small, matrix=matrix, registration=estimate, notes=())
     product = load_matrix(save_matrix(tmp_path / "im.fits", result))
     assert product.matrix.metrics == {}
     assert product.registration.iterations == ()
-    assert product.registration.departures is None
+    assert product.registration.actuator_corrections is None
     assert product.config_text == ""
 
 
@@ -195,8 +196,8 @@ def test_truncation_at_every_block_is_refused(saved, tmp_path):
 def test_truncated_file_with_a_valid_sum_is_refused(tmp_path, small):
     """Zeros add nothing to a sum: a computed matrix has no errors, and its last blocks may be all zero."""
     hdus = [
-        fits_file.primary("IM", "s", True, False, ORIGIN),
-        fits_file.image("ZERO", np.zeros(5000, np.float32)),
+        fits_file.primary_hdu("IM", "s", True, False, ORIGIN),
+        fits_file.image_extension("ZERO", np.zeros(5000, np.float32)),
     ]
     fits_file.write(tmp_path / "zero.fits", hdus)
     content = (tmp_path / "zero.fits").read_bytes()

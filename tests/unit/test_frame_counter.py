@@ -7,7 +7,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from escape_drivers.frame_counter import CameraClock, FrameCounter
+from escape_drivers.common.camera import CameraClock, FrameCounter
 
 BLOCKS = (1, 65535)
 WORDS = (0, 2**32 - 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.pipeline.frame_stack import FrameStack
+from escape_hw.pipeline.psf.frame_stack import FrameStack
 
 
 def frames(n: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.procedure import run
-from escape_hw.calibration import gain_search
+from escape_hw.calibration.loop import gain_search
 from escape_hw.errors import CalibrationError
 
 
@@ -27,9 +27,9 @@ def test_a_best_gain_at_the_edge_of_the_scan_is_none(monkeypatch, top, limit):
         )  # fmt: skip
         yield
 
-    monkeypatch.setattr(gain_search, "closed_loop", loop)
+    monkeypatch.setattr(gain_search, "close_loop", loop)
     found, runs = run(gain_search.best_gain(None, fake_results.matrix(), None))
-    assert len(runs) <= len(gain_search.GAIN_SHARES) + 4
+    assert len(runs) <= len(gain_search.GAIN_FRACTIONS) + 4
     assert min(tried) <= found <= max(tried)
     if top < limit:
         # Within the scan's finest step there, or the parabola's reach.
@@ -41,6 +41,6 @@ def test_a_loop_that_closes_at_no_gain_says_so(monkeypatch):
         return replace(fake_results.loop(), gain=gain, stable=False, partial=False)
         yield
 
-    monkeypatch.setattr(gain_search, "closed_loop", loop)
+    monkeypatch.setattr(gain_search, "close_loop", loop)
     with pytest.raises(CalibrationError, match=r"none of the gains .*0\.05"):
         run(gain_search.best_gain(None, fake_results.matrix(), None))

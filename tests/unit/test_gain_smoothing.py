@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.gain_smoothing import smoothed
+from escape_hw.calibration.optical_gain.smoothing import smooth_over_modes
 
 N = 60
 
@@ -18,7 +18,7 @@ def trials(scatter: float, noise: float, count: int = 12):
         trend = 0.6 - 0.15 * np.exp(-modes / 8)
         true = trend * (1 + scatter * rng.standard_normal(N))
         sigma = noise * rng.uniform(0.5, 1.5, N)
-        found = smoothed(true + sigma * rng.standard_normal(N), sigma)
+        found = smooth_over_modes(true + sigma * rng.standard_normal(N), sigma)
         rows.append(
             (found.trend - trend, found.trend_sigma, found.best - true, found.best_sigma, found.value - true)
         )
@@ -45,20 +45,20 @@ def test_a_mode_that_was_not_measured_gets_the_trend_and_a_larger_error():
     sigma[20] = np.inf
     value = 0.7 + 0.02 * rng.standard_normal(N)
     value[20] = np.nan
-    found = smoothed(value, sigma, 0.005)
+    found = smooth_over_modes(value, sigma, 0.005)
     assert found.best[20] == pytest.approx(0.7, abs=0.02)
     assert found.best_sigma[20] >= found.best_sigma[[19, 21]].max()
     assert found.common_sigma == 0.005
 
 
 def test_few_modes_get_their_mean_as_trend():
-    found = smoothed(np.array([0.5, 0.7, np.nan]), np.array([0.1, 0.1, np.inf]))
+    found = smooth_over_modes(np.array([0.5, 0.7, np.nan]), np.array([0.1, 0.1, np.inf]))
     np.testing.assert_allclose(found.trend, 0.6)
     np.testing.assert_allclose(found.best, [0.5, 0.7, 0.6])
 
 
 def test_gains_without_errors_are_refused():
     with pytest.raises(ValueError, match="positive standard errors"):
-        smoothed(np.ones(N), np.zeros(N))
+        smooth_over_modes(np.ones(N), np.zeros(N))
     with pytest.raises(ValueError, match="positive standard errors"):
-        smoothed(np.full(N, np.nan), np.ones(N))
+        smooth_over_modes(np.full(N, np.nan), np.ones(N))

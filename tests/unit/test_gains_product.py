@@ -8,12 +8,12 @@ import fake_results as fake
 import numpy as np
 import pytest
 
-from escape_hw.api.gains import OpticalGains
+from escape_hw.api.optical_gains import OpticalGains
 from escape_hw.errors import ProductError
 from escape_hw.io.documents import dumps, gains_document
-from escape_hw.io.gains import load_gains, save_gains
-from escape_hw.io.psf import load_loop
-from escape_hw.report import figures_gains
+from escape_hw.io.fits.gains import load_gains, save_gains
+from escape_hw.io.fits.loop import load_loop
+from escape_hw.report.figures import gains as figures_gains
 from escape_hw.report.tables import rounds_table
 
 N = 20

@@ -36,7 +36,7 @@ def test_whatever_goes_in_what_comes_out_obeys(
         before = guard.last
         safe, _ = guard(command)
         assert breaches(limits, before, safe) == []
-        assert guard.obeys(safe)
+        assert guard.is_legal(safe)
 
 
 @settings(max_examples=200, deadline=None)
@@ -48,7 +48,7 @@ def test_what_was_let_through_is_let_through_again_untouched(
     guard(first)
     safe, _ = guard(second)
     again, report = guard(safe)
-    assert report.untouched
+    assert report.is_unchanged
     assert np.array_equal(again, safe)
 
 
@@ -64,7 +64,7 @@ def test_legal_commands_pass_bit_for_bit(
     if breaches(limits, guard.last, legal):
         return
     safe, report = guard(legal)
-    assert report.untouched
+    assert report.is_unchanged
     assert np.array_equal(safe, legal)
 
 

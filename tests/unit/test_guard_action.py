@@ -31,7 +31,7 @@ def test_limit_remembers_nothing_before_it_is_accepted() -> None:
     first, _ = guard.limit(np.full(N, 1.0))
     second, _ = guard.limit(np.full(N, 1.0))
     assert np.array_equal(first, second)
-    guard.accept(first)
+    guard.set_last(first)
     third, _ = guard.limit(np.full(N, 1.0))
     np.testing.assert_allclose(third, 0.2)
 
@@ -40,7 +40,7 @@ def test_report_says_what_was_done() -> None:
     command = np.zeros(N)
     command[[4, 5]] = 2.0, -2.0
     _, report = guard_with(MirrorLimits(max_stroke=0.5))(command)
-    assert (report.clipped, report.untouched) == (2, False)
+    assert (report.clipped, report.is_unchanged) == (2, False)
 
     _, report = guard_with(MirrorLimits(disabled=(4,)))(command / 4)
     assert (report.disabled, report.clipped) == (1, 0)
@@ -112,10 +112,10 @@ def test_an_absurd_piston_keeps_its_sign(sign: float) -> None:
 )
 def test_breach_names_the_rule(limits: MirrorLimits, shape: NDArray[np.float64], words: str) -> None:
     guard = guard_with(limits)
-    told = guard.breach(shape)
+    told = guard.find_violation(shape)
     assert told is not None
     assert words in told
-    assert guard.breach(np.zeros(N)) is None
+    assert guard.find_violation(np.zeros(N)) is None
 
 
 def test_reset_takes_the_shape_found_and_refuses_nonsense() -> None:

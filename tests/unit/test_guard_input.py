@@ -112,7 +112,7 @@ def test_enormous_values_do_not_disturb_a_caller_who_has_numpy_raise() -> None:
 )
 def test_every_real_array_is_taken(command: Any) -> None:
     safe, report = guard_with(MirrorLimits())(command)
-    assert report.untouched
+    assert report.is_unchanged
     assert safe.dtype == np.float64
     assert safe.flags.c_contiguous
     assert np.array_equal(safe, np.full(N, 0.125))

@@ -8,12 +8,12 @@ import pytest
 
 from escape_gui.views import mode_mosaic as mosaic
 from escape_gui.views import procedure_form as form
-from escape_gui.views.convergence import Course, Drift
-from escape_gui.views.gain_curves import Curve, live_curve, sides
+from escape_gui.views.convergence import ConvergenceHistory, RegistrationDrift
+from escape_gui.views.gain_curves import GainCurve, axis_sides, live_curve
 from escape_gui.views.mode_detail import tiles
 from escape_gui.views.mode_mosaic import ModeStatistics, MosaicLayout
-from escape_hw.api.registration import TO_PLAIN
-from escape_hw.remote.state import Ended, Finish, Parameter, Product, Running
+from escape_hw.api.registration import TO_STREAM_UNITS
+from escape_hw.remote.state import ActiveRun, Finish, FinishedRun, ProcedureParameter, ProductEntry
 
 
 # ---------------------------------------------------------------- mosaic
@@ -33,7 +33,7 @@ def test_every_pixel_of_every_map_is_found_again(layout):
 
 def test_a_painted_page_holds_the_matrix():
     matrix = fake.matrix(n=12, n_modes=20)
-    layout = mosaic.fit(matrix.valid.shape, 20, (600.0, 400.0), 100.0, 12.0)
+    layout = mosaic.fit_layout(matrix.valid.shape, 20, (600.0, 400.0), 100.0, 12.0)
     statistics = ModeStatistics.of(matrix.data, matrix.sigma)
     values = mosaic.normalised(matrix.data, statistics, fade=False)
     np.testing.assert_allclose(np.sqrt(np.mean(values**2, axis=0)), 1.0, rtol=1e-5)
@@ -41,7 +41,7 @@ def test_a_painted_page_holds_the_matrix():
     assert pages * layout.per_page >= 20
     modes = mosaic.page_modes(layout, 20, pages + 3)
     assert modes.stop == 20
-    picture = mosaic.paint(layout, matrix.valid, values, modes)
+    picture = mosaic.render_page(layout, matrix.valid, values, modes)
     assert picture.shape == layout.size
     for place, mode in enumerate(modes):
         top, left = layout.corner(place)
@@ -63,29 +63,29 @@ def test_fading_hides_noise_and_keeps_signal():
     rng = np.random.default_rng(0)
     sigma = np.ones((2000, 3), np.float32)
     data = rng.standard_normal((2000, 3)).astype(np.float32) * [1.0, 1.0, 1.0] + [0.0, 1.0, 30.0]
-    trust = ModeStatistics.of(data, sigma).trust()
-    assert trust[0] < 0.1
-    assert abs(trust[1] - 0.5) < 0.05
-    assert trust[2] > 0.99
-    assert (ModeStatistics.of(data, None).trust() == 1).all()
+    wiener_weight = ModeStatistics.of(data, sigma).wiener_weight()
+    assert wiener_weight[0] < 0.1
+    assert abs(wiener_weight[1] - 0.5) < 0.05
+    assert wiener_weight[2] > 0.99
+    assert (ModeStatistics.of(data, None).wiener_weight() == 1).all()
 
 
 def test_modes_that_were_not_measured_stay_empty():
     data = fake.matrix(n=12, n_modes=4).data.copy()
     data[:, 2] = np.nan
     values = mosaic.normalised(data, ModeStatistics.of(data, np.ones_like(data)), fade=True)
-    assert (mosaic.indices(values[:, 2]) == mosaic.OUTSIDE).all()
-    assert (mosaic.indices(values[:, 1]) != mosaic.OUTSIDE).all()
+    assert (mosaic.colour_indices(values[:, 2]) == mosaic.OUTSIDE).all()
+    assert (mosaic.colour_indices(values[:, 1]) != mosaic.OUTSIDE).all()
 
 
 def test_the_layout_uses_the_window():
-    small = mosaic.fit((24, 24), 94, (400.0, 300.0), 100.0, 12.0)
-    large = mosaic.fit((24, 24), 94, (1600.0, 1000.0), 100.0, 12.0)
+    small = mosaic.fit_layout((24, 24), 94, (400.0, 300.0), 100.0, 12.0)
+    large = mosaic.fit_layout((24, 24), 94, (1600.0, 1000.0), 100.0, 12.0)
     assert small.per_page < large.per_page
     assert large.columns <= 16
-    few = mosaic.fit((24, 24), 3, (1600.0, 1000.0), 100.0, 12.0)
+    few = mosaic.fit_layout((24, 24), 3, (1600.0, 1000.0), 100.0, 12.0)
     assert few.per_page >= 3
-    assert mosaic.fit((24, 24), 5, (0.0, 0.0), 100.0, 12.0).per_page == 1
+    assert mosaic.fit_layout((24, 24), 5, (0.0, 0.0), 100.0, 12.0).per_page == 1
 
 
 # ---------------------------------------------------------------- one mode
@@ -112,7 +112,9 @@ def test_one_mode_in_every_matrix():
 # ---------------------------------------------------------------- SPRINT
 def test_a_course_is_shown_in_the_papers_units():
     values = np.array([[1.0, -2.0, 0.5, 3.0, 0.0], [2.0, -71.0, -0.77, 2.9, 0.0]])
-    course = Course.of(values * TO_PLAIN, np.full(5, 0.1) * TO_PLAIN, np.array([0.0, 0.3]), True)
+    course = ConvergenceHistory.of(
+        values * TO_STREAM_UNITS, np.full(5, 0.1) * TO_STREAM_UNITS, np.array([0.0, 0.3]), True
+    )
     np.testing.assert_allclose(course.values, values)
     np.testing.assert_allclose(course.sigma, 0.1)
     assert np.isnan(course.step_norm[0])
@@ -122,39 +124,39 @@ def test_a_course_is_shown_in_the_papers_units():
     np.testing.assert_allclose(drawn.values[1], [1, -1, -1, 2.9 / 3, 0])
     np.testing.assert_allclose(drawn.sigma[:2], [0.1 / 2, 0.1 / 71])
     assert course.headline() == "converged, 2 iterations"
-    assert "NOT" in Course.of(values, None, None, False).headline()
+    assert "NOT" in ConvergenceHistory.of(values, None, None, False).headline()
     # Read a moment apart, the streams may differ by an iteration.
-    assert np.isnan(Course.of(values, None, np.array([0.1, 0.2, 0.3, 0.4])[:1]).step_norm[1])
-    assert Course.of(values, None, np.arange(5.0)).step_norm.shape == (2,)
+    assert np.isnan(ConvergenceHistory.of(values, None, np.array([0.1, 0.2, 0.3, 0.4])[:1]).step_norm[1])
+    assert ConvergenceHistory.of(values, None, np.arange(5.0)).step_norm.shape == (2,)
 
 
 def test_drift_counts_from_the_first_known_value():
     track = np.zeros((4, 11))
     track[:, 0] = [0, 3600, 7200, 4 * 3600]
-    track[:, 1:6] = np.outer([np.nan, 5.0, 6.0, 9.0], np.ones(5)) * TO_PLAIN
-    drift = Drift.of(track, [(7200.0, "exchange")])
+    track[:, 1:6] = np.outer([np.nan, 5.0, 6.0, 9.0], np.ones(5)) * TO_STREAM_UNITS
+    drift = RegistrationDrift.of(track, [(7200.0, "exchange")])
     assert drift.unit == "h"
     assert drift.marks == ((2.0, "exchange"),)
     np.testing.assert_allclose(drift.since_start()[1:, 2], [0, 1, 4])
-    assert Drift.of(np.zeros((0, 11))).since_start().shape == (0, 5)
+    assert RegistrationDrift.of(np.zeros((0, 11))).since_start().shape == (0, 5)
 
 
 # ---------------------------------------------------------------- optical gains
 def test_gains_stand_on_two_axes_where_they_need_them():
-    low, high = (Curve.of(str(level), fake.optical_gains(level)) for level in (0.6, 1.9))
-    assert sides({"low": low, "high": high}) == {"low": "left", "high": "right"}
-    assert sides({"high": high}) == {"high": "left"}
+    low, high = (GainCurve.of(str(level), fake.optical_gains(level)) for level in (0.6, 1.9))
+    assert axis_sides({"low": low, "high": high}) == {"low": "left", "high": "right"}
+    assert axis_sides({"high": high}) == {"high": "left"}
     assert np.isnan(low.value[4])
     live = live_curve("now", np.ones(20), np.full(20, np.inf), None, np.ones((2, 20)))
     assert np.isnan(live.sigma).all()
-    assert np.isnan(live.middle)
+    assert np.isnan(live.median)
     assert live.rounds.shape == (2, 20)
     assert live_curve("now", np.ones(20), np.ones(3), None, np.ones((2, 3))).rounds.shape == (0, 20)
 
 
 # ---------------------------------------------------------------- forms and words
-FRAMES = Parameter(name="frames", kind="int", default=1000, unit="frame", low=1, high=1e6)
-SNR = Parameter(name="snr", kind="float", low=0.01)
+FRAMES = ProcedureParameter(name="frames", kind="int", default=1000, unit="frame", low=1, high=1e6)
+SNR = ProcedureParameter(name="snr", kind="float", low=0.01)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +164,7 @@ SNR = Parameter(name="snr", kind="float", low=0.01)
     [(FRAMES, "200", 200), (FRAMES, "1e3", 1000), (SNR, "", None), (SNR, "2.5", 2.5), (SNR, "–", None)],
 )
 def test_fields_are_understood(parameter, text, value):
-    found = form.value_of(parameter, text)
+    found = form.parse_value(parameter, text)
     assert found == value
     assert type(found) is type(value)
 
@@ -170,11 +172,11 @@ def test_fields_are_understood(parameter, text, value):
 @pytest.mark.parametrize("text", ["", "many", "0", "1.5", "nan", "1e9", "−3"])
 def test_wrong_fields_say_what_would_do(text):
     with pytest.raises(ValueError, match=r"^Frames: .+"):
-        form.value_of(FRAMES, text)
+        form.parse_value(FRAMES, text)
 
 
 def test_only_what_differs_is_sent():
-    assert form.asked((FRAMES, SNR), {"frames": 1000, "snr": 3.0}) == {"snr": 3.0}
+    assert form.non_default_arguments((FRAMES, SNR), {"frames": 1000, "snr": 3.0}) == {"snr": 3.0}
 
 
 @pytest.mark.parametrize(
@@ -182,19 +184,21 @@ def test_only_what_differs_is_sent():
     [(8.04, "8.0 s"), (252, "4:12 min"), (3723, "1:02:03"), (float("nan"), "–"), (59.99, "60.0 s")],
 )
 def test_lengths_of_time(seconds, text):
-    assert form.duration(seconds) == text
+    assert form.format_duration(seconds) == text
 
 
 def test_progress_in_words():
-    run = Running(id=1, name="docrime", arguments={}, stage="DO-CRIME", done=610, total=1000, remaining_s=252)
+    run = ActiveRun(
+        id=1, name="docrime", arguments={}, stage="DO-CRIME", done=610, total=1000, remaining_s=252
+    )
     assert form.progress_line(run) == "DO-CRIME: 610 of 1000 frames, 4:12 min left"
     assert form.progress_line(run.model_copy(update={"paused": True})).endswith("paused")
     endless = run.model_copy(update={"total": 0, "remaining_s": None})
     assert form.progress_line(endless) == "DO-CRIME: 610 frames"
     assert form.worst_mode(np.array([5.0, 3.1, np.nan, np.inf])) == "worst mode 2: SNR 3.1"
     assert form.worst_mode(np.array([np.nan])) == ""
-    failed = Ended(id=1, name="escape", finish=Finish.FAILED, message="too dark")
-    assert form.ended_line(failed) == "Failed: escape. too dark"
+    failed = FinishedRun(id=1, name="escape", finish=Finish.FAILED, message="too dark")
+    assert form.result_line(failed) == "Failed: escape. too dark"
 
 
 def test_a_result_is_compared_with_the_one_before():
@@ -209,5 +213,5 @@ def test_a_result_is_compared_with_the_one_before():
 
 def test_the_newest_matrix_is_offered_first():
     kinds = (("im", "matrix"), ("psf", "psf"), ("escape-2", "matrix"))
-    products = tuple(Product(name=name, kind=kind, path="/x") for name, kind in kinds)
+    products = tuple(ProductEntry(name=name, kind=kind, path="/x") for name, kind in kinds)
     assert form.matrices(products) == ("escape-2", "im")

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from escape_hw.streams.histogram import BINS, MIDDLES, Histogram, bin_of, percentiles_of
-from escape_hw.streams.loop_timing import LoopTiming
+from escape_hw.streams.timing import BINS, MIDDLES, Histogram, LoopTiming, bin_of, percentiles_of
 
 
 def test_bins_follow_each_other_and_hold_their_middles():
@@ -44,9 +43,9 @@ def test_percentiles_agree_with_the_values_themselves(scale):
 
 def test_nothing_counted_is_nan():
     assert all(math.isnan(value) for value in Histogram().percentiles(50, 99))
-    assert math.isnan(Histogram().departure(99))
+    assert math.isnan(Histogram().deviation_percentile(99))
     assert np.isnan(percentiles_of(np.zeros(BINS), [50])).all()
-    assert math.isnan(LoopTiming().lately().p50)
+    assert math.isnan(LoopTiming().recent().p50)
     assert math.isnan(LoopTiming().since_start().p99)
 
 
@@ -60,13 +59,13 @@ def test_a_loop_knows_its_last_second_and_all_of_its_time():
         timing.add(now, now + took)
         spacings.append(step)
         latencies.append(took)
-    lately, ever = timing.lately(), timing.since_start()
+    recent, ever = timing.recent(), timing.since_start()
     last = np.array(latencies[-500:]) / 1e3
     np.testing.assert_allclose(
-        [lately.p50, lately.p99, lately.largest], np.percentile(last, [50, 99, 100]), rtol=0.01
+        [recent.p50, recent.p99, recent.largest], np.percentile(last, [50, 99, 100]), rtol=0.01
     )
     off = np.abs(spacings[-499:] - np.median(spacings[-499:])) / 1e3
-    np.testing.assert_allclose(lately.jitter_p99, np.percentile(off, 99), rtol=0.05)
+    np.testing.assert_allclose(recent.jitter_p99, np.percentile(off, 99), rtol=0.05)
     np.testing.assert_allclose(ever.p99, np.percentile(latencies, 99) / 1e3, rtol=0.04)
     assert ever.largest == max(latencies) / 1e3
     # 50 us of jitter on 2 ms are as much as a bin is wide.

@@ -12,19 +12,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from escape_hw.api.frames import CameraInfo, CameraSettings, Region
+from escape_hw.api.camera import CameraInfo, CameraSettings, Region
 from escape_hw.errors import DeviceLost, FrameTimeout, SettingRejected
-from escape_hw.pipeline.command_shape import shaper, zonal_places
-from escape_hw.pipeline.integrator import LeakyIntegrator
-from escape_hw.pipeline.packed_matrix import LARGE, PackedMatrix
+from escape_hw.pipeline.control.integrator import LeakyIntegrator
+from escape_hw.pipeline.control.matrix_products import (
+    PACKING_BYTES,
+    PackedMatrix,
+    build_command_mapper,
+    zonal_actuators,
+)
 from escape_hw.safety.guard import CommandGuard
 from escape_hw.safety.limits import MirrorLimits, neighbour_pairs
 from escape_hw.streams import realtime
-from escape_hw.streams.realtime import prompt
+from escape_hw.streams.realtime import realtime_thread
 from escape_hw.streams.ring import RingReader, RingWriter
-from escape_hw.streams.ring_camera import RingCamera
+from escape_hw.streams.ring_camera import POLLS, RingCamera, wait_for_change
 from escape_hw.streams.segments import segment_name
-from escape_hw.streams.spin import LOOKS, changes
 
 
 # ---------------------------------------------------------------- packed matrices
@@ -58,7 +61,7 @@ def test_a_large_integrator_does_what_a_small_one_does():
     rng = np.random.default_rng(2)
     n_modes, n_slopes = 1100, 1000
     matrix = rng.normal(size=(n_modes, n_slopes)).astype(np.float32)
-    assert matrix.nbytes > LARGE
+    assert matrix.nbytes > PACKING_BYTES
     large = LeakyIntegrator(matrix, 0.3, 0.02)
     rows = rng.permutation(n_modes)[:50]
     small = LeakyIntegrator(matrix[rows], 0.3, 0.02)
@@ -95,7 +98,7 @@ def _orders(n_act: int, n_modes: int) -> np.ndarray:
     ids=["modes", "many modes", "every actuator", "some actuators"],
 )
 def test_shapes_are_products(m2c):
-    shape_of, rng = shaper(m2c), np.random.default_rng(6)
+    shape_of, rng = build_command_mapper(m2c), np.random.default_rng(6)
     for _ in range(3):
         modes = rng.normal(size=m2c.shape[1])
         exact = m2c @ modes
@@ -103,10 +106,10 @@ def test_shapes_are_products(m2c):
 
 
 def test_only_zonal_modes_are_taken_for_such():
-    assert zonal_places(np.eye(4)) is not None
-    assert zonal_places(np.array([[1.0, 1.0], [0.0, 0.0]])) is None
-    assert zonal_places(np.array([[1.0, 0.0], [1.0, 0.0]])) is None
-    assert zonal_places(np.zeros((3, 2))) is None
+    assert zonal_actuators(np.eye(4)) is not None
+    assert zonal_actuators(np.array([[1.0, 1.0], [0.0, 0.0]])) is None
+    assert zonal_actuators(np.array([[1.0, 0.0], [1.0, 0.0]])) is None
+    assert zonal_actuators(np.zeros((3, 2))) is None
 
 
 # ---------------------------------------------------------------- limits
@@ -131,10 +134,10 @@ def test_the_compiled_check_agrees_with_the_rules_in_words(
     if disabled and rng.random() < 0.7:
         shape[list(disabled)] = 0
     far = float(np.abs(shape - guard.last).max())
-    assert guard.obeys(shape) == (guard.breach(shape) is None and (slew is None or far <= slew))
+    assert guard.is_legal(shape) == (guard.find_violation(shape) is None and (slew is None or far <= slew))
     safe, report = guard.limit(shape)
-    assert report.untouched == guard.obeys(shape)
-    if report.untouched:
+    assert report.is_unchanged == guard.is_legal(shape)
+    if report.is_unchanged:
         np.testing.assert_array_equal(safe, shape)
 
 
@@ -143,7 +146,7 @@ def test_what_is_no_number_never_obeys(bad):
     guard = CommandGuard("dm", 4, MirrorLimits(1.0))
     shape = np.zeros(4)
     shape[2] = bad
-    assert not guard.obeys(shape)
+    assert not guard.is_legal(shape)
 
 
 # ---------------------------------------------------------------- waiting for frames
@@ -226,12 +229,12 @@ def test_a_sleeping_reader_is_woken(ring):
 
 def test_a_spinning_reader_sees_a_change_made_elsewhere():
     word = np.zeros(1, np.uint64)
-    assert not changes(word.ctypes.data, 0, LOOKS)
+    assert not wait_for_change(word.ctypes.data, 0, POLLS)
     thread = threading.Timer(0.02, lambda: word.__setitem__(0, 1))
     thread.start()
     # The lock is free meanwhile, or the other thread could never write.
     until = time.monotonic() + 20.0
-    while not changes(word.ctypes.data, 0, 50 * LOOKS) and time.monotonic() < until:
+    while not wait_for_change(word.ctypes.data, 0, 50 * POLLS) and time.monotonic() < until:
         pass
     assert word[0] == 1
     thread.join()
@@ -240,7 +243,7 @@ def test_a_spinning_reader_sees_a_change_made_elsewhere():
 # ---------------------------------------------------------------- the operating system
 def test_all_is_as_before_in_the_end():
     before = os.sched_getscheduler(0), os.sched_getaffinity(0)
-    with prompt(cpus=[min(before[1])]) as notes:
+    with realtime_thread(cpus=[min(before[1])]) as notes:
         assert os.sched_getaffinity(0) == {min(before[1])} or notes
         if not notes:
             assert os.sched_getscheduler(0) & os.SCHED_FIFO
@@ -258,7 +261,7 @@ def test_what_is_not_allowed_is_said_and_the_loop_runs_all_the_same(monkeypatch)
 
     monkeypatch.setattr(realtime.os, "sched_setscheduler", refuse)
     monkeypatch.setattr(realtime.os, "sched_setaffinity", refuse)
-    with prompt(cpus=[0]) as notes:
+    with realtime_thread(cpus=[0]) as notes:
         assert len(notes) >= 2
         assert "processors cannot be chosen" in notes[0]
         assert "no real-time priority" in notes[1]

@@ -8,9 +8,13 @@ from astropy.io import fits
 
 from escape_hw.api.registration import Registration
 from escape_hw.errors import ConfigError
-from escape_sim.influence import InfluenceFunctions, layout_positions
-from escape_sim.measured_influence import MeasuredInfluence, read_influence
-from escape_sim.mirror_surface import MirrorSurface, StampedSurface, WindowedSurface, mirror_surface
+from escape_sim.mirror.influence_functions import (
+    InfluenceFunctions,
+    MeasuredInfluenceFunctions,
+    layout_positions,
+    read_influence_functions,
+)
+from escape_sim.mirror.surface import DenseSurface, GriddedSurface, WindowedSurface, make_mirror_surface
 
 PITCH, D = 0.75e-3, 0.28e-3
 X = np.linspace(-4e-3, 4e-3, 81)
@@ -63,7 +67,7 @@ def test_separable_factors_make_the_dense_formula(registration, options):
     rng = np.random.default_rng(1)
     command = rng.uniform(-1, 1, m.n_act)
     factors = m.factors(registration, D, X, Y)
-    for fast in (MirrorSurface(*factors), WindowedSurface(*factors), StampedSurface(want)):
+    for fast in (DenseSurface(*factors), WindowedSurface(*factors), GriddedSurface(want)):
         surface = fast(command)
         assert surface.dtype == np.float32
         assert np.abs(surface - np.tensordot(command, want, 1)).max() < 4e-6
@@ -142,11 +146,11 @@ def test_scalings_alike_need_no_angle():
 
 
 def test_the_faster_way_is_taken():
-    few = mirror_surface(mirror(), Registration(), D, X, Y)
-    assert isinstance(few, MirrorSurface)
+    few = make_mirror_surface(mirror(), Registration(), D, X, Y)
+    assert isinstance(few, DenseSurface)
     line = np.linspace(-1, 1, 120)
     many = InfluenceFunctions(layout_positions(np.ones((30, 30), bool), 2 / 30), 2 / 30, 0.3)
-    fast = mirror_surface(many, Registration(rotation=3.0), 0.1, line, line)
+    fast = make_mirror_surface(many, Registration(rotation=3.0), 0.1, line, line)
     assert isinstance(fast, WindowedSurface)
     command = np.random.default_rng(3).uniform(-1, 1, 900)
     command[5] = 0.0
@@ -160,7 +164,7 @@ GRID = (np.arange(121) - 60) * FINE
 
 def measured(**options):
     """What an interferometer would see of the Gaussian mirror, on a grid of its own."""
-    return MeasuredInfluence(mirror().surfaces(Registration(), D, GRID, GRID), FINE, **options)
+    return MeasuredInfluenceFunctions(mirror().surfaces(Registration(), D, GRID, GRID), FINE, **options)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +187,7 @@ def test_measured_shapes_follow_a_registration_as_gaussians_do(registration):
 def test_measured_shapes_turn_with_the_mirror():
     # An ellipse along x, turned by a right angle, lies along y.
     wide = np.exp(-((GRID[None, :] / 1e-3) ** 2) - (GRID[:, None] / 0.5e-3) ** 2)[None]
-    turned = MeasuredInfluence(wide, FINE).surfaces(Registration(rotation=90.0), D, GRID, GRID)
+    turned = MeasuredInfluenceFunctions(wide, FINE).surfaces(Registration(rotation=90.0), D, GRID, GRID)
     assert turned[0] == pytest.approx(wide[0].T, abs=1e-9)
 
 
@@ -192,8 +196,8 @@ def test_measured_shapes_carry_gains_and_end_where_nothing_was_measured():
     assert found == pytest.approx(2 * mirror().surfaces(Registration(), D, GRID, GRID), abs=1e-6)
     beyond = np.array([6.6e-3, 9e-3])
     assert not measured().surfaces(Registration(), D, beyond, GRID).any()
-    fast = mirror_surface(measured(), GENERAL, D, X, Y)
-    assert isinstance(fast, StampedSurface)
+    fast = make_mirror_surface(measured(), GENERAL, D, X, Y)
+    assert isinstance(fast, GriddedSurface)
     command = np.random.default_rng(2).uniform(-1, 1, 33)
     want = np.tensordot(command, measured().surfaces(GENERAL, D, X, Y), 1)
     assert np.abs(fast(command) - want).max() < 5e-6
@@ -202,21 +206,21 @@ def test_measured_shapes_carry_gains_and_end_where_nothing_was_measured():
 @pytest.mark.parametrize("cube", [np.zeros((3, 4)), np.zeros((2, 4, 5)), np.full((2, 4, 4), np.nan)])
 def test_what_is_no_stack_of_surfaces_is_refused(cube):
     with pytest.raises(ValueError, match="influence functions"):
-        MeasuredInfluence(cube, FINE)
+        MeasuredInfluenceFunctions(cube, FINE)
 
 
 def test_influence_functions_from_a_file(tmp_path):
     cube = np.random.default_rng(1).normal(size=(5, 8, 8))
     fits.writeto(tmp_path / "if.fits", cube)
-    assert np.array_equal(read_influence(str(tmp_path / "if.fits"), 5), cube)
+    assert np.array_equal(read_influence_functions(str(tmp_path / "if.fits"), 5), cube)
     with pytest.raises(ConfigError, match=r"shape \(5, 8, 8\); influence functions of 97"):
-        read_influence(str(tmp_path / "if.fits"), 97)
+        read_influence_functions(str(tmp_path / "if.fits"), 97)
     with pytest.raises(ConfigError, match=r"cannot be read from .*none\.fits"):
-        read_influence(str(tmp_path / "none.fits"), 5)
+        read_influence_functions(str(tmp_path / "none.fits"), 5)
     (tmp_path / "text.fits").write_text("no")
     with pytest.raises(ConfigError, match="cannot be read"):
-        read_influence(str(tmp_path / "text.fits"), 5)
+        read_influence_functions(str(tmp_path / "text.fits"), 5)
     cube[0, 0, 0] = np.nan
     fits.writeto(tmp_path / "nan.fits", cube)
     with pytest.raises(ConfigError, match="not finite"):
-        read_influence(str(tmp_path / "nan.fits"), 5)
+        read_influence_functions(str(tmp_path / "nan.fits"), 5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.pipeline.integrator import LeakyIntegrator, gain_limit
+from escape_hw.pipeline.control.integrator import LeakyIntegrator, gain_limit
 
 ONE = np.ones((1, 1), np.float32)
 
@@ -21,7 +21,7 @@ def run_loop(gain, delay, leak=0.0, frames=3000, disturbance=1.0, limit=np.inf, 
         command = float(control(np.array([residuals[k]], np.float32))[0])
         clipped = float(np.clip(command, -limit, limit))
         if clipped != command and not windup:
-            control.applied(np.array([clipped]))
+            control.set_applied(np.array([clipped]))
         sent.append(clipped)
     return residuals
 
@@ -63,7 +63,7 @@ def test_a_leak_leaves_its_share(gain, leak):
 
 def test_the_leak_lets_the_state_decay():
     control = LeakyIntegrator(ONE, 0.5, 0.1)
-    control.applied(np.array([1.0]))
+    control.set_applied(np.array([1.0]))
     states = [float(control(np.zeros(1, np.float32))[0]) for _ in range(10)]
     assert states == pytest.approx(0.9 ** np.arange(1, 11), rel=1e-5)
 
@@ -111,14 +111,14 @@ def test_it_goes_on_from_what_the_mirror_really_did():
     r = np.random.default_rng(1).standard_normal((7, 20)).astype(np.float32)
     control, slopes = LeakyIntegrator(r, 0.4, 0.1), np.ones(20, np.float32)
     control(slopes)
-    control.applied(np.arange(7.0))
+    control.set_applied(np.arange(7.0))
     assert control(slopes) == pytest.approx(0.9 * np.arange(7) - 0.4 * (r @ slopes), abs=1e-5)
 
 
 def test_applied_does_not_hold_on_to_the_callers_array():
     control = LeakyIntegrator(ONE, 0.5, 0.0)
     modes = np.ones(1, np.float32)
-    control.applied(modes)
+    control.set_applied(modes)
     modes[0] = 77
     assert control(np.zeros(1, np.float32))[0] == 1
 

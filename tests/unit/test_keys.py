@@ -10,7 +10,7 @@ import pytest
 
 from escape_hw.errors import ConfigError, StorageError
 from escape_hw.remote import keys
-from escape_hw.remote.address import find_listing, is_loopback, resolve, servers
+from escape_hw.remote.address import find_server, is_loopback, resolve, running_servers
 
 OTHER = "X8nS7Q1AbBe5qEMxbWkJSWPHmZc84UmvUYdVdpc1"
 
@@ -62,8 +62,8 @@ def test_other_addresses_than_the_loopback_need_keys_and_somebody_to_let_in(esca
     code, _, said = escape(*serve)
     assert code == 2
     assert "no client is let in; add one with 'escape keys allow NAME KEY'" in said
-    assert find_listing("razor-shwfs") is None
-    assert servers() == ()
+    assert find_server("razor-shwfs") is None
+    assert running_servers() == ()
 
 
 def test_a_key_may_begin_with_a_minus_sign(document) -> None:
@@ -125,4 +125,4 @@ def test_a_runtime_folder_that_others_may_write_to_is_not_used(home: Path) -> No
     (home / "escape").mkdir(mode=0o700)
     (home / "escape").chmod(0o777)
     with pytest.raises(StorageError, match="others may write there"):
-        find_listing("razor-shwfs")
+        find_server("razor-shwfs")

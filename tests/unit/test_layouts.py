@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 
 from escape_hw.api.mirror import DeformableMirror, DMInfo
-from escape_hw.config import layouts
+from escape_hw.config import actuator_layouts
 from escape_hw.safety.limits import MirrorLimits, nearest_pairs, neighbour_pairs
 
 
 @pytest.mark.parametrize("n", [336, 672])
 def test_rings(n):
     name = f"rings-{n}"
-    at = layouts.positions(name)
-    assert layouts.count(name) == n
+    at = actuator_layouts.positions(name)
+    assert actuator_layouts.n_actuators(name) == n
     assert at.shape == (n, 2)
-    assert not layouts.on_grid(name)
+    assert not actuator_layouts.is_on_grid(name)
     radius = np.hypot(*at.T)
     levels, members = np.unique(radius.round(9), return_counts=True)
-    assert tuple(members) == layouts.RINGS[n]
+    assert tuple(members) == actuator_layouts.RINGS[n]
     assert np.diff(levels) == pytest.approx(1.0)
     # Numbered outwards, and along each ring from +x towards +y.
     assert (np.diff(radius) > -1e-9).all()
@@ -32,16 +32,16 @@ def test_rings(n):
 
 
 def test_the_mmt_mirror_has_a_hole():
-    radius = np.hypot(*layouts.positions("rings-336").T)
+    radius = np.hypot(*actuator_layouts.positions("rings-336").T)
     assert radius.min() == pytest.approx(3.5)
     assert radius.max() == pytest.approx(10.5)
 
 
 @pytest.mark.parametrize("name", ["circle-11", "circle-4", "square-5"])
 def test_grids(name):
-    grid = layouts.actuator_map(name)
-    at = layouts.positions(name)
-    assert len(at) == layouts.count(name) == grid.sum()
+    grid = actuator_layouts.actuator_map(name)
+    at = actuator_layouts.positions(name)
+    assert len(at) == actuator_layouts.n_actuators(name) == grid.sum()
     again = np.zeros_like(grid)
     middle = (len(grid) - 1) / 2
     again[tuple((at[:, ::-1] + middle).round().astype(int).T)] = True
@@ -52,24 +52,24 @@ def test_grids(name):
 @pytest.mark.parametrize("name", ["rings-335", "rings-0", "rings-", "ring-336", "hexagon-7", "circle-0"])
 def test_unknown_layouts_are_refused(name):
     with pytest.raises(ValueError, match=r"'circle-N', 'square-N', 'rings-336'"):
-        layouts.count(name)
+        actuator_layouts.n_actuators(name)
 
 
 def test_rings_have_no_grid():
     with pytest.raises(ValueError, match="not on a grid"):
-        layouts.actuator_map("rings-336")
+        actuator_layouts.actuator_map("rings-336")
 
 
 @pytest.mark.parametrize("name", ["circle-11", "circle-6", "square-4"])
 def test_nearest_pairs_on_a_grid_are_the_grids(name):
-    want = {tuple(sorted(map(int, pair))) for pair in neighbour_pairs(layouts.actuator_map(name))}
-    found = nearest_pairs(layouts.positions(name) * 1.5e-3)
+    want = {tuple(sorted(map(int, pair))) for pair in neighbour_pairs(actuator_layouts.actuator_map(name))}
+    found = nearest_pairs(actuator_layouts.positions(name) * 1.5e-3)
     assert {tuple(map(int, pair)) for pair in found} == want
     assert len(found) == len(want)
 
 
 def test_nearest_pairs_on_rings():
-    at = layouts.positions("rings-336")
+    at = actuator_layouts.positions("rings-336")
     pairs = nearest_pairs(at)
     distance = np.hypot(*(at[pairs[:, 0]] - at[pairs[:, 1]]).T)
     assert distance.max() < 1.3 * 1.05
@@ -107,7 +107,7 @@ class RingMirror(DeformableMirror):
     def __init__(self, limits):
         super().__init__("rings", limits)
         self.sent = []
-        places = layouts.positions("rings-336") * 0.03
+        places = actuator_layouts.positions("rings-336") * 0.03
         self._info = DMInfo("rings", "R1", 336, None, places, 1e-5, True)
 
     @property
@@ -132,4 +132,4 @@ def test_the_guard_limits_neighbours_without_a_grid():
         assert report.guard.scale == pytest.approx(0.2)
         # A smooth tilt of the same height passes.
         tilt = 0.5 * mirror.info.positions_m[:, 0] / np.abs(mirror.info.positions_m).max()
-        assert mirror.send(tilt).guard.untouched
+        assert mirror.send(tilt).guard.is_unchanged

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from escape_hw.errors import LeaseHeld, RequestRefused
-from escape_hw.remote.requests import Hello
-from escape_hw.server.lease import MOST_CLIENTS, Client, LeaseBook
+from escape_hw.remote.requests import RegisterClient
+from escape_hw.server.frontend.lease import MAX_CLIENTS, LeaseManager, RegisteredClient
 
 
 class Clock:
@@ -22,19 +22,19 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def book(clock: Clock) -> LeaseBook:
-    return LeaseBook(5.0, clock)
+def book(clock: Clock) -> LeaseManager:
+    return LeaseManager(5.0, clock)
 
 
-def comes(book: LeaseBook, number: int, route: bytes | None = None) -> Client:
+def comes(book: LeaseManager, number: int, route: bytes | None = None) -> RegisteredClient:
     client = f"{number:08x}-0000"
-    hello = Hello(client=client, schema_version=1, name=f"client {number}", host="here", pid=number)
+    hello = RegisterClient(client=client, schema_version=1, name=f"client {number}", host="here", pid=number)
     route = b"r%d" % number if route is None else route
-    book.greet(hello, route)
-    return book.hear(client, route)
+    book.register_client(hello, route)
+    return book.record_activity(client, route)
 
 
-def test_the_second_is_told_who_has_it(book: LeaseBook) -> None:
+def test_the_second_is_told_who_has_it(book: LeaseManager) -> None:
     one, other = comes(book, 1), comes(book, 2)
     assert book.acquire(one, False).name == "client 1"
     with pytest.raises(LeaseHeld, match=r"client 1 on here \(process 1\) has had the right to write since"):
@@ -46,7 +46,7 @@ def test_the_second_is_told_who_has_it(book: LeaseBook) -> None:
     assert book.acquire(one, False).name == "client 1"
 
 
-def test_it_is_taken_over_on_request_and_given_back(book: LeaseBook) -> None:
+def test_it_is_taken_over_on_request_and_given_back(book: LeaseManager) -> None:
     one, other = comes(book, 1), comes(book, 2)
     book.acquire(one, False)
     book.acquire(other, True)
@@ -59,40 +59,40 @@ def test_it_is_taken_over_on_request_and_given_back(book: LeaseBook) -> None:
         book.require(one)
 
 
-def test_a_holder_that_is_silent_loses_it(book: LeaseBook, clock: Clock) -> None:
+def test_a_holder_that_is_silent_loses_it(book: LeaseManager, clock: Clock) -> None:
     one = comes(book, 1)
     book.acquire(one, False)
     clock.now += 5.0
     book.expire()
     assert book.lease is not None
-    book.hear(one.hello.client, one.route)
+    book.record_activity(one.hello.client, one.route)
     clock.now += 5.1
     book.expire()
     assert book.lease is None
     clock.now += 3.0
-    assert book.lost_for() == pytest.approx(3.0)
+    assert book.seconds_without_holder() == pytest.approx(3.0)
     book.acquire(comes(book, 2), False)
-    assert book.lost_for() == 0.0
+    assert book.seconds_without_holder() == 0.0
 
 
-def test_nobody_speaks_for_another(book: LeaseBook) -> None:
+def test_nobody_speaks_for_another(book: LeaseManager) -> None:
     one = comes(book, 1)
     book.acquire(one, False)
     with pytest.raises(RequestRefused, match="belongs to another connection"):
         comes(book, 1, b"somebody else")
     with pytest.raises(RequestRefused, match="say hello first"):
-        book.hear(one.hello.client, b"somebody else")
+        book.record_activity(one.hello.client, b"somebody else")
     with pytest.raises(RequestRefused, match="say hello first"):
-        book.hear("0000000f-0000", b"x")
+        book.record_activity("0000000f-0000", b"x")
 
 
-def test_too_many_are_refused_until_some_are_forgotten(book: LeaseBook, clock: Clock) -> None:
-    for number in range(MOST_CLIENTS):
+def test_too_many_are_refused_until_some_are_forgotten(book: LeaseManager, clock: Clock) -> None:
+    for number in range(MAX_CLIENTS):
         comes(book, number)
-    assert book.count == MOST_CLIENTS
+    assert book.count == MAX_CLIENTS
     with pytest.raises(RequestRefused, match="clients are here already"):
-        comes(book, MOST_CLIENTS)
+        comes(book, MAX_CLIENTS)
     clock.now += 61
     book.expire()
     assert book.count == 0
-    comes(book, MOST_CLIENTS)
+    comes(book, MAX_CLIENTS)

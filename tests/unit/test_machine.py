@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from escape_hw.api.emulator import EmulatorRequest
-from escape_hw.config.load import load_system
-from escape_hw.runtime import doctor, udev
-from escape_hw.runtime.discover import discover
-from escape_hw.runtime.host import Host, route_to
-from escape_sim.emulators.asm import make_emulator
+from escape_hw.config.loader import load_system
+from escape_hw.runtime.host import doctor, udev
+from escape_hw.runtime.host.computer import Host, route_to
+from escape_hw.runtime.host.discovery import discover
+from escape_sim.emulators.asm.emulator import make_emulator
 
-RULES = (udev.shipped() / "70-escape.rules").read_text()
+RULES = (udev.find_packaged_files() / "70-escape.rules").read_text()
 
 
 def put(root: Path, path: str, text: str) -> None:
@@ -55,7 +55,7 @@ def bench(tmp_path: Path) -> Path:
 
 
 def levels(root: Path, config: object = None) -> dict[str, doctor.Finding]:
-    found = doctor.examine(config, Host(root), root)  # type: ignore[arg-type]
+    found = doctor.check_computer(config, Host(root), root)  # type: ignore[arg-type]
     return {finding.item: finding for finding in found}
 
 
@@ -144,7 +144,7 @@ def test_doctor_is_content_with_a_good_bench(bench: Path) -> None:
     put(bench, "sys/bus/usb-serial/devices/ttyUSB0/latency_timer", "1")
     for cpu in range(2):
         put(bench, f"sys/devices/system/cpu/cpu{cpu}/cpufreq/scaling_governor", "performance")
-    udev.apply(udev.plan(bench))
+    udev.apply_changes(udev.plan_changes(bench))
     found = levels(bench)
     for item in ("usbfs memory", "latency of /dev/ttyUSB0", "governor", "udev", "free space", "packages"):
         assert found[item].level == "ok", found[item]
@@ -183,7 +183,7 @@ def test_doctor_reports_the_computer_it_runs_on(document, escape) -> None:
 
 def test_a_full_disk_is_noticed(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setattr(doctor, "FREE_GB", 1e9)
-    found = {f.item: f for f in doctor.examine(None, Host(tmp_path), tmp_path / "not/there/yet")}
+    found = {f.item: f for f in doctor.check_computer(None, Host(tmp_path), tmp_path / "not/there/yet")}
     assert found["free space"].level == "warning"
 
 

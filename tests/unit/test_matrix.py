@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 
 VALID = np.array([[False, True, True], [True, True, True]])
 N_SLOPES, N_MODES, N_ACT = 10, 3, 7

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from escape_hw.errors import ProductError
-from escape_hw.io.interchange import milk_layout as layout
-from escape_hw.io.interchange.milk_stream import MilkStream
+from escape_hw.io.interchange.milk import layout
+from escape_hw.io.interchange.milk.stream import MilkStream
 
 PLAIN, CIRCULAR = 0x2, 0x20001
 
@@ -55,7 +55,7 @@ FIELDS = tuple(layout.Sections.__dataclass_fields__)
 def head_of(image: str) -> layout.Metadata:
     """Its metadata."""
     shape, dtype, keywords, kind, ring, semaphores = IMAGES[image]
-    head = layout.fresh_metadata(image, shape, dtype, "2.01")
+    head = layout.build_metadata(image, shape, dtype, "2.01")
     head.n_keywords, head.imagetype, head.ring_size, head.sem = keywords, kind, ring, semaphores
     return head
 
@@ -70,7 +70,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize("image", IMAGES)
 def test_sections_lie_where_the_library_said(release: str, image: str) -> None:
     printed = dict(zip(FIELDS, PRINTED[release][image], strict=True))
-    found = layout.found_sections(head_of(image), PRINTED[release][image][-1])
+    found = layout.detect_sections(head_of(image), PRINTED[release][image][-1])
     assert found is not None
     for field, at in printed.items():
         if at is not None:
@@ -82,7 +82,7 @@ def test_sections_lie_where_the_library_said(release: str, image: str) -> None:
 def test_images_of_every_layout_are_read_and_written(folder: Path, release: str, image: str) -> None:
     file, size = layout.shm_path(image), PRINTED[release][image][-1]
     file.write_bytes(bytes(head_of(image)).ljust(size, b"\0"))
-    found = layout.found_sections(head_of(image), size)
+    found = layout.detect_sections(head_of(image), size)
     assert found is not None
     shape, dtype, _, kind, ring, _ = IMAGES[image]
     frame, n = (shape[1:], shape[0]) if kind == CIRCULAR else (shape, 1)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from escape_hw.api.mirror import DMInfo
 from escape_hw.errors import CommandRejected, DeviceError, DeviceLost, NotOpen, SettingRejected
 from escape_hw.safety.limits import MirrorLimits
-from escape_hw.testing.reference import RecordingMirror
+from escape_hw.testing.reference_devices import RecordingMirror
 
 N = 21
 
@@ -37,7 +37,7 @@ class Flaky(RecordingMirror):
         if self.open_error is not None:
             raise self.open_error
 
-    def _abandon(self) -> None:
+    def _release_after_failed_open(self) -> None:
         self.abandoned += 1
 
     def _close(self) -> None:
@@ -91,8 +91,8 @@ def test_flatten_after_reopening_sends_again() -> None:
 def test_flatten_arrives_from_anywhere_under_any_limits(limits: MirrorLimits, seed: int) -> None:
     rng = np.random.default_rng(seed)
     with RecordingMirror(limits=limits) as dm:
-        guard = dm._checked()
-        flat, *_ = guard._legalise(rng.standard_normal(N))
+        guard = dm._guard_when_open()
+        flat, *_ = guard._apply_static_limits(rng.standard_normal(N))
         dm.set_flat(flat)
         for _ in range(3):
             dm.send(rng.standard_normal(N))
@@ -318,13 +318,13 @@ def test_two_threads_never_break_the_slew_rule_between_them() -> None:
 
 def test_flattenings_are_counted() -> None:
     with RecordingMirror(limits=MirrorLimits()) as dm:
-        before = dm.flattened_count
+        before = dm.flatten_count
         dm.send([0.3] * N)
-        assert dm.flattened_count == before
+        assert dm.flatten_count == before
         dm.flatten()
         # Flat already: whoever asks begins anew all the same.
         dm.flatten()
-        assert dm.flattened_count == before + 2
+        assert dm.flatten_count == before + 2
 
 
 def test_guard_report_reaches_the_counters() -> None:
@@ -344,8 +344,8 @@ def test_guard_report_reaches_the_counters() -> None:
 def test_what_obeys_is_sent_as_it_is_and_nothing_else_is(values: list[float], slew: float) -> None:
     with RecordingMirror("dm", MirrorLimits(max_stroke=0.9, max_slew=slew, max_mean=0.3)) as dm:
         shape = np.array(values)
-        obeys = dm.obeys(shape)
+        is_legal = dm.is_legal(shape)
         assert dm.sent_count == 0
         report = dm.send(shape)
-        assert obeys == report.guard.untouched
-        assert not obeys or np.array_equal(report.sent, shape)
+        assert is_legal == report.guard.is_unchanged
+        assert not is_legal or np.array_equal(report.sent, shape)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from escape_sim.mirror_dynamics import MirrorDynamics
+from escape_sim.mirror.dynamics import MirrorDynamics
 
 SETTLING = 4e-4
 

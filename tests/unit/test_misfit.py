@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.misfit import normal_equations
+from escape_hw.calibration.sprint.normal_equations import normal_equations
 
 N_COMMON, N_SLOPES, N_ACT, N_MODES = 7, 11, 6, 5
 
@@ -44,7 +44,7 @@ def test_the_system_is_that_of_the_dense_jacobian(case):
     j = jacobian(case)
     system = normal_equations(**case)
     assert system.matrix == pytest.approx(j.T @ j + np.diag(case["precision"]), abs=1e-10)
-    assert system.right == pytest.approx(
+    assert system.right_hand_side == pytest.approx(
         j.T @ case["residual"].ravel() - case["precision"] * case["offset"], abs=1e-10
     )
     assert system.n_common == N_COMMON
@@ -57,12 +57,12 @@ def test_its_solution_is_the_penalised_least_squares(case):
     design = np.concatenate([jacobian(case), np.diag(root)])
     data = np.concatenate([case["residual"].ravel(), -root * case["offset"]])
     want = np.linalg.lstsq(design, data, rcond=None)[0]
-    assert np.linalg.solve(system.matrix, system.right) == pytest.approx(want, abs=1e-9)
+    assert np.linalg.solve(system.matrix, system.right_hand_side) == pytest.approx(want, abs=1e-9)
 
 
 def test_the_callers_arrays_stay_as_they_were(case):
     before = {name: values.copy() for name, values in case.items()}
-    normal_equations(**case).efficient()
+    normal_equations(**case).projected_jacobian()
     assert all(np.array_equal(case[name], before[name]) for name in case)
 
 
@@ -73,7 +73,7 @@ def test_efficient_derivatives_are_what_random_effects_cannot_imitate(case):
     prior = np.diag(case["precision"][k:])
     imitation = np.linalg.solve(random.T @ random + prior, random.T @ common)
     want = (common - random @ imitation).T.reshape(k, N_SLOPES, N_MODES)
-    assert system.efficient() == pytest.approx(want, abs=1e-10)
+    assert system.projected_jacobian() == pytest.approx(want, abs=1e-10)
 
 
 def test_without_priors_they_are_orthogonal_to_every_random_effect(case):
@@ -84,7 +84,7 @@ def test_without_priors_they_are_orthogonal_to_every_random_effect(case):
     for name in ("model", "residual"):
         vague[name] = rng.standard_normal((N_SLOPES, 40))
     vague["common"] = rng.standard_normal((N_COMMON, N_SLOPES, 40))
-    left = normal_equations(**vague).efficient()
+    left = normal_equations(**vague).projected_jacobian()
     for a in range(N_ACT):
         for zonal in (vague["slopes_gain"], vague["slopes_width"]):
             effect = np.outer(zonal[:, a], vague["modes"][a])
@@ -103,7 +103,7 @@ def test_information_on_the_common_parameters_is_that_of_the_efficient_derivativ
     a, b, c = system.matrix[:k, :k], system.matrix[:k, k:], system.matrix[k:, k:]
     reduced = a - b @ np.linalg.solve(c, b.T)
     imitation = np.linalg.solve(c, b.T)
-    left = system.efficient().reshape(k, -1)
+    left = system.projected_jacobian().reshape(k, -1)
     priors = imitation.T @ (case["precision"][k:, None] * imitation) + np.diag(case["precision"][:k])
     assert left @ left.T + priors == pytest.approx(reduced, abs=1e-9)
 
@@ -124,4 +124,4 @@ def test_noise_that_slopes_share_does_not_average_out(together, want):
         np.ones(N_COMMON + 2 * N_ACT + n_slopes),
         np.zeros(N_COMMON + 2 * N_ACT + n_slopes),
     )
-    assert system.shared_noise() == pytest.approx(want, rel=0.1)
+    assert system.estimate_noise_inflation() == pytest.approx(want, rel=0.1)

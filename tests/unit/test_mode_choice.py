@@ -7,13 +7,13 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.degeneracy import degeneracies
-from escape_hw.calibration.light import LARGEST
-from escape_hw.calibration.mode_choice import fisher_choice
-from escape_hw.calibration.robust import trust
+from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
+from escape_hw.calibration.sprint.least_squares import MAX_STEP
+from escape_hw.calibration.sprint.mode_choice import choose_by_fisher_information
+from escape_hw.calibration.sprint.slope_weights import huber_weights
 
 NAMES = ("gain", "shift_x", "shift_y", "rotation", "radial_scaling", "tangential_scaling")
-UNIT = np.append(1.0, LARGEST)
+UNIT = np.append(1.0, MAX_STEP)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def cost(by_mode: np.ndarray, chosen: tuple[int, ...], choice: str) -> float:
 @pytest.mark.parametrize("choice", ["d-optimal", "a-optimal"])
 def test_the_greedy_choice_is_among_the_best(by_mode, choice):
     costs = {c: cost(by_mode, c, choice) for c in combinations(range(9), 4)}
-    found = tuple(fisher_choice(by_mode, 4, choice).tolist())
+    found = tuple(choose_by_fisher_information(by_mode, 4, choice).tolist())
     assert list(found) == sorted(found)
     better = sum(value < costs[found] - 1e-9 for value in costs.values())
     # The best of 126 sets, or nearly.
@@ -42,38 +42,38 @@ def test_the_greedy_choice_is_among_the_best(by_mode, choice):
 
 
 def test_it_takes_all_there_are(by_mode):
-    assert fisher_choice(by_mode, 20, "d-optimal").tolist() == list(range(9))
+    assert choose_by_fisher_information(by_mode, 20, "d-optimal").tolist() == list(range(9))
 
 
 def test_a_degeneracy_is_named_with_its_reason():
     sigma = np.array([0.01, 0.1, 0.1, 0.01, 0.5, 0.5])
     correlation = np.eye(6)
     correlation[0, 4] = correlation[4, 0] = 0.999
-    (note,) = degeneracies(correlation * np.outer(sigma, sigma), NAMES)
+    (note,) = describe_degeneracies(correlation * np.outer(sigma, sigma), NAMES)
     assert note.startswith("gain and radial scaling can hardly be told apart (a larger mirror")
     # 1 / sqrt(1 - 0.999^2) = 22.
     assert "22 times better" in note
 
 
 def test_what_is_known_well_enough_is_not_mentioned():
-    assert degeneracies(np.eye(6), NAMES) == ()
+    assert describe_degeneracies(np.eye(6), NAMES) == ()
     some = np.eye(6)
     some[1, 2] = some[2, 1] = 0.9
-    assert degeneracies(some, NAMES) == ()
+    assert describe_degeneracies(some, NAMES) == ()
 
 
 def test_three_that_go_together_are_named_together():
     direction = np.array([0, 0, 0, 0, 1.0, -1.0]) + np.array([1.0, 0, 0, 0, 0, 0])
     direction /= np.linalg.norm(direction)
     covariance = np.eye(6) - (1 - 1e-4) * np.outer(direction, direction)
-    (note,) = degeneracies(covariance, NAMES)
+    (note,) = describe_degeneracies(covariance, NAMES)
     assert note.startswith("gain, radial scaling and tangential scaling can hardly be told apart")
 
 
 def test_only_sub_apertures_that_stand_out_are_trusted_less():
     residual = np.random.default_rng(0).standard_normal((60, 40))
-    assert trust(residual).min() > 0.9
+    assert huber_weights(residual).min() > 0.9
     residual[[3, 33]] *= 10
-    shares = trust(residual)
+    shares = huber_weights(residual)
     np.testing.assert_allclose(shares[[3, 33]], 0.15, atol=0.03)
     assert np.delete(shares, [3, 33]).min() > 0.9

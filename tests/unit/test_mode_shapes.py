@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.mode_shapes import fourier, zernike
+from escape_hw.calibration.modes.bases import fourier, zernike
 from escape_hw.errors import CalibrationError
-from escape_sim.influence import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions
 
 N = 64
 

@@ -9,9 +9,15 @@ import pytest
 from scipy import integrate, special
 
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.modes import fix_signs, karhunen_loeve, unit_rms, von_karman_covariance, zonal
+from escape_hw.calibration.modes.bases import (
+    fix_signs,
+    karhunen_loeve,
+    scale_to_unit_rms,
+    von_karman_covariance,
+    zonal,
+)
 from escape_hw.errors import CalibrationError
-from escape_sim.influence import InfluenceFunctions, layout_positions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, layout_positions
 
 DIAMETER = 6.75e-3
 N = 40
@@ -168,6 +174,6 @@ def test_zonal_modes_move_one_actuator_each(mirror):
 
 def test_unit_rms_scales_and_nothing_else(mirror):
     m2c = np.random.default_rng(1).normal(size=(mirror[0].shape[0], 5))
-    scaled = unit_rms(m2c, *mirror)
+    scaled = scale_to_unit_rms(m2c, *mirror)
     assert surfaces_of(scaled, mirror).std(axis=1) == pytest.approx(np.ones(5))
     assert scaled / m2c == pytest.approx(np.broadcast_to((scaled / m2c)[0], m2c.shape))

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from escape_hw.api.modulator import Modulation
-from escape_hw.api.screen import ScreenState
+from escape_hw.api.phase_screen import ScreenState
 from escape_hw.errors import DeviceError, NotOpen, SettingRejected
-from escape_hw.testing.reference import QuantisedModulator, SteadyScreen
+from escape_hw.testing.reference_devices import IdealPhaseScreen, QuantisedModulator
 
 
 def test_frequency_is_quantised_and_stated() -> None:
@@ -69,7 +69,7 @@ def test_a_stage_without_a_clock_of_its_own_is_parked_when_released() -> None:
 
 
 def test_screen_keeps_what_is_not_given() -> None:
-    with SteadyScreen() as screen:
+    with IdealPhaseScreen() as screen:
         assert screen.set(inserted=False) == ScreenState(1, False, 0.0135)
         assert screen.set(screen=3, speed_m_s=0.0) == ScreenState(3, False, 0.0)
         assert screen.set(blocked=True) == ScreenState(3, False, 0.0, True)
@@ -91,7 +91,7 @@ def test_screen_keeps_what_is_not_given() -> None:
     ],
 )
 def test_screen_refuses_what_means_nothing(change: dict[str, Any], words: str) -> None:
-    with SteadyScreen("changer") as screen:
+    with IdealPhaseScreen("changer") as screen:
         before = screen.state
         with pytest.raises(SettingRejected, match=words):
             screen.set(**change)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.pyramid import PyramidPupils
-from escape_hw.calibration.acquire import Motion
+from escape_hw.calibration.acquisition.frames import SlopeStatistics
 
 
 def pupils() -> PyramidPupils:
@@ -21,13 +21,13 @@ def pupils() -> PyramidPupils:
 def run(frames: int, memory: float, white: float, seed: int) -> PyramidPupils:
     """Slopes that forget over ``memory`` frames beside a white share of their variance."""
     rng = np.random.default_rng(seed)
-    motion, keep = Motion(128), np.exp(-1 / memory)
+    slope_statistics, keep = SlopeStatistics(128), np.exp(-1 / memory)
     air = rng.standard_normal(128)
     for _ in range(frames):
         air = keep * air + np.sqrt(1 - keep**2) * rng.standard_normal(128)
         slopes = np.sqrt(1 - white) * air + np.sqrt(white) * rng.standard_normal(128)
-        motion.add((0.3 * slopes + 0.1).astype(np.float32), 0.05 * rng.standard_normal(4))
-    found = motion.of(pupils())
+        slope_statistics.add((0.3 * slopes + 0.1).astype(np.float32), 0.05 * rng.standard_normal(4))
+    found = slope_statistics.annotate_geometry(pupils())
     assert isinstance(found, PyramidPupils)
     return found
 
@@ -35,47 +35,52 @@ def run(frames: int, memory: float, white: float, seed: int) -> PyramidPupils:
 @pytest.mark.parametrize(("memory", "white"), [(20.0, 0.0), (20.0, 0.6), (5.0, 0.3)])
 def test_motion_pokes_and_what_lasts(memory: float, white: float) -> None:
     found = [run(1500, memory, white, seed) for seed in range(4)]
-    assert np.mean([f.motion for f in found]) == pytest.approx(0.3, rel=0.03)
+    assert np.mean([f.slope_statistics for f in found]) == pytest.approx(0.3, rel=0.03)
     assert np.mean([f.pokes for f in found]) == pytest.approx(0.1, rel=0.03)
-    assert np.mean([f.steady for f in found]) == pytest.approx((1 - white) * np.exp(-2 / memory), abs=0.04)
+    assert np.mean([f.persistent_fraction for f in found]) == pytest.approx(
+        (1 - white) * np.exp(-2 / memory), abs=0.04
+    )
     # The integral of an exponential's correlation is twice its memory; the air's share is told two frames
     # late and a little small, so its correlation seems so much longer. Noise that is new in every frame
     # does not count as states of the air.
     integral = 1 + np.exp(2 / memory) * (2 / (np.exp(1 / memory) - 1))
-    assert np.mean([f.looks for f in found]) == pytest.approx(1500 / integral, rel=0.3)
+    assert np.mean([f.n_effective for f in found]) == pytest.approx(1500 / integral, rel=0.3)
 
 
 def test_too_few_frames_tell_no_looks() -> None:
-    assert run(3, 5.0, 0.0, 1).looks == 0
-    assert run(2, 5.0, 0.0, 1).steady == 0
+    assert run(3, 5.0, 0.0, 1).n_effective == 0
+    assert run(2, 5.0, 0.0, 1).persistent_fraction == 0
 
 
 def test_a_run_that_goes_on_later_tells_the_same() -> None:
     rng = np.random.default_rng(7)
     slopes, pokes = rng.standard_normal((300, 16)).cumsum(axis=0), rng.standard_normal((300, 4))
-    whole, first, second = Motion(16), Motion(16), Motion(16)
+    whole, first, second = SlopeStatistics(16), SlopeStatistics(16), SlopeStatistics(16)
     for k in range(300):
         whole.add(slopes[k].astype(np.float32), pokes[k])
         if k == 170:
             second.restore(first.state())
         (first if k < 170 else second).add(slopes[k].astype(np.float32), pokes[k])
-    one, other = whole.of(pupils()), second.of(pupils())
+    one, other = whole.annotate_geometry(pupils()), second.annotate_geometry(pupils())
     assert isinstance(one, PyramidPupils)
     assert isinstance(other, PyramidPupils)
-    assert (other.motion, other.pokes) == pytest.approx((one.motion, one.pokes))
+    assert (other.slope_statistics, other.pokes) == pytest.approx((one.slope_statistics, one.pokes))
     # Two pairs across the interruption are lost.
-    assert other.looks == pytest.approx(one.looks, rel=0.03)
-    assert other.steady == pytest.approx(one.steady, abs=0.02)
+    assert other.n_effective == pytest.approx(one.n_effective, rel=0.03)
+    assert other.persistent_fraction == pytest.approx(one.persistent_fraction, abs=0.02)
 
 
 def test_a_closed_loop_tells_nothing_of_the_air_within_a_lenslet() -> None:
     rng, lenslets = np.random.default_rng(3), fake.grid(8)
-    motion, slopes = Motion(lenslets.n_slopes), np.zeros(lenslets.n_slopes)
+    slope_statistics, slopes = SlopeStatistics(lenslets.n_slopes), np.zeros(lenslets.n_slopes)
     for _ in range(200):
         # What a loop leaves lasts for some frames as well.
         slopes = 0.8 * slopes + 0.02 * rng.standard_normal(slopes.size)
-        motion.add(slopes.astype(np.float32))
-    opened, closed = motion.of(lenslets), motion.of(lenslets, closed=True)
-    assert 0 < opened.air_px < 0.2 * lenslets.air_px
-    assert closed.air_px == lenslets.air_px
+        slope_statistics.add(slopes.astype(np.float32))
+    opened, closed = (
+        slope_statistics.annotate_geometry(lenslets),
+        slope_statistics.annotate_geometry(lenslets, closed=True),
+    )
+    assert 0 < opened.turbulence_px < 0.2 * lenslets.turbulence_px
+    assert closed.turbulence_px == lenslets.turbulence_px
     assert closed.motion_px == opened.motion_px < lenslets.motion_px

@@ -8,15 +8,15 @@ import fake_results as fake
 import numpy as np
 import pytest
 
-from escape_hw.api.matrix import InteractionMatrix
-from escape_hw.calibration.optical_gain import (
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.calibration.acquisition.pokes import noise_gain, scale_to_strehl_budget, strehl_loss
+from escape_hw.calibration.optical_gain.matrix_comparison import (
     deviation_ratio,
     projection,
     projector,
-    scaled_matrix,
+    scale_matrix,
     slope_weights,
 )
-from escape_hw.calibration.poke_cost import noise_gain, strehl_loss, within_budget
 from escape_hw.errors import CalibrationError
 
 N_MODES = 12
@@ -38,7 +38,7 @@ def noisy(matrix: InteractionMatrix, share: float, rng: np.random.Generator) -> 
 
 def test_both_estimators_are_right_without_noise():
     reference = clean()
-    measured = scaled_matrix(reference, TRUE)
+    measured = scale_matrix(reference, TRUE)
     for value, sigma in (deviation_ratio(measured, reference), projection(measured, reference)):
         np.testing.assert_allclose(value, TRUE, rtol=1e-5)
         assert not sigma.any()
@@ -48,7 +48,7 @@ def test_noise_biases_the_ratio_as_predicted_and_the_projection_not():
     rng, reference = np.random.default_rng(0), clean()
     ratios, fits, errors = [], [], []
     for _ in range(40):
-        measured = noisy(scaled_matrix(reference, TRUE), 0.5, rng)
+        measured = noisy(scale_matrix(reference, TRUE), 0.5, rng)
         ratios.append(deviation_ratio(measured, reference)[0])
         value, sigma = projection(measured, reference)
         fits.append(value)
@@ -72,7 +72,7 @@ def test_a_noisy_reference_does_not_lower_the_gain():
     rng, reference = np.random.default_rng(2), clean()
     pulls = []
     for _ in range(40):
-        value, sigma = projection(noisy(scaled_matrix(reference, TRUE), 0.1, rng), noisy(reference, 0.3, rng))
+        value, sigma = projection(noisy(scale_matrix(reference, TRUE), 0.1, rng), noisy(reference, 0.3, rng))
         pulls.append((value - TRUE) / sigma)
     # Without the correction the gains would be lower by 0.09 * 11 / 3, many standard errors.
     assert abs(np.mean(pulls)) < 0.3
@@ -108,12 +108,12 @@ def test_a_reference_of_noise_and_matrices_that_do_not_fit_are_refused():
 
 def test_scaling_takes_the_gains_errors_along():
     reference = clean()
-    made = scaled_matrix(reference, TRUE, 0.1 * TRUE)
+    made = scale_matrix(reference, TRUE, 0.1 * TRUE)
     np.testing.assert_allclose(made.data, reference.data * TRUE, rtol=1e-6)
     np.testing.assert_allclose(made.sigma, np.abs(reference.data) * 0.1 * TRUE, rtol=1e-5)
     for wrong in (-TRUE, TRUE[1:], np.full(N_MODES, np.nan)):
         with pytest.raises(ValueError, match="12 positive optical gains"):
-            scaled_matrix(reference, wrong)
+            scale_matrix(reference, wrong)
 
 
 @pytest.mark.parametrize(("gain", "delay"), [(0.3, 2), (0.5, 2), (0.5, 1), (0.3, 3)])
@@ -132,7 +132,7 @@ def test_the_budget_holds_and_small_pokes_stay_as_they_are():
     amplitude = np.full(94, 0.002)
     whole = strehl_loss(amplitude, 2.2e-6, 635e-9)
     assert whole == pytest.approx(1 - np.exp(-94 / 3 * (2 * np.pi * 8.8 / 635) ** 2), rel=1e-6)
-    lowered = within_budget(amplitude, 0.01, 2.2e-6, 635e-9, 1.3)
+    lowered = scale_to_strehl_budget(amplitude, 0.01, 2.2e-6, 635e-9, 1.3)
     assert strehl_loss(lowered, 2.2e-6, 635e-9, 1.3) == pytest.approx(0.01)
-    assert within_budget(1e-3 * amplitude, 0.01, 2.2e-6, 635e-9) == pytest.approx(1e-3 * amplitude)
-    assert not within_budget(0 * amplitude, 0.01, 2.2e-6, 635e-9).any()
+    assert scale_to_strehl_budget(1e-3 * amplitude, 0.01, 2.2e-6, 635e-9) == pytest.approx(1e-3 * amplitude)
+    assert not scale_to_strehl_budget(0 * amplitude, 0.01, 2.2e-6, 635e-9).any()

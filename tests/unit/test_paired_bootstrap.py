@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.pipeline.paired_bootstrap import PairedComparison, compare_pairs, statement
+from escape_hw.pipeline.statistics import PairedComparison, compare_pairs, describe_comparison
 
 REPEATS = 200
 
@@ -68,4 +68,4 @@ def test_few_pairs_are_refused():
     ],
 )
 def test_the_words_follow_from_the_interval(found, words):
-    assert words in statement("A", "B", found, 0.01)
+    assert words in describe_comparison("A", "B", found, 0.01)

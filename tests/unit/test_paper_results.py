@@ -9,18 +9,18 @@ from made_up_sweep import SWEPT, made_up
 
 from escape_hw.errors import ConfigError
 from escape_hw.io.run_folder import RunFolder
-from escape_hw.report.build import write_report
-from escape_hw.report.paper_results import write_results
-from escape_hw.runtime.paper import sweep_runs
-from escape_hw.runtime.sweep.document import sweep_document
-from escape_hw.runtime.sweep.result import conclude
+from escape_hw.paper.cases import find_sweeps
+from escape_hw.paper.results import write_results
+from escape_hw.report.run_report import write_report
+from escape_hw.runtime.sweep.products import sweep_document
+from escape_hw.runtime.sweep.result import analyse_sweep
 
 
 @pytest.fixture(scope="module")
 def sweep_run(tmp_path_factory):
     with RunFolder("razor-shwfs", "sweep", tmp_path_factory.mktemp("sweep") / "run") as folder:
         head = {"schema": 1, "command": "sweep", "system": "razor-shwfs", "simulated": True, "seed": 1}
-        folder.write_result({**head, **sweep_document(conclude(SWEPT, made_up(0.0), 0.01))})
+        folder.write_result({**head, **sweep_document(analyse_sweep(SWEPT, made_up(0.0), 0.01))})
     return folder.path
 
 
@@ -33,7 +33,7 @@ def test_without_runs_every_row_says_how_to_make_it(tmp_path):
 
 
 def test_a_sweep_fills_its_rows_and_draws_its_figures(tmp_path, sweep_run):
-    runs = sweep_runs([sweep_run])
+    runs = find_sweeps([sweep_run])
     assert list(runs) == ["sweep-shwfs"]
     write_results(tmp_path, runs)
     rows = json.loads((tmp_path / "results.json").read_text())["rows"]
@@ -55,11 +55,11 @@ def test_the_report_tells_of_a_sweep(sweep_run):
 def test_what_is_no_sweep_of_the_papers_is_refused(tmp_path):
     (tmp_path / "result.json").write_text('{"system": "maps-nir", "sweep": {}, "products": {}}')
     with pytest.raises(ConfigError, match="--sweep"):
-        sweep_runs([tmp_path])
+        find_sweeps([tmp_path])
 
 
 def test_a_sweep_that_was_broken_off_is_not_taken_for_a_finished_one(sweep_run, tmp_path):
     document = json.loads((sweep_run / "result.json").read_text())
     (tmp_path / "result.json").write_text(json.dumps({**document, "partial": True}))
     with pytest.raises(ConfigError, match="broken off; finish it"):
-        sweep_runs([tmp_path])
+        find_sweeps([tmp_path])

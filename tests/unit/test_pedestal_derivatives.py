@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 import small_system
 
-from escape_hw.api.departures import PEDESTAL, MirrorDepartures
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_hw.api.results import Measured, RegistrationEstimate
-from escape_hw.calibration.found_mirror import found_jacobian, found_matrix
-from escape_hw.calibration.linearisation import SHAPE, WIDTH, Problem, State
-from escape_hw.calibration.misfit import Priors
-from escape_hw.calibration.weighted import WeightedMatrix
-from escape_sim.model import ShackHartmannModel, make_model, nominal_grid
+from escape_hw.api.results import PEDESTAL, ActuatorCorrections, Estimate, RegistrationEstimate
+from escape_hw.calibration.sprint.mixed_effects import SHAPE, WIDTH, Problem, State
+from escape_hw.calibration.sprint.normal_equations import Priors
+from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_jacobian, compute_fitted_matrix
+from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
+from escape_sim.models.shack_hartmann import ShackHartmannModel, make_model, nominal_grid
 
 PLACE = Registration(-16.0, 31.0, -0.77, 1.9, 0.5)
 #: Half steps of the differences by the registration, and by width and pedestal.
@@ -73,28 +72,38 @@ def test_unequal_widths_spread_the_pedestal_too(
     fitted = problem.zonal(replace(state, actuator_width=unequal)) - problem.zonal(state)
     assert np.linalg.norm(fitted - want) < 0.01 * np.linalg.norm(want)
     nothing = np.zeros(model.n_act)
-    single, estimate = np.eye(model.n_act), told(MirrorDepartures(nothing, nothing, unequal, pedestal))
-    alike = told(MirrorDepartures(nothing, nothing, nothing, pedestal))
-    made = found_matrix(model, PLACE, estimate, single) - found_matrix(model, PLACE, alike, single)
+    single, estimate = np.eye(model.n_act), told(ActuatorCorrections(nothing, nothing, unequal, pedestal))
+    alike = told(ActuatorCorrections(nothing, nothing, nothing, pedestal))
+    made = compute_fitted_matrix(model, PLACE, estimate, single) - compute_fitted_matrix(
+        model, PLACE, alike, single
+    )
     assert np.linalg.norm(made - want) < 0.01 * np.linalg.norm(want)
 
 
 def test_a_found_mirror_moves_with_its_pedestal(model: ShackHartmannModel) -> None:
     nothing, single = np.zeros(model.n_act), np.eye(model.n_act)
-    open_gains = MirrorDepartures(nothing, nothing + 0.01, nothing, 0.5)
+    open_gains = ActuatorCorrections(nothing, nothing + 0.01, nothing, 0.5)
     estimate = told(open_gains)
-    matrix, derivatives, variance = found_jacobian(model, estimate, single)
+    matrix, derivatives, variance = compute_fitted_jacobian(model, estimate, single)
     np.testing.assert_allclose(variance, np.square(0.01 * matrix), atol=1e-4 * variance.max())
     for k, step in enumerate(np.diag(STEPS)):
         more, less = (Registration.from_array(PLACE.to_array() + sign * step) for sign in (1, -1))
-        want = (found_matrix(model, more, estimate, single) - found_matrix(model, less, estimate, single)) / (
-            2 * step.sum()
-        )
+        want = (
+            compute_fitted_matrix(model, more, estimate, single)
+            - compute_fitted_matrix(model, less, estimate, single)
+        ) / (2 * step.sum())
         assert np.linalg.norm(derivatives[k] - want) < 1e-3 * np.linalg.norm(want), PARAMETERS[k]
 
 
-def told(departures: MirrorDepartures) -> RegistrationEstimate:
+def told(actuator_corrections: ActuatorCorrections) -> RegistrationEstimate:
     """An estimate with these departures."""
     return RegistrationEstimate(
-        PLACE, np.eye(5), Measured(1.0, 0.0), Measured(1.12, 0.0), True, (), 1.0, departures=departures
+        PLACE,
+        np.eye(5),
+        Estimate(1.0, 0.0),
+        Estimate(1.12, 0.0),
+        True,
+        (),
+        1.0,
+        actuator_corrections=actuator_corrections,
     )

@@ -14,9 +14,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from escape_hw.api.benchmark import BenchmarkRow, alternate
-from escape_hw.cli import perf
-from escape_hw.cli.benchmarks import docrime, docrime_frames, peer, pipeline
+from escape_benchmarks.calibration import docrime
+from escape_benchmarks.calibration import docrime as docrime_frames
+from escape_benchmarks.peers import pyrtcao as peer
+from escape_benchmarks.real_time import pipeline
+from escape_hw.api.benchmark import BenchmarkRow, time_alternately
+from escape_hw.cli.system import perf
 from escape_hw.errors import ConfigError
 
 
@@ -63,26 +66,28 @@ def test_two_functions_are_timed_in_turn():
         calls.append(name)
         time.sleep(seconds)
 
-    ours, theirs = alternate(lambda: call("a", 0.004), lambda: call("b", 0.012), seconds=0.05, rounds=3)
+    ours, theirs = time_alternately(
+        lambda: call("a", 0.004), lambda: call("b", 0.012), seconds=0.05, rounds=3
+    )
     assert 0.004 <= ours < 0.012 <= theirs
     turns = [c for k, c in enumerate(calls) if k == 0 or calls[k - 1] != c]
     assert "".join(turns).endswith("ababab")
-    assert alternate(lambda: call("a", 0.001), None, seconds=0.01)[1] is None
+    assert time_alternately(lambda: call("a", 0.001), None, seconds=0.01)[1] is None
 
 
 def test_stages_run_in_order_and_by_name(stages):
-    assert list(perf.available()) == ["first", "second"]
-    assert len(perf.measure()) == 2
-    assert len(perf.measure(["second"])) == 1
+    assert list(perf.find_benchmarks()) == ["first", "second"]
+    assert len(perf.run_benchmarks()) == 2
+    assert len(perf.run_benchmarks(["second"])) == 1
 
 
 def test_an_unknown_stage_is_refused_before_anything_runs(stages):
     with pytest.raises(ConfigError, match=r"'third'.*first, second"):
-        perf.measure(["first", "third"])
+        perf.run_benchmarks(["first", "third"])
 
 
 def test_the_document_is_strict_json(stages):
-    document = json.loads(json.dumps(perf.document(perf.measure(["first"])), allow_nan=False))
+    document = json.loads(json.dumps(perf.document(perf.run_benchmarks(["first"])), allow_nan=False))
     assert document["schema"] == 1
     assert document["simulated"] is True
     assert set(document["rows"][0]) >= {"stage", "ours", "peer", "peer_name", "ratio", "unit"}
@@ -95,8 +100,10 @@ def test_the_stages_are_declared(request):
 
 
 def test_a_missing_peer_is_a_row_without_a_figure(monkeypatch):
-    monkeypatch.setattr(pipeline, "pyrtc", lambda module: None)
-    monkeypatch.setattr(pipeline, "alternate", lambda ours, theirs: (1e-6, None if theirs is None else 2e-6))
+    monkeypatch.setattr(pipeline, "import_pyrtc", lambda module: None)
+    monkeypatch.setattr(
+        pipeline, "time_alternately", lambda ours, theirs: (1e-6, None if theirs is None else 2e-6)
+    )
     rows = [one for one in pipeline.run() if "pyrtcao" in one.peer_name]
     assert len(rows) >= 4
     for one in rows:
@@ -108,8 +115,8 @@ def test_a_missing_peer_is_a_row_without_a_figure(monkeypatch):
 
 def test_the_core_does_not_import_the_peer():
     code = (
-        "import sys, escape_hw.cli.perf\n"
-        "from escape_hw.cli.benchmarks import docrime, pipeline\n"
+        "import sys, escape_hw.cli.system.perf\n"
+        "from escape_benchmarks import docrime, pipeline\n"
         "print(sorted({'pyrtc', 'OOPAO', 'escape_sim'} & set(sys.modules)))"
     )
     env = {"PYTHONPATH": ":".join(p for p in sys.path if p)}
@@ -119,11 +126,11 @@ def test_the_core_does_not_import_the_peer():
 
 def test_the_frames_of_the_docrime_stage_answer_one_frame_later(monkeypatch):
     monkeypatch.setattr(docrime, "_N_FRAMES", 1500)
-    data = docrime.make_run(None)
+    data = docrime.simulate_run(None)
     x, y = data.pokes[:-1].astype(float), data.slopes[1:].astype(float)
     assert data.error(np.linalg.solve(x.T @ x, x.T @ y).T) < 0.2
-    assert data.error(docrime.whole(data)) < 0.2
-    assert np.allclose(docrime.whole(data), docrime.streaming(data), rtol=0, atol=1e-4)
+    assert data.error(docrime.estimate_recorded(data)) < 0.2
+    assert np.allclose(docrime.estimate_recorded(data), docrime.estimate_streaming(data), rtol=0, atol=1e-4)
 
 
 def test_the_docrime_run_counts_real_frames_against_the_benchs_rate(monkeypatch):

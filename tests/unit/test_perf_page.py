@@ -7,7 +7,7 @@ import json
 import pytest
 
 from escape_hw.api.benchmark import BenchmarkRow, product_rate
-from escape_hw.cli.perf_page import BEGIN, END, check_page, conditions, render, write_page
+from escape_hw.cli.system.perf import BEGIN, END, measurement_conditions, render, require_page, write_page
 from escape_hw.errors import ConfigError
 
 ROWS = [
@@ -20,8 +20,8 @@ def test_the_table_replaces_what_stood_between_the_marks(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(f"# Title\n\nprose\n\n{BEGIN}\nold\n{END}\n\nmore prose\n")
     for _ in range(2):
-        check_page(page)
-        write_page(page, ROWS, conditions())
+        require_page(page)
+        write_page(page, ROWS, measurement_conditions())
     text = page.read_text()
     assert text.startswith("# Title\n\nprose\n")
     assert text.endswith(f"{END}\n\nmore prose\n")
@@ -32,19 +32,19 @@ def test_the_table_replaces_what_stood_between_the_marks(tmp_path):
 
 def test_a_new_page_is_made_and_a_page_without_marks_refused(tmp_path):
     new = tmp_path / "new.md"
-    check_page(new)
-    write_page(new, ROWS, conditions())
-    check_page(new)
+    require_page(new)
+    write_page(new, ROWS, measurement_conditions())
+    require_page(new)
     bare = tmp_path / "bare.md"
     bare.write_text("nothing\n")
     with pytest.raises(ConfigError, match="no place for the table"):
-        check_page(bare)
+        require_page(bare)
     with pytest.raises(ConfigError, match="is no folder"):
-        check_page(tmp_path / "missing" / "page.md")
+        require_page(tmp_path / "missing" / "page.md")
 
 
 def test_conditions_name_what_was_there_and_what_was_not():
-    at = json.loads(json.dumps(conditions(), allow_nan=False))
+    at = json.loads(json.dumps(measurement_conditions(), allow_nan=False))
     assert at["cores"] >= 1
     assert at["versions"]["numpy"]
     at["versions"]["specula"] = None

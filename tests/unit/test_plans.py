@@ -9,10 +9,10 @@ import pytest
 from small_system import SMALL
 
 from escape_hw.bench import Bench
-from escape_hw.calibration.poke_patterns import RandomPokes
-from escape_hw.calibration.sensor_setup import modal_basis, poke_amplitudes
-from escape_hw.config.load import load_system
-from escape_hw.server.plans import Planner
+from escape_hw.calibration.acquisition.pokes import RandomPokes
+from escape_hw.calibration.acquisition.sensor_setup import build_modal_basis, compute_poke_amplitudes
+from escape_hw.config.loader import load_system
+from escape_hw.server.engine.planning import ProcedurePlanner
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +23,13 @@ def bench() -> Iterator[Bench]:
 
 def commands(bench: Bench, poke: float, frames: int = 4000) -> np.ndarray:
     """Shapes that random pokes ask for ``(frames, n_act)``."""
-    m2c = modal_basis(bench)
-    pokes = RandomPokes(poke_amplitudes(bench, m2c, poke), np.random.default_rng(5))
+    m2c = build_modal_basis(bench)
+    pokes = RandomPokes(compute_poke_amplitudes(bench, m2c, poke), np.random.default_rng(5))
     return np.array([m2c @ pokes() for _ in range(frames)])
 
 
 def test_the_stroke_is_what_random_pokes_reach(bench: Bench) -> None:
-    told = Planner(bench).plan("docrime", {"frames": 400, "poke": 0.005})
+    told = ProcedurePlanner(bench).plan("docrime", {"frames": 400, "poke": 0.005})
     assert told.stroke == pytest.approx(np.abs(commands(bench, 0.005)).max(), rel=0.2)
     assert told.frames == 400
     assert told.seconds == pytest.approx(400 / bench.wfs.settings.frame_rate_hz)
@@ -37,7 +37,7 @@ def test_the_stroke_is_what_random_pokes_reach(bench: Bench) -> None:
 
 
 def test_pokes_in_turn_reach_less_than_all_at_once(bench: Bench) -> None:
-    planner, asked = Planner(bench), {"frames": 400, "poke": 0.005}
+    planner, asked = ProcedurePlanner(bench), {"frames": 400, "poke": 0.005}
     assert planner.plan("push-pull-fast", asked).stroke < 0.7 * planner.plan("docrime", asked).stroke
 
 
@@ -48,7 +48,7 @@ def test_shortened_frames_are_counted_before_they_happen() -> None:
         # A poke of which some frames, not all, pass the limit.
         poke = 0.02 * limit / float(np.quantile(np.abs(commands(bench, 0.02)).max(axis=1), 0.85))
         share = float((np.abs(commands(bench, poke)).max(axis=1) > limit).mean())
-        told = Planner(bench).plan("docrime", {"frames": 400, "poke": poke})
+        told = ProcedurePlanner(bench).plan("docrime", {"frames": 400, "poke": poke})
     (warning,) = told.warnings
     assert "% of the frames" in warning
     assert 0.5 * share < float(warning.split()[1]) / 100 < 2 * share

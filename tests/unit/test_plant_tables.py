@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-_FILE = Path(__file__).parents[2] / "benchmarks" / "plant_tables.py"
+_FILE = Path(__file__).parents[2] / "benchmarks" / "studies" / "realisation_tables.py"
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,8 @@ def test_plants_that_the_file_has_are_not_measured_again(tables, tmp_path):
         measured.append(number)
         return {"error": 0.5 * number}
 
-    tables.each_plant(target, {"frames": (20, 50)}, range(2), measure)
-    lines = tables.each_plant(target, {"frames": (20, 50)}, [1, 3], measure)
+    tables.each_realisation(target, {"frames": (20, 50)}, range(2), measure)
+    lines = tables.each_realisation(target, {"frames": (20, 50)}, [1, 3], measure)
     assert measured == [0, 1, 3]
     assert [line["error"] for line in lines] == [0.0, 0.5, 1.5]
     assert [json.loads(line)["plant"] for line in target.read_text().splitlines()] == [0, 1, 3]
@@ -35,8 +35,8 @@ def test_plants_that_the_file_has_are_not_measured_again(tables, tmp_path):
 
 def test_plants_that_were_asked_for_otherwise_are_not_told_with_these(tables, tmp_path):
     target = tmp_path / "lines.jsonl"
-    tables.each_plant(target, {"frames": 20}, [0], lambda number: {})
+    tables.each_realisation(target, {"frames": 20}, [0], lambda number: {})
     before = target.read_bytes()
     with pytest.raises(SystemExit, match=r"lines\.jsonl has plants that were asked for otherwise"):
-        tables.each_plant(target, {"frames": 50}, [1], lambda number: {})
+        tables.each_realisation(target, {"frames": 50}, [1], lambda number: {})
     assert target.read_bytes() == before

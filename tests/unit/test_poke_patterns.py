@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from escape_hw.calibration.poke_patterns import PushPullPokes, RandomPokes
+from escape_hw.calibration.acquisition.pokes import PushPullPokes, RandomPokes
 
 AMPLITUDE = np.array([0.01, 0.02, 0.03, 0.04])
 

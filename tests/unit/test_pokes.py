@@ -5,14 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.poke_patterns import ALTERNATING, RandomPokes, random_pattern
-from escape_hw.calibration.pokes import equal_snr, information_gain
+from escape_hw.calibration.acquisition.pokes import (
+    ANTICORRELATION,
+    RandomPokes,
+    equal_snr_amplitudes,
+    information_gain,
+    select_random_pokes,
+)
 
 AMPLITUDE = np.array([0.02, 0.005, 0.01])
 
 
 def drawn(kind: str, n: int = 20_000) -> np.ndarray:
-    pokes = random_pattern(kind)(AMPLITUDE, np.random.default_rng(4))
+    pokes = select_random_pokes(kind)(AMPLITUDE, np.random.default_rng(4))
     return np.array([pokes() for _ in range(n)])
 
 
@@ -28,13 +33,13 @@ def test_white_pokes_are_what_they_were():
     rng = np.random.default_rng(4)
     want = AMPLITUDE * rng.uniform(-1.0, 1.0, (50, 3))
     np.testing.assert_array_equal(drawn("white", 50), want)
-    assert random_pattern("equal-snr") is RandomPokes
+    assert select_random_pokes("equal-snr") is RandomPokes
 
 
 def test_shaped_pokes_alternate():
     pokes = drawn("shaped") / AMPLITUDE
     by_lag = [np.mean(pokes[k:] * pokes[: len(pokes) - k]) / np.mean(pokes**2) for k in (1, 2)]
-    assert by_lag == pytest.approx([-ALTERNATING, ALTERNATING**2], abs=0.03)
+    assert by_lag == pytest.approx([-ANTICORRELATION, ANTICORRELATION**2], abs=0.03)
 
 
 def test_information_gain_is_the_power_of_the_whitened_pokes():
@@ -45,7 +50,7 @@ def test_information_gain_is_the_power_of_the_whitened_pokes():
         return float(np.square(seen).mean())
 
     found = power(drawn("shaped")) / power(drawn("white"))
-    assert information_gain(whitener, response, ALTERNATING) == pytest.approx(found, rel=0.05)
+    assert information_gain(whitener, response, ANTICORRELATION) == pytest.approx(found, rel=0.05)
     assert information_gain(whitener, response, 0.0) == 1.0
     # Without turbulence to whiten, a spectrum only loses what the response swallows.
     assert information_gain(np.ones(1), response, 0.5) < 1
@@ -53,7 +58,7 @@ def test_information_gain_is_the_power_of_the_whitened_pokes():
 
 def test_equal_snr_is_equal_and_keeps_the_budget():
     columns = np.random.default_rng(1).standard_normal((40, 6)) * np.array([1, 2, 3, 4, 5, 6])
-    amplitude = equal_snr(columns, np.full(6, 1.0), 0.02)
+    amplitude = equal_snr_amplitudes(columns, np.full(6, 1.0), 0.02)
     snr = amplitude * np.linalg.norm(columns, axis=0)
     np.testing.assert_allclose(snr, snr[0])
     assert np.square(amplitude).sum() == pytest.approx(6 * 0.02**2)
@@ -61,9 +66,9 @@ def test_equal_snr_is_equal_and_keeps_the_budget():
 
 def test_equal_snr_respects_the_limits_and_gives_the_rest_to_the_others():
     columns = np.diag([1.0, 10.0, 10.0])
-    most = np.array([0.01, 1.0, 1.0])
-    amplitude = equal_snr(columns, most, 0.02)
+    max_amplitude = np.array([0.01, 1.0, 1.0])
+    amplitude = equal_snr_amplitudes(columns, max_amplitude, 0.02)
     assert amplitude[0] == 0.01
     assert amplitude[1] == amplitude[2]
     assert np.square(amplitude).sum() == pytest.approx(0.01**2 + 2 * 0.02**2)
-    assert (equal_snr(columns, np.full(3, 1e-3), 0.02) <= 1e-3).all()
+    assert (equal_snr_amplitudes(columns, np.full(3, 1e-3), 0.02) <= 1e-3).all()

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from escape_hw.api.procedure import Progress
-from escape_hw.runtime.progress import ProgressView, time_left
+from escape_hw.runtime.display.progress import ProgressView, format_time_left
 
 
 def shown(terminal: bool, quiet: bool = False) -> str:
@@ -57,7 +57,7 @@ def test_quiet_shows_nothing():
     ],
 )
 def test_time_left_in_words(seconds, words):
-    assert time_left(seconds) == words
+    assert format_time_left(seconds) == words
 
 
 class Output:

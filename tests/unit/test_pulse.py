@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from escape_hw.server.pulse import Pulse
+from escape_hw.server.engine.state_publisher import StatePublisher
 
 
 class Looked:
@@ -17,11 +17,11 @@ class Looked:
 
     def __init__(self) -> None:
         self.now = 1000.0
-        self.dm = SimpleNamespace(is_open=True, clipped_count=0, sent_count=0, flattened_count=0)
+        self.dm = SimpleNamespace(is_open=True, clipped_count=0, sent_count=0, flatten_count=0)
         bench: Any = SimpleNamespace(dm=self.dm)
         publisher: Any = SimpleNamespace(command=np.full(10, 0.5))
         nothing: Any = None
-        self.pulse = Pulse(
+        self.state_publisher = StatePublisher(
             bench, nothing, publisher, nothing, Path(), lambda state: None, clock=lambda: self.now
         )
 
@@ -32,7 +32,7 @@ class Looked:
             self.now += every
             self.dm.sent_count += round(500 * every)
             self.dm.clipped_count += clipped * round(500 * every)
-            share = self.pulse._mirror().clipped
+            share = self.state_publisher._mirror().clipped
         return share
 
 
@@ -47,5 +47,5 @@ def test_the_share_of_clipped_actuators_is_that_of_the_last_second(every: float)
 
 def test_it_tells_how_often_the_mirror_was_flattened() -> None:
     looked = Looked()
-    looked.dm.flattened_count = 3
-    assert looked.pulse._mirror().flattened == 3
+    looked.dm.flatten_count = 3
+    assert looked.state_publisher._mirror().flattened == 3

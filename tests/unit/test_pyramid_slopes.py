@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.pyramid import PyramidPupils
-from escape_hw.pipeline.pyramid_slopes import PyramidSlopes, slopes_of_image
+from escape_hw.pipeline.slopes.pyramid import PyramidSlopes, slopes_of_image
 
 SHAPE = (40, 50)
 CORNERS = np.array([[3, 2], [30, 5], [1, 22], [25, 21]])

@@ -13,21 +13,31 @@ from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError
-from escape_hw.io.fits import load_matrix, save_matrix
-from escape_hw.io.interchange import optional
-from escape_hw.io.interchange.pyrtc_file import MATRIX, VALID, read_file, write_array, write_file
-from escape_hw.io.interchange.pyrtc_legacy import LegacyFrame
-from escape_hw.io.interchange.pyrtc_lenslets import PyrtcLenslets
-from escape_hw.io.interchange.pyrtc_pupils import PyrtcPupils
-from escape_hw.io.interchange.pyrtc_read import PyrtcConfig, import_matrix
-from escape_hw.io.interchange.pyrtc_write import FrameFacts, export_matrix, in_basis
-from escape_hw.pipeline.pyramid_slopes import slopes_of_image
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
+from escape_hw.io.interchange import optional_packages as optional
+from escape_hw.io.interchange.pyrtc.calibration import (
+    FrameSettings,
+    PyrtcConfig,
+    convert_basis,
+    export_matrix,
+    import_matrix,
+)
+from escape_hw.io.interchange.pyrtc.files import (
+    MATRIX,
+    VALID,
+    LegacyConvention,
+    read_file,
+    write_array,
+    write_file,
+)
+from escape_hw.io.interchange.pyrtc.geometry import PyrtcLenslets, PyrtcPupils
+from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 
 yaml = pytest.importorskip("yaml")
 
 
 def there_and_back(folder: Path, result: CalibrationResult, shape: tuple[int, int]) -> CalibrationResult:
-    paths = export_matrix(folder, result, FrameFacts(shape, 12.0))
+    paths = export_matrix(folder, result, FrameSettings(shape, 12.0))
     whole = folder / "whole.yaml"
     whole.write_text(add_frame(paths["settings"].read_text(), shape))
     return import_matrix(PyrtcConfig.read(whole), target(result))
@@ -97,16 +107,16 @@ def test_windows_are_where_pyrtc_reads_them() -> None:
     assert (windows.window, windows.n) == (16, 25)
     # The window over lenslet 3 begins at round(46.62) + 19 and is 16 wide.
     assert windows.centres()[0][3] == 47 + 19 + 7.5
-    assert not windows.inside()[:, 24].any(), "it would end beyond the frame"
+    assert not windows.windows_on_frame()[:, 24].any(), "it would end beyond the frame"
 
 
 def test_a_grid_beyond_the_frame_is_refused() -> None:
     grid = lenslets().grid
     assert isinstance(grid, SubApertureGrid)
     with pytest.raises(IncompatibleProduct, match="read a larger region"):
-        PyrtcLenslets.of(grid, (385, 400))
+        PyrtcLenslets.from_grid(grid, (385, 400))
     with pytest.raises(IncompatibleProduct, match="lie beyond"):
-        PyrtcLenslets.of(grid, (200, 200))
+        PyrtcLenslets.from_grid(grid, (200, 200))
 
 
 def test_a_mask_whose_place_is_undecided_is_told() -> None:
@@ -123,10 +133,10 @@ def test_a_mask_whose_place_is_undecided_is_told() -> None:
 def test_other_modes_of_the_same_span() -> None:
     matrix = lenslets().matrix
     turn = np.random.default_rng(0).standard_normal((94, 5))
-    other = in_basis(matrix, matrix.m2c @ turn)
+    other = convert_basis(matrix, matrix.m2c @ turn)
     np.testing.assert_allclose(other.data, matrix.data @ turn, rtol=1e-3, atol=1e-3)
     with pytest.raises(IncompatibleProduct, match=r"no sum of the matrix's 94 modes.*basis.n_modes=97"):
-        in_basis(matrix, np.eye(97))
+        convert_basis(matrix, np.eye(97))
 
 
 # ------------------------------------------------------------------ files
@@ -190,8 +200,8 @@ def test_files_of_1x_are_read_when_somebody_says_how_they_were_made(tmp_path: Pa
     with pytest.raises(IncompatibleProduct, match="--legacy yx"):
         import_matrix(config, target(result))
     with pytest.raises(ConfigError, match="it is one of yx, xy, as_is"):
-        import_matrix(config, target(result), way="zz")
-    back = import_matrix(config, target(result), way="xy")
+        import_matrix(config, target(result), frame_order="zz")
+    back = import_matrix(config, target(result), frame_order="xy")
     np.testing.assert_array_equal(back.matrix.data, result.matrix.data)
     np.testing.assert_array_equal(back.grid.valid, result.grid.valid)
     assert isinstance(back.grid, SubApertureGrid)
@@ -215,14 +225,14 @@ def test_configurations_of_1x_spell_their_keys_in_one_word(tmp_path: Path) -> No
     assert old_config.old
     assert not config.old
     assert old_config.slopes == config.slopes
-    back = import_matrix(old_config, target(result), way="xy")
+    back = import_matrix(old_config, target(result), frame_order="xy")
     np.testing.assert_array_equal(back.matrix.data, result.matrix.data)
 
 
 def test_pupils_of_1x_are_rows_and_columns(tmp_path: Path) -> None:
     result = pyramid()
     assert isinstance(result.grid, PyramidPupils)
-    paths = export_matrix(tmp_path, result, FrameFacts((48, 48), 0.0))
+    paths = export_matrix(tmp_path, result, FrameSettings((48, 48), 0.0))
     write_array(paths["im"], read_file(paths["im"]).data)
     write_array(paths["references"], read_file(paths["references"]).data)
     found = yaml.safe_load(paths["settings"].read_text())
@@ -230,16 +240,16 @@ def test_pupils_of_1x_are_rows_and_columns(tmp_path: Path) -> None:
     found["slopes"] |= {"pupils": rows, "pupilsRadius": found["slopes"].pop("pupils_radius")}
     whole = tmp_path / "whole.yaml"
     whole.write_text(yaml.safe_dump({**found, "wfs": {"width": 48, "height": 48}}))
-    back = import_matrix(PyrtcConfig.read(whole), target(result), way="yx")
+    back = import_matrix(PyrtcConfig.read(whole), target(result), frame_order="yx")
     assert isinstance(back.grid, PyramidPupils)
     np.testing.assert_array_equal(back.grid.corners_px, result.grid.corners_px)
 
 
 def test_even_windows_of_1x_were_half_a_pixel_off() -> None:
     zeros = np.zeros((4, 2))
-    assert (LegacyFrame("yx", window=8).references(zeros) == 0.5).all()
-    assert (LegacyFrame("yx", window=7).references(zeros) == 0).all()
-    assert (LegacyFrame("as_is", window=8).references(zeros) == 0).all()
+    assert (LegacyConvention("yx", window=8).references(zeros) == 0.5).all()
+    assert (LegacyConvention("yx", window=7).references(zeros) == 0).all()
+    assert (LegacyConvention("as_is", window=8).references(zeros) == 0).all()
 
 
 def test_what_does_not_fit_the_system_is_refused(tmp_path: Path) -> None:
@@ -276,7 +286,7 @@ def test_a_missing_package_names_the_way_out() -> None:
 
 
 def test_export_and_import_from_the_command_line(tmp_path: Path, document, monkeypatch) -> None:
-    from escape_hw.config.load import load_system
+    from escape_hw.config.loader import load_system
     from escape_hw.io.provenance import Provenance
 
     result = lenslets()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from escape_hw.errors import CalibrationError
-from escape_hw.pipeline.reconstructor import reconstructor
+from escape_hw.pipeline.control.reconstructor import reconstructor
 
 
 def matrix(n_slopes=60, n_modes=12, seed=0):

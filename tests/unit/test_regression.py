@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration import regression
-from escape_hw.calibration.regression import RegressionSums
+from escape_hw.calibration.docrime import regression
+from escape_hw.calibration.docrime.regression import RegressionSums
 
 N, N_SLOPES, N_MODES = 400, 9, 5
 
@@ -25,21 +25,21 @@ def test_blocks_add_up_to_least_squares_with_an_intercept(offset):
     for part in np.array_split(np.arange(N), 7):
         sums.add(slopes[part], pokes[part])
     assert sums.count == N
-    centred = sums.centred()
+    about_means = sums.subtract_means()
     design = np.concatenate([pokes, np.ones((N, 1))], axis=1).astype(float)
     answer = np.linalg.lstsq(design, slopes.astype(float), rcond=None)[0]
-    matrix = centred.solve()
+    matrix = about_means.solve()
     assert matrix == pytest.approx(answer[:-1].T, abs=1e-4)
     inverse = np.diag(np.linalg.inv((pokes - pokes.mean(0)).T.astype(float) @ (pokes - pokes.mean(0))))
-    assert centred.inverse_diagonal() == pytest.approx(inverse, rel=1e-4)
+    assert about_means.inverse_diagonal() == pytest.approx(inverse, rel=1e-4)
     residual = slopes - design @ answer
-    assert centred.residual_power(matrix) == pytest.approx(residual.T @ residual, rel=1e-3, abs=2e-2)
+    assert about_means.residual_power(matrix) == pytest.approx(residual.T @ residual, rel=1e-3, abs=2e-2)
 
 
 def test_without_correlations_only_the_diagonal_is_kept():
     slopes, pokes = data(1.0)
     full, lean = (
-        RegressionSums.zeros(N_SLOPES, N_MODES, correlations=c).add(slopes, pokes).centred()
+        RegressionSums.zeros(N_SLOPES, N_MODES, correlations=c).add(slopes, pokes).subtract_means()
         for c in (True, False)
     )
     assert np.array_equal(full.solve(), lean.solve())
@@ -49,7 +49,7 @@ def test_without_correlations_only_the_diagonal_is_kept():
 
 
 def test_empty_sums_are_empty():
-    sums = RegressionSums.zeros(3, 2, correlations=True).centred()
+    sums = RegressionSums.zeros(3, 2, correlations=True).subtract_means()
     assert sums.count == 0
     assert not sums.gram.any()
 
@@ -57,10 +57,12 @@ def test_empty_sums_are_empty():
 @pytest.mark.parametrize("correlations", [True, False])
 @pytest.mark.parametrize("limit", [64, 5, 4])
 def test_correlations_of_a_few_slopes_are_always_known(monkeypatch, correlations, limit):
-    monkeypatch.setattr(regression, "FEW", limit)
+    monkeypatch.setattr(regression, "N_SAMPLED_SLOPES", limit)
     slopes, pokes = data(1.0)
-    full = RegressionSums.zeros(N_SLOPES, N_MODES, correlations=True).add(slopes, pokes).centred()
-    sums = RegressionSums.zeros(N_SLOPES, N_MODES, correlations=correlations).add(slopes, pokes).centred()
+    full = RegressionSums.zeros(N_SLOPES, N_MODES, correlations=True).add(slopes, pokes).subtract_means()
+    sums = (
+        RegressionSums.zeros(N_SLOPES, N_MODES, correlations=correlations).add(slopes, pokes).subtract_means()
+    )
     matrix = sums.solve()
     step = {64: 1, 5: 2, 4: 3}[limit]
     rows, power = sums.sample(matrix)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import recorded_run
 
-from escape_gui.library import Library
-from escape_gui.replay.source import REASON, ReplaySource
-from escape_hw.api.registration import TO_PLAIN
+from escape_gui.client.product_library import ProductLibrary
+from escape_gui.replay.source import READ_ONLY_REASON, ReplaySource
+from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.errors import ConfigError, ProductError
 from escape_hw.remote.source import STREAMS
-from escape_hw.remote.state import Phase, Product
+from escape_hw.remote.state import Phase, ProductEntry
 
 
 @pytest.fixture(scope="module")
@@ -23,15 +23,15 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def library():
-    library = Library()
+    library = ProductLibrary()
     yield library
     library.close()
 
 
 def read_all(library):
-    while library.reading:
+    while library.is_reading:
         pass
-    return library.shelf
+    return library.loaded
 
 
 def test_a_run_fills_the_streams(folder):
@@ -42,9 +42,11 @@ def test_a_run_fills_the_streams(folder):
     assert {"matrix", "valid", "registration", "gains", "psf", "model_psf", "commands"} <= held
     np.testing.assert_array_equal(source.latest("matrix").data, truth.measured.data)
     np.testing.assert_array_equal(source.latest("valid").data, truth.grid.valid)
-    last = source.latest("registration").data[-1] / TO_PLAIN
+    last = source.latest("registration").data[-1] / TO_STREAM_UNITS
     np.testing.assert_allclose(last, truth.registration.registration.to_array())
-    np.testing.assert_allclose(source.latest("registration_sigma").data / TO_PLAIN, truth.registration.sigma)
+    np.testing.assert_allclose(
+        source.latest("registration_sigma").data / TO_STREAM_UNITS, truth.registration.sigma
+    )
     assert source.latest("gains_rounds").data.shape == (2, recorded_run.N_MODES)
     assert source.latest("slopes") is None
     geometry = source.geometry()
@@ -87,7 +89,7 @@ def test_nothing_can_be_started(folder):
     assert source.procedures() == ()
     with pytest.raises(ConfigError, match="recording"):
         source.check("escape", {})
-    assert "recording" in REASON
+    assert "recording" in READ_ONLY_REASON
 
 
 def test_what_is_no_run_is_refused(folder, tmp_path):
@@ -101,12 +103,12 @@ def test_what_is_no_run_is_refused(folder, tmp_path):
 
 def test_the_library_reads_each_matrix_once(folder, library):
     source = ReplaySource(folder)
-    library.want(source.state.products)
-    shelf = read_all(library)
-    assert list(shelf.matrices) == ["push-pull", "DO-CRIME", "ESCAPE"]
-    assert list(shelf.gains) == ["ESCAPE", "DO-CRIME"]
-    library.want(source.state.products)
-    assert library.shelf is shelf
+    library.request(source.state.products)
+    loaded = read_all(library)
+    assert list(loaded.matrices) == ["push-pull", "DO-CRIME", "ESCAPE"]
+    assert list(loaded.gains) == ["ESCAPE", "DO-CRIME"]
+    library.request(source.state.products)
+    assert library.loaded is loaded
 
 
 def test_the_library_tells_what_it_cannot_read(folder, library, tmp_path):
@@ -114,20 +116,20 @@ def test_the_library_tells_what_it_cannot_read(folder, library, tmp_path):
     shutil.copy(folder / "escape.fits", damaged)
     damaged.write_bytes(damaged.read_bytes()[:-2880])
     names = (("good", folder / "push_pull.fits"), ("bad", damaged), ("gone", tmp_path / "no.fits"))
-    library.want(tuple(Product(name=name, kind="matrix", path=str(path)) for name, path in names))
-    shelf = read_all(library)
-    assert list(shelf.matrices) == ["push-pull"]
-    assert set(shelf.troubles) == {"bad", "gone"}
-    assert "no.fits" in shelf.troubles["gone"]
+    library.request(tuple(ProductEntry(name=name, kind="matrix", path=str(path)) for name, path in names))
+    loaded = read_all(library)
+    assert list(loaded.matrices) == ["push-pull"]
+    assert set(loaded.errors) == {"bad", "gone"}
+    assert "no.fits" in loaded.errors["gone"]
 
 
 def test_a_product_written_again_is_read_again(folder, library, tmp_path):
     path = tmp_path / "im.fits"
     shutil.copy(folder / "push_pull.fits", path)
-    product = (Product(name="im", kind="matrix", path=str(path)),)
-    library.want(product)
+    product = (ProductEntry(name="im", kind="matrix", path=str(path)),)
+    library.request(product)
     assert list(read_all(library).matrices) == ["push-pull"]
     path.unlink()
     shutil.copyfile(folder / "docrime_whitened.fits", path)
-    library.want(product)
+    library.request(product)
     assert list(read_all(library).matrices) == ["DO-CRIME"]

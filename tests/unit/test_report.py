@@ -12,25 +12,21 @@ import numpy as np
 import pytest
 
 from escape_hw.api.registration import PARAMETERS
-from escape_hw.api.results import Measured
-from escape_hw.config import layouts
+from escape_hw.api.results import Estimate
+from escape_hw.config import actuator_layouts
 from escape_hw.errors import IncompatibleProduct, ProductError
 from escape_hw.io import documents
-from escape_hw.io.fits import save_matrix
-from escape_hw.io.psf import save_loop
+from escape_hw.io.fits.loop import save_loop
+from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.io.run_folder import RunFolder
-from escape_hw.report import (
-    build,
-    comparison,
-    figures_bench,
-    figures_matrix,
-    figures_registration,
-    style,
-    tables,
-)
-from escape_hw.report.build import write_report
+from escape_hw.report import comparison, tables
+from escape_hw.report import run_report as build
 from escape_hw.report.content import RunContent, read_run
-from escape_hw.report.picture import draw, write_picture
+from escape_hw.report.figures import bench as figures_bench
+from escape_hw.report.figures import matrix as figures_matrix
+from escape_hw.report.figures import registration as figures_registration
+from escape_hw.report.figures import style
+from escape_hw.report.run_report import draw, write_picture, write_report
 
 LOOPS = {
     "push-pull": fake.loop("push-pull", strehl=0.63),
@@ -52,7 +48,7 @@ def make_run(folder, *, simulated=True, partial=False, lean=False, title="A <tit
             )
         run.write_result(
             {
-                **documents.head("test", "razor-shwfs", simulated, 1),
+                **documents.header_fields("test", "razor-shwfs", simulated, 1),
                 "title": title,
                 "planted": fake.PLANTED.to_dict(),
                 "labels": {"escape": {"label": "ESCAPE", "measured": "DO-CRIME", "column": "SHORT"}},
@@ -204,11 +200,11 @@ def test_loops_without_images_or_strehl_draw():
     style.png(figures_bench.residual_strip({"bare": bare}), 40)
     only = dataclasses.replace(LOOPS["ESCAPE"], strehl=None, model_psf=None)
     style.png(figures_bench.stacked_psfs({"only": only}), 40)
-    style.png(figures_bench.mirror(np.zeros(97), fake.layout()), 40)
+    style.png(figures_bench.mirror_on_grid(np.zeros(97), fake.layout()), 40)
 
 
 def test_a_mirror_without_a_grid_is_drawn_where_its_actuators_stand(tmp_path):
-    places = layouts.positions("rings-336") * 0.03
+    places = actuator_layouts.positions("rings-336") * 0.03
     command = np.zeros(336)
     command[7] = 0.6
     figure = figures_bench.mirror_without_grid(command, places)
@@ -242,7 +238,7 @@ def test_a_mirror_without_a_grid_is_drawn_where_its_actuators_stand(tmp_path):
     ],
 )
 def test_numbers_are_rounded_to_their_error(value, sigma, text):
-    assert tables.with_error(Measured(value, sigma)) == text
+    assert tables.format_with_error(Estimate(value, sigma)) == text
 
 
 def test_registration_table_has_the_papers_form():
@@ -294,7 +290,7 @@ def test_compare_refuses_another_basis_or_grid():
 
 def test_documents_are_strict_json():
     text = documents.dumps(
-        {"a": np.float32(1), "b": [math.inf, np.nan], "c": np.arange(2), "d": Measured(1, 2)}
+        {"a": np.float32(1), "b": [math.inf, np.nan], "c": np.arange(2), "d": Estimate(1, 2)}
     )
     assert "NaN" not in text
     assert "Infinity" not in text

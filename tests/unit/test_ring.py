@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from escape_hw.errors import StorageError
-from escape_hw.streams import ring_reader, segments
+from escape_hw.streams import ring as ring_reader
+from escape_hw.streams import segments
 from escape_hw.streams.ring import RingReader, RingWriter
-from escape_hw.streams.segments import StreamGone, segment_name
+from escape_hw.streams.segments import StreamUnavailable, segment_name
 
 
 @pytest.fixture
@@ -153,9 +154,9 @@ def test_a_closed_ring_is_gone_for_those_who_come_and_legible_for_those_who_look
         sample = reader.latest()
         assert sample is not None
         assert sample.index == 4
-    with pytest.raises(StreamGone, match="has its server ended"):
+    with pytest.raises(StreamUnavailable, match="has its server ended"):
         RingReader(writer.name)
-    with pytest.raises(StreamGone, match="after it was closed"):
+    with pytest.raises(StreamUnavailable, match="after it was closed"):
         writer.write(np.ones(3), 5)
 
 
@@ -172,7 +173,7 @@ def test_too_large_a_ring_is_refused_with_the_way_out() -> None:
 
 @pytest.mark.parametrize("name", ["../etc/passwd", "escape-0-x", "psm_12345", "escape-0-a/b-1-x"])
 def test_other_names_are_refused(name: str) -> None:
-    with pytest.raises(StreamGone, match="is no name of a stream"):
+    with pytest.raises(StreamUnavailable, match="is no name of a stream"):
         RingReader(name)
 
 
@@ -180,17 +181,17 @@ def test_foreign_content_and_another_version_are_refused(writer: RingWriter) -> 
     path = segments.SHARED / segment_name("test.ring", "foreign")
     try:
         path.write_bytes(b"\0" * 9000)
-        with pytest.raises(StreamGone, match="is no stream of ESCAPE"):
+        with pytest.raises(StreamUnavailable, match="is no stream of ESCAPE"):
             RingReader(path.name)
-        assert segments.examine(path.name) is None
+        assert segments.read_identity(path.name) is None
         content = bytearray((segments.SHARED / writer.name).read_bytes())
         content[8] = 99
         path.write_bytes(content)
-        with pytest.raises(StreamGone, match="version 99, this program reads 1"):
+        with pytest.raises(StreamUnavailable, match="version 99, this program reads 1"):
             RingReader(path.name)
         content[8] = segments.SCHEMA
         path.write_bytes(content[:-1])
-        with pytest.raises(StreamGone, match="has not the size"):
+        with pytest.raises(StreamUnavailable, match="has not the size"):
             RingReader(path.name)
     finally:
         path.unlink(missing_ok=True)
@@ -200,8 +201,8 @@ def test_no_link_is_followed(writer: RingWriter) -> None:
     path = segments.SHARED / segment_name("test.ring", "link")
     path.symlink_to(segments.SHARED / writer.name)
     try:
-        with pytest.raises(StreamGone):
+        with pytest.raises(StreamUnavailable):
             RingReader(path.name)
-        assert segments.examine(path.name) is None
+        assert segments.read_identity(path.name) is None
     finally:
         path.unlink()

@@ -33,7 +33,7 @@ def test_default_folder_is_dated_and_named(home):
 def test_names_cannot_leave_the_folder(home):
     path = RunFolder("../../etc", "a/b c").path
     assert home / "data" in path.resolve().parents
-    assert path.parent.parent == run_folder.default_base()
+    assert path.parent.parent == run_folder.default_runs_folder()
 
 
 def test_same_name_makes_a_sibling(home):
@@ -69,7 +69,7 @@ def test_many_at_once_never_share_a_folder(home, monkeypatch):
 def test_log_result_and_products(home):
     with RunFolder("s", "k", home / "run") as folder:
         logging.getLogger("escape_hw.somewhere").info("a remark")
-        folder.add("im", folder.file("im.fits"))
+        folder.add_product("im", folder.file("im.fits"))
         folder.write_result({"system": "s", "value": float("nan")})
     logging.getLogger("escape_hw.somewhere").warning("after the end")
     log = (home / "run" / "run.log").read_text()

@@ -7,24 +7,23 @@ from small_system import configuration
 
 from escape_hw import errors
 from escape_hw.errors import ConfigError, DeviceLost, EscapeError
-from escape_hw.remote.faults import from_wire, to_wire
-from escape_hw.remote.state import Parameter
-from escape_hw.runtime.procedures import METHODS
-from escape_hw.server.arguments import completed
-from escape_hw.server.offers import Offers
-from escape_hw.server.shelf import Shelf
+from escape_hw.remote.requests import error_from_document, error_to_document
+from escape_hw.remote.state import ProcedureParameter
+from escape_hw.runtime.procedures.calibration import METHODS
+from escape_hw.server.engine.procedures import ProcedureRegistry, check_arguments
+from escape_hw.server.engine.product_store import ProductStore
 
 PARAMETERS = (
-    Parameter(name="frames", kind="int", default=10, low=1, high=100, unit="frame"),
-    Parameter(name="poke", kind="float", default=None, low=0),
-    Parameter(name="fast", kind="bool", default=False),
-    Parameter(name="solver", kind="choice", default="a", choices=("a", "b")),
-    Parameter(name="im", kind="matrix"),
+    ProcedureParameter(name="frames", kind="int", default=10, low=1, high=100, unit="frame"),
+    ProcedureParameter(name="poke", kind="float", default=None, low=0),
+    ProcedureParameter(name="fast", kind="bool", default=False),
+    ProcedureParameter(name="solver", kind="choice", default="a", choices=("a", "b")),
+    ProcedureParameter(name="im", kind="matrix"),
 )
 
 
 def test_what_is_not_said_is_as_offered() -> None:
-    assert completed(PARAMETERS, {"poke": 1}) == {
+    assert check_arguments(PARAMETERS, {"poke": 1}) == {
         "frames": 10, "poke": 1.0, "fast": False, "solver": "a", "im": None,
     }  # fmt: skip
 
@@ -47,47 +46,47 @@ def test_what_is_not_said_is_as_offered() -> None:
 )
 def test_what_is_wrong_is_named(said: dict, message: str) -> None:
     with pytest.raises(ConfigError) as error:
-        completed(PARAMETERS, said)
+        check_arguments(PARAMETERS, said)
     assert str(error.value) == message
 
 
 def test_all_that_is_wrong_is_told_at_once() -> None:
     with pytest.raises(ConfigError, match=r"frames is 0.*poke is -1"):
-        completed(PARAMETERS, {"frames": 0, "poke": -1})
+        check_arguments(PARAMETERS, {"frames": 0, "poke": -1})
 
 
 def test_every_method_is_offered_with_the_defaults_of_the_configuration(tmp_path) -> None:
     config = configuration()
-    offers = Offers(config)
-    entries = {entry.name: entry for entry in offers.entries}
+    procedures = ProcedureRegistry(config)
+    entries = {entry.name: entry for entry in procedures.entries}
     assert set(METHODS) < set(entries)
     for name, entry in entries.items():
         # What is offered is accepted, kind by kind and default by default.
-        arguments = offers.arguments(name, {})
+        arguments = procedures.arguments(name, {})
         assert arguments == {one.name: one.default for one in entry.parameters}
         if "im" not in arguments:
-            offers.task(name, {}, Shelf([tmp_path])).load(config)
-    assert offers.arguments("docrime", {})["frames"] == config.calibration.frames
+            procedures.task(name, {}, ProductStore([tmp_path])).load(config)
+    assert procedures.arguments("docrime", {})["frames"] == config.calibration.frames
     with pytest.raises(ConfigError, match="no procedure is called 'explode'"):
-        offers.arguments("explode", {})
+        procedures.arguments("explode", {})
     with pytest.raises(ConfigError, match="im is missing"):
-        offers.task("loop", {}, Shelf([tmp_path]))
+        procedures.task("loop", {}, ProductStore([tmp_path]))
 
 
 @pytest.mark.parametrize("kind", [kind for kind in vars(errors).values() if isinstance(kind, type)])
 def test_every_error_keeps_its_class_and_message_across_the_wire(kind: type[EscapeError]) -> None:
     error = kind("dm", "lost: it is gone") if issubclass(kind, errors.DeviceError) else kind("it is gone")
-    again = from_wire(to_wire(error))
+    again = error_from_document(error_to_document(error))
     assert type(again) is kind
     assert str(again) == str(error)
 
 
 def test_a_device_is_still_known_and_a_defect_is_called_one() -> None:
-    again = from_wire(to_wire(DeviceLost("dm", "unplugged")))
+    again = error_from_document(error_to_document(DeviceLost("dm", "unplugged")))
     assert isinstance(again, DeviceLost)
     assert again.device == "dm"
-    defect = from_wire(to_wire(ZeroDivisionError("oops")))
+    defect = error_from_document(error_to_document(ZeroDivisionError("oops")))
     assert type(defect) is EscapeError
     assert "ZeroDivisionError: oops (this is a defect of ESCAPE" in str(defect)
-    assert type(from_wire({"type": "SystemExit", "message": "x"})) is EscapeError
-    assert str(from_wire({})) == "the server gave no reason"
+    assert type(error_from_document({"type": "SystemExit", "message": "x"})) is EscapeError
+    assert str(error_from_document({})) == "the server gave no reason"

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from escape_hw.api.modulator import Modulation
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, SettingRejected
-from escape_sim.beam_circle import BeamCircle
-from escape_sim.sim_modulator import make_modulator
+from escape_sim.devices.twins import make_modulator
+from escape_sim.optics.modulation import BeamPath
 
 RADIUS = 3 * 4.7e-5
 
 
-def circle(*overrides: str) -> BeamCircle:
+def circle(*overrides: str) -> BeamPath:
     config = load_system("razor-pywfs", overrides=overrides)
-    made = BeamCircle(config, np.array([0.3, 1.1]))
+    made = BeamPath(config, np.array([0.3, 1.1]))
     made.modulation = Modulation(RADIUS, 303.03)
     return made
 
@@ -56,7 +56,7 @@ def test_circle_is_the_one_that_was_asked_for_when_nothing_is_wrong() -> None:
     assert np.hypot(*points.points.T) == pytest.approx(3.0)
     assert np.abs(points.weights @ points.points).max() < 1e-12
     assert not ideal.drift(100.0).any()
-    assert ideal.turn_s == pytest.approx(3.3e-3, rel=1e-5)
+    assert ideal.cycle_period_s == pytest.approx(3.3e-3, rel=1e-5)
 
 
 def test_circle_is_an_ellipse_with_a_lag_about_the_told_centre() -> None:
@@ -82,5 +82,5 @@ def test_centre_drifts_slowly_by_its_amplitude() -> None:
 def test_a_parked_stage_leaves_one_point_in_the_middle() -> None:
     parked = circle()
     parked.modulation = None
-    assert parked.turn_s is None
+    assert parked.cycle_period_s is None
     assert parked.points().points.tolist() == [[0.0, 0.0]]

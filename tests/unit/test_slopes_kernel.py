@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.pipeline.slopes import SlopeExtractor, windows
+from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes, subaperture_windows
 
 SHAPES = {
     "whole pixels": (6, 8.0, (3.5, 3.5), (48, 48)),
@@ -21,7 +21,7 @@ def by_hand(grid, frame, dark, flat, threshold):
     light = np.maximum((frame.astype(float) - dark) / flat - threshold, 0)
     slopes, flux = [], []
     centres = grid.centres_px()
-    boxes = windows(centres, grid.pitch_px, frame.shape)
+    boxes = subaperture_windows(centres, grid.pitch_px, frame.shape)
     for (x, y), (top, end, left, right), reference in zip(centres, boxes, grid.references_px, strict=True):
         part = light[top:end, left:right]
         total = part.sum()
@@ -48,7 +48,7 @@ def make(case):
 @pytest.mark.parametrize("threshold", [0.0, 300.0, 960.0])
 def test_slopes_and_flux_are_right(case, threshold):
     grid, frame, dark, flat = make(case)
-    extractor = SlopeExtractor(grid, frame.shape, dark=dark, flat=flat, threshold=threshold)
+    extractor = ShackHartmannSlopes(grid, frame.shape, dark=dark, flat=flat, threshold=threshold)
     flux = np.zeros(grid.n_valid, np.float32)
     slopes = extractor(frame, flux)
     want, light = by_hand(grid, frame, dark, flat, threshold)
@@ -59,23 +59,23 @@ def test_slopes_and_flux_are_right(case, threshold):
 def test_slopes_without_dark_and_flat():
     grid, frame, _, _ = make("bench")
     want, _ = by_hand(grid, frame, 0.0, 1.0, 0.0)
-    assert SlopeExtractor(grid, frame.shape)(frame) == pytest.approx(want, abs=1e-4)
+    assert ShackHartmannSlopes(grid, frame.shape)(frame) == pytest.approx(want, abs=1e-4)
 
 
 def test_a_dark_window_yields_zero():
     grid, frame, _, _ = make("bench")
     flux = np.ones(grid.n_valid, np.float32)
-    slopes = SlopeExtractor(grid, frame.shape, threshold=2000.0)(frame, flux)
+    slopes = ShackHartmannSlopes(grid, frame.shape, threshold=2000.0)(frame, flux)
     assert not slopes.any()
     assert not flux.any()
 
 
 def test_pixels_outside_a_window_do_not_matter():
     grid, frame, _, _ = make("bench")
-    extractor = SlopeExtractor(grid, frame.shape)
+    extractor = ShackHartmannSlopes(grid, frame.shape)
     before = extractor(frame)
     outside = np.ones(frame.shape, bool)
-    for top, end, left, right in windows(grid.centres_px(), grid.pitch_px, frame.shape):
+    for top, end, left, right in subaperture_windows(grid.centres_px(), grid.pitch_px, frame.shape):
         outside[top:end, left:right] = False
     assert outside.any()
     frame[outside] = 1023
@@ -84,7 +84,7 @@ def test_pixels_outside_a_window_do_not_matter():
 
 def test_read_only_and_cut_out_frames_give_the_same():
     grid, frame, dark, flat = make("bench")
-    extractor = SlopeExtractor(grid, frame.shape, dark=dark, flat=flat, threshold=50.0)
+    extractor = ShackHartmannSlopes(grid, frame.shape, dark=dark, flat=flat, threshold=50.0)
     want = extractor(frame)
     large = np.zeros((200, 220), np.uint16)
     large[9:179, 13:188] = frame
@@ -96,7 +96,7 @@ def test_read_only_and_cut_out_frames_give_the_same():
 
 def test_the_result_can_be_put_where_the_caller_wants():
     grid, frame, _, _ = make("bench")
-    extractor = SlopeExtractor(grid, frame.shape)
+    extractor = ShackHartmannSlopes(grid, frame.shape)
     out = np.empty(grid.n_slopes, np.float32)
     assert extractor(frame, None, out) is out
     assert np.array_equal(out, extractor(frame))
@@ -105,9 +105,9 @@ def test_the_result_can_be_put_where_the_caller_wants():
 def test_wrong_shapes_are_refused():
     grid, frame, dark, flat = make("bench")
     with pytest.raises(ValueError, match="frame has shape"):
-        SlopeExtractor(grid, frame.shape)(frame[:-1])
+        ShackHartmannSlopes(grid, frame.shape)(frame[:-1])
     with pytest.raises(ValueError, match="dark"):
-        SlopeExtractor(grid, frame.shape, dark=dark[:-1])
+        ShackHartmannSlopes(grid, frame.shape, dark=dark[:-1])
     flat[3, 4] = 0
     with pytest.raises(ValueError, match="not positive"):
-        SlopeExtractor(grid, frame.shape, flat=flat)
+        ShackHartmannSlopes(grid, frame.shape, flat=flat)

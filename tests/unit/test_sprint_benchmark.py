@@ -7,12 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from escape_benchmarks.calibration import sprint
+from escape_benchmarks.peers import specula as specula_sprint
+from escape_benchmarks.peers.oopao import OopaoPeer, SolverResult
 from escape_hw.api.registration import Registration
-from escape_hw.calibration.modes import karhunen_loeve
-from escape_hw.config.load import load_system
-from escape_sim.benchmarks import specula_sprint, sprint
-from escape_sim.benchmarks.oopao_sprint import Answer, OopaoPeer
-from escape_sim.model import make_model
+from escape_hw.calibration.modes.bases import karhunen_loeve
+from escape_hw.config.loader import load_system
+from escape_sim.models.shack_hartmann import make_model
 
 
 @pytest.fixture(scope="module")
@@ -28,13 +29,13 @@ def modes(alike):
 
 def test_ours_and_oopaos_sensor_give_the_same_matrix_and_ours_solves_it(alike, modes):
     peer = OopaoPeer(alike, modes)
-    theirs = peer.matrix(sprint.PLANTED, sprint.mirror(False))
-    ours = make_model(alike, None).modal_matrix(sprint.PLANTED, modes)
+    theirs = peer.matrix(sprint.INJECTED, sprint.mirror(False))
+    ours = make_model(alike, None).modal_matrix(sprint.INJECTED, modes)
     scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
     assert np.linalg.norm(scale * ours - theirs) < 5e-6 * np.linalg.norm(theirs)
-    answer = sprint.Ours(alike, modes).solver("light", noise=False)(theirs)
+    answer = sprint.EscapeSolver(alike, modes).solver("light", noise=False)(theirs)
     assert answer.valid
-    error = np.abs(answer.registration.to_array() - sprint.PLANTED.to_array())
+    error = np.abs(answer.registration.to_array() - sprint.INJECTED.to_array())
     assert (error < [0.01, 0.01, 1e-4, 1e-3, 1e-3]).all()
 
 
@@ -51,12 +52,12 @@ def test_on_the_pyramid_both_solve_oopaos_matrix_and_ours_is_nearer():
     peer.set_up()
     mine, other = (
         np.abs(solve(theirs).registration.to_array() - at.to_array())
-        for solve in (sprint.Ours(config, low).solver("light", noise=False), peer.solve)
+        for solve in (sprint.EscapeSolver(config, low).solver("light", noise=False), peer.solve)
     )
     assert (mine < [0.02, 0.02, 1e-4, 1e-3, 1e-3]).all()
     assert (other < [0.2, 0.2, 1e-3, 0.05, 0.05]).all()
     # What is planted is the same share of the pupil on both sensors.
-    assert at.shift_x / config.sensor.n_sub == pytest.approx(sprint.PLANTED.shift_x / sprint.PLANTED_SUB)
+    assert at.shift_x / config.sensor.n_sub == pytest.approx(sprint.INJECTED.shift_x / sprint.INJECTED_N_SUB)
 
 
 def test_products_of_a_pyramid_matrix_are_counted_on_its_nodes():
@@ -77,7 +78,7 @@ def test_a_real_mirror_differs_from_the_ideal_one():
 def test_without_specula_there_is_a_row_that_says_so(monkeypatch, alike, modes):
     monkeypatch.setattr(sprint, "specula_peer", lambda *given: None)
     monkeypatch.setattr(sprint, "alternate", lambda ours, peer, **given: (ours() and 1.0, None))
-    (row,) = sprint._beside_specula(alike, modes)
+    (row,) = sprint._specula_rows(alike, modes)
     assert row.peer is None
     assert row.ratio is None
     assert row.note == specula_sprint.MISSING
@@ -96,14 +97,14 @@ def test_far_answers_count_as_found_only_when_right_and_vouched_for(monkeypatch,
 
         def solve(self, data, iterations):
             self.calls += 1
-            return Answer(Registration(), self.calls % 2 == 0)
+            return SolverResult(Registration(), self.calls % 2 == 0)
 
     monkeypatch.setattr(
-        sprint.Ours,
+        sprint.EscapeSolver,
         "solver",
-        lambda self, how, **given: lambda data: Answer(Registration.from_array(data), True),
+        lambda self, how, **given: lambda data: SolverResult(Registration.from_array(data), True),
     )
-    found, wrong = sprint._from_afar(alike, Lost(), "sprint")
+    found, wrong = sprint._capture_rows(alike, Lost(), "sprint")
     n = len(sprint.PITCHES) * len(sprint.DIRECTIONS)
     assert (found.ours, found.peer) == (n, 0)
     assert (wrong.ours, wrong.peer) == (0, n // 2)

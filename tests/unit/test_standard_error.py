@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from escape_hw.pipeline.standard_error import LEAST, standard_error
+from escape_hw.pipeline.statistics import MIN_SAMPLES, standard_error
 
 SERIES = 400
 
@@ -57,6 +57,6 @@ def test_anticorrelated_series_state_no_less_than_nothing():
 
 
 def test_too_few_values_have_no_error_and_equal_ones_none():
-    assert math.isnan(standard_error(np.arange(LEAST - 1.0)))
-    assert math.isfinite(standard_error(np.arange(float(LEAST))))
+    assert math.isnan(standard_error(np.arange(MIN_SAMPLES - 1.0)))
+    assert math.isfinite(standard_error(np.arange(float(MIN_SAMPLES))))
     assert standard_error(np.ones(50)) == 0.0

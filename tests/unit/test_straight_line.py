@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.straight_line import StraightLine
+from escape_hw.calibration.tracking.smoothing import DoubleExponentialSmoother
 
 KEEP = float(np.exp(-1 / 8))
 SIGMA = 0.3
@@ -13,7 +13,7 @@ SIGMA = 0.3
 
 def follow(truth, noise, *, fastest=0.5, static=0.0):
     """What comes of a run of updates: estimates are the faded means of truth and noise."""
-    line = StraightLine(KEEP, 1.0, np.array([fastest]))
+    line = DoubleExponentialSmoother(KEEP, 1.0, np.array([fastest]))
     weight = total = squares = 0.0
     found = []
     for value in truth + noise:
@@ -49,8 +49,8 @@ def test_errors_are_honest_while_the_memory_fills_and_after(rate, at):
 
 def test_what_does_not_change_is_not_averaged_away():
     last = follow(np.zeros(80), np.zeros(80), static=0.04)[-1]
-    assert last.covariance[0, 0] == pytest.approx(0.04 + last.moving[0, 0])
-    assert last.moving[0, 0] < 0.03
+    assert last.covariance[0, 0] == pytest.approx(0.04 + last.random_covariance[0, 0])
+    assert last.random_covariance[0, 0] < 0.03
 
 
 def test_a_jump_is_a_surprise_and_noise_is_none():
@@ -83,11 +83,11 @@ def test_what_bends_too_fast_widens_the_errors():
     t = np.arange(60) + 0.5
     swing = 5 * np.sin(2 * np.pi * t / 20)
     calm, wild = follow(np.zeros(60), np.zeros(60), fastest=0.1), follow(swing, np.zeros(60), fastest=0.1)
-    assert wild[-1].moving[0, 0] > 4 * calm[-1].moving[0, 0]
+    assert wild[-1].random_covariance[0, 0] > 4 * calm[-1].random_covariance[0, 0]
 
 
 def test_a_restart_forgets():
-    line = StraightLine(KEEP, 1.0, np.array([0.1]))
+    line = DoubleExponentialSmoother(KEEP, 1.0, np.array([0.1]))
     one = np.eye(1)
     for value in (1.0, 2.0, 3.0):
         line.update(np.array([value]), 0.01 * one, 0 * one)

@@ -11,33 +11,33 @@ from small_system import SMALL, configuration
 
 import escape_hw
 from escape_hw.api.procedure import run
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
-from escape_hw.io.provenance import sha256_of
-from escape_hw.runtime.sweep.ask import need_optuna, require_loop_frames, swept_space
-from escape_hw.runtime.sweep.document import criteria, sweep_document, trials_csv
-from escape_hw.runtime.sweep.kept import KeptSweep, read_kept
-from escape_hw.runtime.sweep.plan import Arm, Design
-from escape_hw.runtime.sweep.result import conclude
+from escape_hw.io.provenance import file_sha256
+from escape_hw.runtime.sweep.description import SweepDescription, read_description
+from escape_hw.runtime.sweep.design import Design, MatrixVariant
+from escape_hw.runtime.sweep.products import criteria, sweep_document, trials_csv
+from escape_hw.runtime.sweep.request import parse_search_space, require_loop_frames, require_optuna
+from escape_hw.runtime.sweep.result import analyse_sweep
 from escape_hw.runtime.sweep.run import Sweep, run_sweep
-from escape_hw.runtime.sweep.space import default_space, parse_parameter
+from escape_hw.runtime.sweep.search_space import default_space, parse_parameter
 
 
 def test_hardware_wants_a_persons_limits_on_everything():
     config = load_system("razor-shwfs", mode="hardware")
     with pytest.raises(ConfigError, match="leak, dropped_modes"):
-        swept_space(config, ["gain=0.1:0.5"])
+        parse_search_space(config, ["gain=0.1:0.5"])
     limits = ["gain=0.1:0.5", "leak=0.01:0.05", "dropped_modes=10:20"]
-    assert [one.to_text() for one in swept_space(config, limits)] == limits
+    assert [one.to_text() for one in parse_search_space(config, limits)] == limits
     for text in ("twin.latency_s=0:1e-3", "delay=0:1", "calibration.poke=0.01:0.02"):
         with pytest.raises(ConfigError, match="on hardware only"):
-            swept_space(config, [*limits, text])
+            parse_search_space(config, [*limits, text])
 
 
 @pytest.mark.parametrize("text", ["gian=0:1", "sensor.threshold=0:1", "basis.n_modes=10:20"])
 def test_what_cannot_be_varied_is_said(text):
     with pytest.raises(ConfigError, match="--vary"):
-        swept_space(configuration(), [text])
+        parse_search_space(configuration(), [text])
 
 
 @pytest.mark.parametrize(("system", "least"), [("razor-shwfs", 270), ("razor-pywfs", 162)])
@@ -66,30 +66,30 @@ def test_without_a_science_camera_there_is_nothing_to_judge_by():
 
 def test_ranges_beyond_the_configurations_are_refused():
     for text in ("gain=0.1:9", "leak=0:2", "dropped_modes=0:30", "twin.loss_probability=0:0.9", "twin.x=0:1"):
-        arm = Arm("A", False, __file__, "")
+        arm = MatrixVariant("A", False, __file__, "")
         space = default_space(30, [parse_parameter(text)])
         swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
         with pytest.raises(ConfigError, match=text.partition("=")[0]):
-            KeptSweep(swept, "sqlite://", "s", "random", 0.01).checked()
+            SweepDescription(swept, "sqlite://", "s", "random", 0.01).validate()
 
 
 def test_passwords_are_not_written(tmp_path):
     (tmp_path / "im.fits").write_bytes(b"")
     path = tmp_path / "im.fits"
-    arm = Arm("A", False, path, sha256_of(path))
+    arm = MatrixVariant("A", False, path, file_sha256(path))
     space = default_space(30, [parse_parameter("gain=0.1:1")])
     swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
     url = "postgresql+psycopg://me:secret@host/sweeps"
-    assert "secret" not in KeptSweep(swept, url, "s", "random", 0.01).keep(tmp_path).read_text()
+    assert "secret" not in SweepDescription(swept, url, "s", "random", 0.01).keep(tmp_path).read_text()
     with pytest.raises(ConfigError, match="--storage"):
-        read_kept(tmp_path)
-    assert read_kept(tmp_path, url).storage == url
+        read_description(tmp_path)
+    assert read_description(tmp_path, url).storage == url
 
 
 def test_without_optuna_the_way_out_is_named(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"escape-hw\[sweep\]"):
-        need_optuna()
+        require_optuna()
 
 
 def test_a_sweep_on_an_open_bench(tmp_path):
@@ -97,18 +97,18 @@ def test_a_sweep_on_an_open_bench(tmp_path):
         path = escape_hw.save_matrix(tmp_path / "im.fits", bench.calibrate("push-pull"))
         np.save(tmp_path / "psf.npy", bench.take_model_psf())
         sent = []
-        arms = tuple(Arm(name, False, path, sha256_of(path)) for name in ("A", "B"))
+        arms = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("A", "B"))
         space = tuple(parse_parameter(t) for t in ("gain=0.3:0.6", "leak=0.01", "dropped_modes=2:6"))
         swept = Sweep(
             bench.config.to_toml(), arms, space, Design(4, 1, 1, 6), 200, 1,
             psf=str(tmp_path / "psf.npy"), simulated=False,
         )  # fmt: skip
-        kept = KeptSweep(swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05).checked()
-        kept.keep(tmp_path)
-        assert read_kept(tmp_path) == kept
+        kept = SweepDescription(swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05).validate()
+        kept.save(tmp_path)
+        assert read_description(tmp_path) == kept
         found = run(run_sweep(swept, kept.store(), bench), observers=(sent.append,))
         assert np.all(bench.dm.shape == 0)
-    result = conclude(swept, found, 0.05)
+    result = analyse_sweep(swept, found, 0.05)
     assert len(found.records) == 4 + 2 + 12
     done = [progress.done for progress in sent if progress.stage == "sweep"]
     assert done == sorted(set(done))
@@ -126,7 +126,7 @@ def test_a_sweep_on_an_open_bench(tmp_path):
     ("difference", "word"), [(0.0, "equivalent"), (0.05, "ESCAPE better"), (-0.05, "worse")]
 )
 def test_conclusions(difference, word):
-    result = conclude(SWEPT, made_up(difference), 0.01)
+    result = analyse_sweep(SWEPT, made_up(difference), 0.01)
     (one,) = result.comparisons
     assert one.found.mean == pytest.approx(difference, abs=0.005)
     assert (word if word != "worse" else "push-pull better than ESCAPE") in one.text

@@ -10,38 +10,37 @@ import pytest
 from made_up_sweep import SWEPT, made_up
 from small_system import configuration
 
-from escape_hw.io.documents import dumps, head
-from escape_hw.io.fits import save_matrix
-from escape_hw.io.provenance import sha256_of
+from escape_hw.io.documents import dumps, header_fields
+from escape_hw.io.fits.matrix import save_matrix
+from escape_hw.io.provenance import file_sha256
 from escape_hw.io.run_folder import RunFolder
-from escape_hw.runtime.sweep.document import sweep_document
-from escape_hw.runtime.sweep.finished import finished_document
-from escape_hw.runtime.sweep.kept import KeptSweep
-from escape_hw.runtime.sweep.plan import Arm
-from escape_hw.runtime.sweep.result import conclude
+from escape_hw.runtime.sweep.description import SweepDescription
+from escape_hw.runtime.sweep.design import MatrixVariant
+from escape_hw.runtime.sweep.products import find_finished_result, sweep_document
+from escape_hw.runtime.sweep.result import analyse_sweep
 
 
 @pytest.fixture
-def kept(tmp_path: Path) -> KeptSweep:
+def description(tmp_path: Path) -> SweepDescription:
     """A sweep of two matrices in the folder ``run``."""
     config, run = configuration(), tmp_path / "run"
     path = save_matrix(tmp_path / "im.fits", fake.calibration(), fake.ORIGIN)
-    arms = tuple(Arm(name, False, path, sha256_of(path)) for name in ("push-pull", "ESCAPE"))
+    arms = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("push-pull", "ESCAPE"))
     swept = replace(SWEPT, config=config.to_toml(), arms=arms)
-    one = KeptSweep(swept, f"sqlite:///{run / 'study.db'}", "sweep", "random", 0.01)
+    one = SweepDescription(swept, f"sqlite:///{run / 'study.db'}", "sweep", "random", 0.01)
     with RunFolder("razor-shwfs", "sweep", run) as folder:
         folder.write_config(config.to_toml())
         one.keep(folder.path)
     return one
 
 
-def conclude_in(path: Path, kept: KeptSweep, partial: bool = False) -> Path:
+def conclude_in(path: Path, description: SweepDescription, partial: bool = False) -> Path:
     """What a sweep writes at its end."""
     run = made_up(0.0)
     run.partial = partial
     document = {
-        **head("sweep", "razor-shwfs", True, 1),
-        **sweep_document(conclude(kept.sweep, run, 0.01)),
+        **header_fields("sweep", "razor-shwfs", True, 1),
+        **sweep_document(analyse_sweep(description.sweep, run, 0.01)),
         "finished_utc": "2026-11-22T00:00:00Z",
     }
     path.mkdir(exist_ok=True)
@@ -50,17 +49,19 @@ def conclude_in(path: Path, kept: KeptSweep, partial: bool = False) -> Path:
     return path
 
 
-def test_what_is_broken_off_is_not_finished(kept: KeptSweep, tmp_path: Path) -> None:
-    assert finished_document(tmp_path / "run", kept) is None
-    conclude_in(tmp_path / "run", kept, partial=True)
-    assert finished_document(tmp_path / "run", kept) is None
+def test_what_is_broken_off_is_not_finished(description: SweepDescription, tmp_path: Path) -> None:
+    assert find_finished_result(tmp_path / "run", description) is None
+    conclude_in(tmp_path / "run", description, partial=True)
+    assert find_finished_result(tmp_path / "run", description) is None
 
 
 @pytest.mark.parametrize("where", ["run", "elsewhere"])
-def test_resume_of_a_finished_sweep_shows_its_result(escape, document, kept, tmp_path, monkeypatch, where):
+def test_resume_of_a_finished_sweep_shows_its_result(
+    escape, document, description, tmp_path, monkeypatch, where
+):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    there = conclude_in(tmp_path / where, kept)
-    kept.store().mark_finished(str(there))
+    there = conclude_in(tmp_path / where, description)
+    description.store().set_result_folder(str(there))
     before = sorted(path.name for path in tmp_path.iterdir())
     code, out, err = escape("sweep", "--resume", tmp_path / "run", "--out", tmp_path / "again")
     assert code == 0
@@ -73,6 +74,6 @@ def test_resume_of_a_finished_sweep_shows_its_result(escape, document, kept, tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-def test_a_result_that_has_gone_is_made_again(kept: KeptSweep, tmp_path: Path) -> None:
-    kept.store().mark_finished(str(tmp_path / "gone"))
-    assert finished_document(tmp_path / "run", kept) is None
+def test_a_result_that_has_gone_is_made_again(description: SweepDescription, tmp_path: Path) -> None:
+    description.store().set_result_folder(str(tmp_path / "gone"))
+    assert find_finished_result(tmp_path / "run", description) is None

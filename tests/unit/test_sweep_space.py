@@ -7,13 +7,19 @@ import pytest
 from small_system import configuration
 
 from escape_hw.errors import ConfigError
-from escape_hw.runtime.sweep.choice import share_of, shortlist
-from escape_hw.runtime.sweep.plan import EXPLORE, Arm, Design, Slot, drawn
-from escape_hw.runtime.sweep.space import Choices, Range, default_space, overrides_of, parse_parameter
-from escape_hw.runtime.sweep.store import Record
-from escape_hw.runtime.sweep.trial import Task
+from escape_hw.runtime.sweep.design import EXPLORE, Design, MatrixVariant, Slot, draw_parameters
+from escape_hw.runtime.sweep.run import shortlist, unit_coordinate
+from escape_hw.runtime.sweep.search_space import (
+    Choices,
+    Range,
+    config_overrides,
+    default_space,
+    parse_parameter,
+)
+from escape_hw.runtime.sweep.study import LoopRecord
+from escape_hw.runtime.sweep.trials import TrialSpec
 
-ARMS = [Arm(name, False, __file__, "") for name in ("A", "B", "C")]
+ARMS = [MatrixVariant(name, False, __file__, "") for name in ("A", "B", "C")]
 
 
 @pytest.mark.parametrize(
@@ -21,7 +27,7 @@ ARMS = [Arm(name, False, __file__, "") for name in ("A", "B", "C")]
     [
         ("gain=0.1:1", Range("gain", 0.1, 1.0)),
         ("gain=0.05:1.5:log", Range("gain", 0.05, 1.5, log=True)),
-        ("dropped_modes=0:30", Range("dropped_modes", 0, 30, whole=True)),
+        ("dropped_modes=0:30", Range("dropped_modes", 0, 30, integer=True)),
         ("twin.latency_s=0:4e-3", Range("twin.latency_s", 0.0, 4e-3)),
         ("delay=0:2", Range("delay", 0.0, 2.0)),
         ("devices.screen.screen=0,1,3", Choices("devices.screen.screen", (0, 1, 3))),
@@ -49,30 +55,33 @@ def test_given_ranges_replace_the_usual_ones_and_extend_them():
 
 
 @pytest.mark.parametrize(
-    "one", [Range("a", 0.05, 1.5, log=True), Range("a", 1.0, 3.0), Range("a", 0, 9, whole=True)]
+    "one", [Range("a", 0.05, 1.5, log=True), Range("a", 1.0, 3.0), Range("a", 0, 9, integer=True)]
 )
 def test_draws_fill_the_range(one):
     values = [one.at(share) for share in np.linspace(0, 1, 101)]
     assert min(values) == pytest.approx(one.low)
     assert max(values) == pytest.approx(one.high)
-    assert share_of(one, values[50]) == pytest.approx(0.5, abs=0.06)
+    assert unit_coordinate(one, values[50]) == pytest.approx(0.5, abs=0.06)
 
 
 def test_every_arm_draws_the_same_on_the_same_air():
     space = default_space(30, [])
-    slots = list(Design(trials=9).explored(ARMS))
+    slots = list(Design(trials=9).exploration_slots(ARMS))
     assert [(slot.arm, slot.index) for slot in slots[:4]] == [("A", 0), ("B", 0), ("C", 0), ("A", 1)]
-    assert drawn(space, 1, slots[0].index) == drawn(space, 1, slots[2].index)
-    assert drawn(space, 1, 0) != drawn(space, 1, 1)
-    assert drawn(space, 1, 0) != drawn(space, 2, 0)
+    assert draw_parameters(space, 1, slots[0].index) == draw_parameters(space, 1, slots[2].index)
+    assert draw_parameters(space, 1, 0) != draw_parameters(space, 1, 1)
+    assert draw_parameters(space, 1, 0) != draw_parameters(space, 2, 0)
 
 
 def test_no_two_stages_share_their_air():
     design = Design(trials=6)
-    stages = (design.explored(ARMS), design.shortlisted(ARMS), design.final(ARMS))
+    stages = (design.exploration_slots(ARMS), design.shortlist_slots(ARMS), design.final_slots(ARMS))
     seeds = [{slot.run_seed(7) for slot in stage} for stage in stages]
     assert len(seeds[0] | seeds[1] | seeds[2]) == sum(map(len, seeds))
-    assert design.total(3) == sum(len(list(s)) for s in (design.explored(ARMS), design.final(ARMS))) + 36
+    assert (
+        design.n_loops(3)
+        == sum(len(list(s)) for s in (design.exploration_slots(ARMS), design.final_slots(ARMS))) + 36
+    )
 
 
 def test_a_lucky_loop_is_not_shortlisted_before_a_good_neighbourhood():
@@ -81,25 +90,25 @@ def test_a_lucky_loop_is_not_shortlisted_before_a_good_neighbourhood():
     records = []
     for number, gain in enumerate(np.linspace(0, 1, 200)):
         merit = 0.4 - (gain - 0.6) ** 2 + rng.normal(0, 0.02)
-        records.append(Record(Slot(EXPLORE, "A", number), {"gain": float(gain)}, {}, float(merit)))
-    lucky = Record(Slot(EXPLORE, "A", 999), {"gain": 0.02}, {}, 0.9)
+        records.append(LoopRecord(Slot(EXPLORE, "A", number), {"gain": float(gain)}, {}, float(merit)))
+    lucky = LoopRecord(Slot(EXPLORE, "A", 999), {"gain": 0.02}, {}, 0.9)
     found = shortlist([*records, lucky], space, "A", 4)
     assert all(abs(one["gain"] - 0.6) < 0.15 for one in found)
 
 
 def test_diverged_loops_are_never_shortlisted():
     space = (Range("gain", 0.0, 1.0),)
-    records = [Record(Slot(EXPLORE, "A", n), {"gain": n / 10}, {}, 0.0) for n in range(10)]
+    records = [LoopRecord(Slot(EXPLORE, "A", n), {"gain": n / 10}, {}, 0.0) for n in range(10)]
     assert shortlist(records, space, "A", 4) == []
 
 
 def test_a_task_changes_what_is_varied_and_the_air_but_not_the_bench():
     config = configuration()
     values = {"gain": 0.3, "leak": 0.01, "dropped_modes": 2, "delay": 1.5, "twin.wfs.read_noise_e": 12.0}
-    task = Task(config.to_toml(), "x.fits", "", None, values, 100, 17)
-    made = task.configured()
+    task = TrialSpec(config.to_toml(), "x.fits", "", None, values, 100, 17)
+    made = task.build_config()
     assert made.twin.wfs.read_noise_e == 12.0
     assert made.twin.run_seed == 17
     assert made.system.seed == config.system.seed
     assert made.twin.latency_s == pytest.approx(config.twin.latency_s + 1.5 / 500.0)
-    assert overrides_of(values) == ("twin.wfs.read_noise_e=12.0",)
+    assert config_overrides(values) == ("twin.wfs.read_noise_e=12.0",)

@@ -7,22 +7,24 @@ from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
 
 from escape_hw.errors import ConfigError, StorageError
-from escape_hw.runtime.sweep import store as module
-from escape_hw.runtime.sweep.plan import EXPLORE, FINAL, Arm, Design, Slot
-from escape_hw.runtime.sweep.space import default_space
-from escape_hw.runtime.sweep.store import SweepStore
+from escape_hw.runtime.sweep import study as module
+from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot
+from escape_hw.runtime.sweep.search_space import default_space
+from escape_hw.runtime.sweep.study import SweepStore
 
-ARMS = (Arm("push-pull", False, __file__, "a"), Arm("push-pull", True, __file__, "b"))
+ARMS = (MatrixVariant("push-pull", False, __file__, "a"), MatrixVariant("push-pull", True, __file__, "b"))
 SPACE = default_space(30, ())
-PLAN = list(Design(trials=10).explored(ARMS))
+PLAN = list(Design(trials=10).exploration_slots(ARMS))
 OUTCOME = {"strehl": None, "stable": True, "diverged": False}
 
 
 @pytest.fixture
 def opened(tmp_path):
-    def make(learn: bool = False, settings: str = "same", patience_s: float = 5.0) -> SweepStore:
+    def make(use_tpe: bool = False, settings: str = "same", timeout_s: float = 5.0) -> SweepStore:
         url = f"sqlite:///{tmp_path / 'study.db'}"
-        return SweepStore(url, "s", {"frames": settings}, ARMS, SPACE, 1, learn=learn, patience_s=patience_s)
+        return SweepStore(
+            url, "s", {"frames": settings}, ARMS, SPACE, 1, use_tpe=use_tpe, timeout_s=timeout_s
+        )
 
     return make
 
@@ -32,7 +34,7 @@ def drain(*stores: SweepStore) -> list[Slot]:
     done = []
     while True:
         for one in stores:
-            one.lay_out(PLAN, {})
+            one.enqueue_slots(PLAN, {})
         claims = [claim for one in stores if (claim := one.claim()) is not None]
         if not claims:
             return done
@@ -50,7 +52,7 @@ def test_two_runners_run_every_trial_once(opened):
 
 def test_a_study_goes_on_where_it_was(opened):
     one = opened()
-    one.lay_out(PLAN, {})
+    one.enqueue_slots(PLAN, {})
     claim = one.claim()
     one.finish(claim, OUTCOME, 0.5)
     again = opened()
@@ -60,7 +62,7 @@ def test_a_study_goes_on_where_it_was(opened):
 
 def test_a_loop_that_diverged_is_pruned_and_counts_as_nothing(opened):
     one = opened()
-    one.lay_out(PLAN, {})
+    one.enqueue_slots(PLAN, {})
     one.finish(one.claim(), {**OUTCOME, "diverged": True}, None)
     (record,) = one.records()
     assert record.merit == 0.0
@@ -70,7 +72,7 @@ def test_a_loop_that_diverged_is_pruned_and_counts_as_nothing(opened):
 def test_what_a_dead_runner_had_runs_again(opened, monkeypatch):
     dead = opened()
     monkeypatch.setattr(dead, "runner", dead.runner.rsplit(":", 2)[0] + ":4194303:gone")
-    dead.lay_out(PLAN, {})
+    dead.enqueue_slots(PLAN, {})
     claim = dead.claim()
     # A living runner's trial is left alone.
     other = opened()
@@ -91,20 +93,20 @@ def test_what_a_dead_runner_had_runs_again(opened, monkeypatch):
 def test_a_silent_runner_of_another_host_is_given_up_after_its_grace(opened, monkeypatch):
     away = opened()
     monkeypatch.setattr(away, "runner", "elsewhere:1:abc")
-    away._beat()
-    away.lay_out(PLAN, {})
+    away._send_heartbeat()
+    away.enqueue_slots(PLAN, {})
     away.claim()
     assert opened().running() == 1
-    now = module.time.time() + module.GRACE_S + 1
+    now = module.time.time() + module.HEARTBEAT_TIMEOUT_S + 1
     monkeypatch.setattr(module.time, "time", lambda: now)
     assert opened().running() == 0
 
 
 def test_what_is_given_back_runs_again(opened):
     one = opened()
-    one.lay_out(PLAN, {})
+    one.enqueue_slots(PLAN, {})
     claim = one.claim()
-    one.give_back(claim, "stopped")
+    one.release(claim, "stopped")
     assert claim.slot in drain(one)
 
 
@@ -117,7 +119,7 @@ def test_other_settings_are_refused_by_name(opened):
 def test_later_stages_fix_their_parameters(opened):
     one = opened()
     values = {(arm.label, 0): {"gain": 0.3, "leak": 0.01, "dropped_modes": 4} for arm in ARMS}
-    one.lay_out([Slot(FINAL, arm.label, 0) for arm in ARMS], values)
+    one.enqueue_slots([Slot(FINAL, arm.label, 0) for arm in ARMS], values)
     assert one.claim().values == {"gain": 0.3, "leak": 0.01, "dropped_modes": 4}
 
 
@@ -131,11 +133,11 @@ def test_random_parameters_do_not_depend_on_who_runs_what_when(opened):
 
 
 def test_tpe_learns_from_each_arm_alone(opened):
-    one = opened(learn=True)
+    one = opened(use_tpe=True)
     # Merit rises with the gain on one arm and falls with it on the other.
-    plan = list(Design(trials=40).explored(ARMS))
+    plan = list(Design(trials=40).exploration_slots(ARMS))
     while True:
-        one.lay_out(plan, {})
+        one.enqueue_slots(plan, {})
         claim = one.claim()
         if claim is None:
             break
@@ -150,7 +152,7 @@ def test_tpe_learns_from_each_arm_alone(opened):
 def test_a_storage_that_comes_back_is_waited_for(opened, monkeypatch):
     monkeypatch.setattr(module.time, "sleep", lambda seconds: None)
     one = opened()
-    one.lay_out(PLAN, {})
+    one.enqueue_slots(PLAN, {})
     refusals, claim = iter([StorageInternalError("gone"), StorageInternalError("gone")]), one._claim
 
     def sometimes():
@@ -163,7 +165,7 @@ def test_a_storage_that_comes_back_is_waited_for(opened, monkeypatch):
 
 
 def test_a_storage_that_stays_away_is_named(opened, monkeypatch):
-    one = opened(patience_s=0.0)
+    one = opened(timeout_s=0.0)
 
     def never():
         raise StorageInternalError("gone")

@@ -7,31 +7,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from escape_hw.api.frames import Frame
+from escape_hw.api.camera import Frame
 from escape_hw.errors import ProductError
-from escape_hw.io.telemetry import LoopTelemetry, load_telemetry, save_telemetry
-from escape_hw.runtime.telemetry_tape import TelemetryTape
+from escape_hw.io.fits.telemetry import LoopTelemetry, load_telemetry, save_telemetry
+from escape_hw.runtime.procedures.loop import LoopTelemetryRecorder
 
 
-def play(tape: TelemetryTape, index: int, answer: float | None) -> None:
+def play(tape: LoopTelemetryRecorder, index: int, answer: float | None) -> None:
     """A frame, its slopes, and the command that answers it."""
-    taps = tape.taps
-    assert taps.frame is not None
-    assert taps.slopes is not None
-    assert taps.command is not None
-    taps.frame(Frame(np.zeros((2, 2), np.uint16), index, index * 2_000_000, index * 2_000_000 + 5))
+    callbacks = tape.callbacks
+    assert callbacks.frame is not None
+    assert callbacks.slopes is not None
+    assert callbacks.command is not None
+    callbacks.frame(Frame(np.zeros((2, 2), np.uint16), index, index * 2_000_000, index * 2_000_000 + 5))
     buffer = np.full(4, index, np.float32)
-    taps.slopes(index, buffer)
+    callbacks.slopes(index, buffer)
     buffer[:] = -1  # what a tap gets is overwritten
     if answer is not None:
-        taps.command(np.full(3, answer))
+        callbacks.command(np.full(3, answer))
 
 
 def test_the_newest_frames_are_kept_in_order() -> None:
-    tape = TelemetryTape(5, 4, 3)
+    tape = LoopTelemetryRecorder(5, 4, 3)
     for index in (1, 2, 4, 5, 6, 7, 9):
         play(tape, index, index / 10)
-    found = tape.telemetry()
+    found = tape.to_telemetry()
     assert found.index.tolist() == [4, 5, 6, 7, 9]
     np.testing.assert_array_equal(found.slopes[:, 0], found.index)
     np.testing.assert_allclose(found.commands[:, 2], found.index / 10)
@@ -40,35 +40,35 @@ def test_the_newest_frames_are_kept_in_order() -> None:
 
 
 def test_only_the_first_command_answers_a_frame() -> None:
-    tape = TelemetryTape(5, 4, 3)
+    tape = LoopTelemetryRecorder(5, 4, 3)
     play(tape, 1, 0.1)
     play(tape, 2, None)
     play(tape, 3, 0.3)
-    assert tape.taps.command is not None
-    tape.taps.command(np.zeros(3))  # flattened at the end
-    assert tape.telemetry().commands[:, 0].tolist() == [0.1, 0.1, 0.3]
+    assert tape.callbacks.command is not None
+    tape.callbacks.command(np.zeros(3))  # flattened at the end
+    assert tape.to_telemetry().commands[:, 0].tolist() == [0.1, 0.1, 0.3]
 
 
 def test_a_new_start_of_the_camera_begins_anew() -> None:
-    tape = TelemetryTape(5, 4, 3)
+    tape = LoopTelemetryRecorder(5, 4, 3)
     for index in (7, 8, 1, 2):
         play(tape, index, 0.0)
-    assert tape.telemetry().index.tolist() == [1, 2]
-    assert TelemetryTape(5, 4, 3).telemetry().rate_hz == 0
+    assert tape.to_telemetry().index.tolist() == [1, 2]
+    assert LoopTelemetryRecorder(5, 4, 3).to_telemetry().rate_hz == 0
 
 
 def test_slopes_of_another_geometry_are_left_out() -> None:
-    tape = TelemetryTape(5, 4, 3)
-    assert tape.taps.slopes is not None
-    tape.taps.slopes(1, np.zeros(6, np.float32))
-    assert tape.telemetry().index.size == 0
+    tape = LoopTelemetryRecorder(5, 4, 3)
+    assert tape.callbacks.slopes is not None
+    tape.callbacks.slopes(1, np.zeros(6, np.float32))
+    assert tape.to_telemetry().index.size == 0
 
 
 def test_telemetry_on_disk(tmp_path: Path) -> None:
-    tape = TelemetryTape(5, 4, 3)
+    tape = LoopTelemetryRecorder(5, 4, 3)
     for index in (1, 2, 4):
         play(tape, index, index / 10)
-    record = tape.telemetry()
+    record = tape.to_telemetry()
     back = load_telemetry(save_telemetry(tmp_path / "t.fits", record, "a", True))
     for name in ("index", "exposed_s", "slopes", "commands"):
         np.testing.assert_array_equal(getattr(back.result, name), getattr(record, name))

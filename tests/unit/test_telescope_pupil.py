@@ -8,19 +8,18 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from escape_hw.config.load import load_system
-from escape_hw.config.telescope_models import TelescopeSection
-from escape_hw.config.twin_sky import TwinAtmosphere, TwinContamination, TwinStar
-from escape_hw.pipeline.obscuration import passed_share
-from escape_sim.geometry import pupil_geometry, soiled_pupil
-from escape_sim.telescope_pupil import soiled_share
+from escape_hw.config.loader import load_system
+from escape_hw.config.system import TelescopeSection
+from escape_hw.config.twin import TwinAtmosphere, TwinContamination, TwinStar
+from escape_hw.pipeline.geometry.obscuration import transmitted_fraction
+from escape_sim.optics.pupil import contaminated_pupil, pupil_geometry, pupil_transmission
 
 D, N = 6.5, 60
 X = (np.arange(N) - (N - 1) / 2) * D / N
 
 
 def shadow(**telescope):
-    return (1 - passed_share(TelescopeSection(**telescope), D, X)).sum() * (D / N) ** 2
+    return (1 - transmitted_fraction(TelescopeSection(**telescope), D, X)).sum() * (D / N) ** 2
 
 
 def test_nothing_in_the_way_takes_nothing():
@@ -40,7 +39,7 @@ def test_a_vane_thinner_than_a_sample_takes_its_share(angle):
 
 
 def test_vanes_point_from_x_towards_y():
-    share = passed_share(TelescopeSection(spider_m=0.2, spiders_deg=(90.0,)), D, X)
+    share = transmitted_fraction(TelescopeSection(spider_m=0.2, spiders_deg=(90.0,)), D, X)
     rows, columns = np.nonzero(share < 1)
     assert rows.min() >= N // 2 - 1
     assert set(columns) <= {N // 2 - 1, N // 2}
@@ -62,12 +61,12 @@ def test_the_pupil_of_a_telescope_keeps_the_right_power():
     power = [np.square(pupil_geometry(c).amplitude, dtype=float).sum() for c in (config, bare)]
     assert power[0] / power[1] == pytest.approx(1 - 0.09, abs=0.002)
     assert np.array_equal(
-        pupil_geometry(plain).amplitude, soiled_pupil(plain, np.random.default_rng(0)).amplitude
+        pupil_geometry(plain).amplitude, contaminated_pupil(plain, np.random.default_rng(0)).amplitude
     )
 
 
 def soiled(seed=0, **dirt):
-    return soiled_share(TwinContamination(**dirt), D, X, np.random.default_rng(seed))
+    return pupil_transmission(TwinContamination(**dirt), D, X, np.random.default_rng(seed))
 
 
 def inside():

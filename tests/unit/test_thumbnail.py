@@ -10,13 +10,13 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from escape_hw.api.gains import GainsResult
-from escape_hw.api.matrix import InteractionMatrix
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.optical_gains import GainsResult
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import CalibrationResult, Measured, RegistrationEstimate, SprintIteration
-from escape_hw.api.thumbnail import curve, picture, table
+from escape_hw.api.representation import image_html, line_html, table_html
+from escape_hw.api.results import CalibrationResult, Estimate, RegistrationEstimate, SprintIteration
 from escape_hw.remote.html import state_html
-from escape_hw.remote.state import Fault, LoopState, Phase, State
+from escape_hw.remote.state import FaultState, LoopState, Phase, State
 
 
 def pixels(html: str) -> np.ndarray:
@@ -33,7 +33,7 @@ def matrix() -> InteractionMatrix:
 
 
 def test_a_picture_shows_signs_by_colour_and_gaps_in_grey() -> None:
-    found = pixels(picture([[-1.0, 0.0, 1.0, np.nan]]))[0]
+    found = pixels(image_html([[-1.0, 0.0, 1.0, np.nan]]))[0]
     assert found[0].tolist() == [59, 76, 192]
     assert found[1].tolist() == [242, 242, 242]
     assert found[2].tolist() == [180, 4, 38]
@@ -42,24 +42,24 @@ def test_a_picture_shows_signs_by_colour_and_gaps_in_grey() -> None:
 
 @pytest.mark.parametrize("values", [np.zeros((3, 3)), np.full((2, 2), np.nan), np.ones((1, 1))])
 def test_pictures_of_nothing(values: np.ndarray) -> None:
-    assert pixels(picture(values)).shape[:2] == values.shape
+    assert pixels(image_html(values)).shape[:2] == values.shape
 
 
 def test_large_arrays_are_thinned_out() -> None:
-    assert len(picture(np.random.default_rng(0).normal(size=(3000, 1000)))) < 500_000
+    assert len(image_html(np.random.default_rng(0).normal(size=(3000, 1000)))) < 500_000
 
 
 def test_a_curve_fills_its_height() -> None:
     ys = [
         float(pair.split(",")[1])
-        for pair in re.search(r'points="([^"]+)"', curve([3, 5, np.nan, 4]))[1].split()
+        for pair in re.search(r'points="([^"]+)"', line_html([3, 5, np.nan, 4]))[1].split()
     ]
     assert ys == [47.0, 1.0, 24.0]
-    assert curve([1.0]) == ""
+    assert line_html([1.0]) == ""
 
 
 def test_a_table_escapes_what_it_is_given() -> None:
-    assert "&lt;script&gt;" in table({"x": "<script>"})
+    assert "&lt;script&gt;" in table_html({"x": "<script>"})
 
 
 def test_a_matrix_tells_units_errors_and_where_it_is_from() -> None:
@@ -74,7 +74,7 @@ def test_a_matrix_tells_units_errors_and_where_it_is_from() -> None:
 def estimate() -> RegistrationEstimate:
     steps = tuple(SprintIteration(Registration(), 1.0, 10.0**-k, 1.0) for k in range(4))
     return RegistrationEstimate(
-        Registration(shift_x=1.5), np.diag([0.04, 1, 1, 1, 1]), Measured(1, 0.1), Measured(1, 0.1), True,
+        Registration(shift_x=1.5), np.diag([0.04, 1, 1, 1, 1]), Estimate(1, 0.1), Estimate(1, 0.1), True,
         steps, 1.0, ("few frames",),
     )  # fmt: skip
 
@@ -108,7 +108,7 @@ def test_gains_without_a_round_are_shown_as_such() -> None:
 def test_a_state_tells_the_fault_and_the_way_out() -> None:
     state = State(
         system="razor", simulated=False, phase=Phase.FAULT,
-        fault=Fault(reason="it broke", at_utc="", way_out="mend it"), loop=LoopState(closed=True, matrix="m"),
+        fault=FaultState(reason="it broke", at_utc="", way_out="mend it"), loop=LoopState(closed=True, matrix="m"),
     )  # fmt: skip
     html = state_html(state)
     assert "razor (HARDWARE)" in html

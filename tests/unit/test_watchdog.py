@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from escape_hw.config.server_models import ServerSection
-from escape_hw.remote.state import Fault, LoopState, Mirror, Rates, Running, State
-from escape_hw.server.watchdog import Verdict, Watchdog
+from escape_hw.config.system import ServerSection
+from escape_hw.remote.state import ActiveRun, FaultState, FrameCounters, LoopState, MirrorState, State
+from escape_hw.server.safety.watchdog import LimitViolation, Watchdog
 
 
 class Engine:
@@ -18,23 +18,23 @@ class Engine:
 
     def tell(
         self, seconds: float, *, closed: bool = True, frames: int = 100, residual: float = 50.0,
-        clipped: float = 0.0, fault: Fault | None = None, fresh: bool = True, run: int | None = None,
+        clipped: float = 0.0, fault: FaultState | None = None, fresh: bool = True, run: int | None = None,
         flattened: int = 1,
-    ) -> Verdict | None:  # fmt: skip
+    ) -> LimitViolation | None:  # fmt: skip
         """So many seconds alike; the first verdict."""
         for _ in range(round(seconds / self.every)):
             self.now += self.every
             self.frames += frames
             self.told += fresh
             state = State(
-                rates=Rates(frames=self.frames), fault=fault,
-                mirror=Mirror(clipped=clipped, flattened=flattened),
-                procedure=None if run is None else Running(id=run, name="gains", arguments={}),
+                rates=FrameCounters(frames=self.frames), fault=fault,
+                mirror=MirrorState(clipped=clipped, flattened=flattened),
+                procedure=None if run is None else ActiveRun(id=run, name="gains", arguments={}),
                 # No two residuals are quite the same.
                 loop=LoopState(closed=closed, residual_nm=residual * (1 + 1e-6 * self.told)),
             )  # fmt: skip
-            if (verdict := self.dog.judge(state)) is not None:
-                return verdict
+            if (violation := self.dog.check(state)) is not None:
+                return violation
         return None
 
 
@@ -57,27 +57,27 @@ def test_a_run_that_closes_a_loop_of_its_own_is_not_held_against_the_one_before(
     assert engine.tell(20, residual=250, run=5) is None
     # Nor is the loop that comes back after it.
     assert engine.tell(20, residual=60) is None
-    verdict = engine.tell(5, residual=250)
-    assert verdict is not None
-    assert "the residual grew" in verdict.reason
+    violation = engine.tell(5, residual=250)
+    assert violation is not None
+    assert "the residual grew" in violation.reason
 
 
 def test_a_loop_that_a_run_closes_again_is_not_held_against_its_round_before(engine: Engine) -> None:
     assert engine.tell(20, residual=60, run=5) is None
     # Opened, the mirror flat, and closed at a lower gain: no state came in between.
     assert engine.tell(20, residual=250, run=5, flattened=2) is None
-    verdict = engine.tell(5, residual=1100, run=5, flattened=2)
-    assert verdict is not None
-    assert "the residual grew to 1100 nm" in verdict.reason
+    violation = engine.tell(5, residual=1100, run=5, flattened=2)
+    assert violation is not None
+    assert "the residual grew to 1100 nm" in violation.reason
 
 
 def test_no_frames_in_closed_loop(engine: Engine) -> None:
     assert engine.tell(5) is None
     assert engine.tell(2, frames=0) is None
-    verdict = engine.tell(0.5, frames=0)
-    assert verdict is not None
-    assert verdict.reason.startswith("no frame for 2.2 s in closed loop (limit 2 s)")
-    assert "camera" in verdict.way_out
+    violation = engine.tell(0.5, frames=0)
+    assert violation is not None
+    assert violation.reason.startswith("no frame for 2.2 s in closed loop (limit 2 s)")
+    assert "camera" in violation.way_out
 
 
 def test_no_frames_while_nothing_is_closed_is_no_fault(engine: Engine) -> None:
@@ -87,27 +87,27 @@ def test_no_frames_while_nothing_is_closed_is_no_fault(engine: Engine) -> None:
 
 def test_saturated_actuators(engine: Engine) -> None:
     assert engine.tell(5) is None
-    verdict = engine.tell(2, clipped=0.35)
-    assert verdict is not None
-    assert verdict.reason.startswith("35 % of the actuators at their limits for 1.2 s")
+    violation = engine.tell(2, clipped=0.35)
+    assert violation is not None
+    assert violation.reason.startswith("35 % of the actuators at their limits for 1.2 s")
 
 
 def test_a_residual_that_grows(engine: Engine) -> None:
     assert engine.tell(10, residual=50) is None
-    verdict = engine.tell(3, residual=300)
-    assert verdict is not None
-    assert "grew to 300 nm, 6.0 times the usual 50 nm" in verdict.reason
+    violation = engine.tell(3, residual=300)
+    assert violation is not None
+    assert "grew to 300 nm, 6.0 times the usual 50 nm" in violation.reason
 
 
 @pytest.mark.parametrize("every", [0.02, 0.2, 1.5])
 def test_a_residual_that_grows_is_noticed_however_often_the_state_is_told(every: float) -> None:
     engine = Engine(every)
     assert engine.tell(12, residual=50) is None
-    verdict = None
+    violation = None
     for residual in (90, 130, 170, 250, 330, 400, 400):
-        verdict = verdict or engine.tell(1.5, residual=residual)
-    assert verdict is not None
-    assert "times the usual 50 nm" in verdict.reason
+        violation = violation or engine.tell(1.5, residual=residual)
+    assert violation is not None
+    assert "times the usual 50 nm" in violation.reason
 
 
 def test_states_told_out_of_turn_weigh_no_more(engine: Engine) -> None:
@@ -144,4 +144,4 @@ def test_a_residual_told_again_is_none_to_go_by(engine: Engine) -> None:
 
 def test_what_is_latched_is_not_judged_again(engine: Engine) -> None:
     assert engine.tell(5) is None
-    assert engine.tell(60, frames=0, clipped=1.0, fault=Fault(reason="x", at_utc="")) is None
+    assert engine.tell(60, frames=0, clipped=1.0, fault=FaultState(reason="x", at_utc="")) is None

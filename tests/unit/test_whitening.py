@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from escape_hw.calibration.whitening import (
+from escape_hw.calibration.docrime.whitening import (
     apply_filter,
-    filter_by_past,
-    filters_by_past,
-    known_past,
-    prediction_error_filter,
+    apply_history_filters,
+    count_known_history,
+    fit_history_filters,
+    fit_prediction_error_filter,
 )
 
 PROCESSES = {
@@ -35,7 +35,7 @@ def process(coefficients, n=4000, n_slopes=20, seed=0, noise=0.0):
 def test_an_autoregressive_process_is_recovered(name):
     coefficients = PROCESSES[name]
     x = process(coefficients)
-    filter_ = prediction_error_filter(x, np.ones(len(x), bool), 4)
+    filter_ = fit_prediction_error_filter(x, np.ones(len(x), bool), 4)
     want = np.concatenate([[1.0], -np.asarray(coefficients), np.zeros(4 - len(coefficients))])
     # Each coefficient's error is about 1 / sqrt(frames x slopes), a few times more where they compete.
     assert filter_ == pytest.approx(want, abs=0.03)
@@ -44,7 +44,7 @@ def test_an_autoregressive_process_is_recovered(name):
 @pytest.mark.parametrize("name", PROCESSES)
 def test_what_is_left_is_white(name):
     x = process(PROCESSES[name])
-    filter_ = prediction_error_filter(x, np.ones(len(x), bool), 4)
+    filter_ = fit_prediction_error_filter(x, np.ones(len(x), bool), 4)
     e = apply_filter(x, filter_, np.arange(4, len(x)))
     e = e - e.mean(axis=0)
     e /= e.std(axis=0)
@@ -56,11 +56,11 @@ def test_what_is_left_is_white(name):
 def test_lost_frames_do_not_spoil_the_filter(lost):
     x = process(PROCESSES["AR(2), smooth"])
     present = np.random.default_rng(1).random(len(x)) > lost
-    whole = prediction_error_filter(x, np.ones(len(x), bool), 4)
+    whole = fit_prediction_error_filter(x, np.ones(len(x), bool), 4)
     broken = x.copy()
     # Whatever stands in the rows of lost frames.
     broken[~present] = 1e6
-    assert prediction_error_filter(broken, present, 4) == pytest.approx(whole, abs=0.05)
+    assert fit_prediction_error_filter(broken, present, 4) == pytest.approx(whole, abs=0.05)
 
 
 def test_noise_asks_for_a_longer_memory():
@@ -68,7 +68,7 @@ def test_noise_asks_for_a_longer_memory():
     x = process(PROCESSES["AR(1)"], noise=3.0)
     left = []
     for order in (1, 2, 4, 8):
-        filter_ = prediction_error_filter(x, np.ones(len(x), bool), order)
+        filter_ = fit_prediction_error_filter(x, np.ones(len(x), bool), order)
         left.append(float(apply_filter(x, filter_, np.arange(8, len(x))).var(axis=0).sum()))
     assert (np.diff(left) < 0).all()
     assert left[0] < float(x.var(axis=0).sum())
@@ -77,22 +77,22 @@ def test_noise_asks_for_a_longer_memory():
 @pytest.mark.parametrize("order", [1, 3])
 def test_without_signal_nothing_is_filtered(order):
     still = np.full((50, 4), 3.0, np.float32)
-    filter_ = prediction_error_filter(still, np.ones(50, bool), order)
+    filter_ = fit_prediction_error_filter(still, np.ones(50, bool), order)
     assert filter_.tolist() == [1.0] + [0.0] * order
     # No row with a complete past.
     alternate = np.arange(50) % 2 == 0
-    assert prediction_error_filter(process([0.5], 50), alternate, order)[0] == 1
-    assert prediction_error_filter(process([0.5], 2), np.ones(2, bool), order).size == order + 1
+    assert fit_prediction_error_filter(process([0.5], 50), alternate, order)[0] == 1
+    assert fit_prediction_error_filter(process([0.5], 2), np.ones(2, bool), order).size == order + 1
 
 
 def test_order_zero_is_no_filter():
-    assert prediction_error_filter(process([0.9], 100), np.ones(100, bool), 0).tolist() == [1.0]
+    assert fit_prediction_error_filter(process([0.9], 100), np.ones(100, bool), 0).tolist() == [1.0]
 
 
 def test_noise_free_slopes_are_predicted_without_overflow():
     t = np.arange(500)
     x = np.sin(0.01 * t)[:, None] * np.linspace(1, 2, 6)
-    filter_ = prediction_error_filter(x.astype(np.float32), np.ones(500, bool), 6)
+    filter_ = fit_prediction_error_filter(x.astype(np.float32), np.ones(500, bool), 6)
     assert np.isfinite(filter_).all()
     assert np.abs(apply_filter(x, filter_, np.arange(6, 500))).max() < 0.02
 
@@ -114,8 +114,8 @@ def test_applying_a_filter_is_a_convolution(dtype):
 
 def test_the_past_of_a_frame_ends_where_one_was_lost():
     present = np.array([0, 1, 1, 1, 0, 1, 1, 1, 1, 1], bool)
-    assert known_past(present, 3).tolist() == [-1, 0, 1, 2, -1, 0, 1, 2, 3, 3]
-    assert known_past(np.ones(4, bool), 2).tolist() == [0, 1, 2, 2]
+    assert count_known_history(present, 3).tolist() == [-1, 0, 1, 2, -1, 0, 1, 2, 3, 3]
+    assert count_known_history(np.ones(4, bool), 2).tolist() == [0, 1, 2, 2]
 
 
 def test_frames_with_a_short_past_are_whitened_as_well_and_weighted():
@@ -127,9 +127,9 @@ def test_frames_with_a_short_past_are_whitened_as_well_and_weighted():
         slow[t] = 1.5 * slow[t - 1] - 0.56 * slow[t - 2] + noise[t]
     rows, present = slow[300:], np.ones(n, bool)
     present[20] = False
-    filters = filters_by_past(rows.astype(np.float32), present, 2)
+    filters = fit_history_filters(rows.astype(np.float32), present, 2)
     np.testing.assert_allclose(filters[2], [1, -1.5, 0.56], atol=0.02)
-    white = filter_by_past(rows, filters, known_past(present, 2))
+    white = apply_history_filters(rows, filters, count_known_history(present, 2))
     # All but the first frame and those lost or first after the loss.
     assert white.shape == (n - 3, copies)
     covariance = white @ white.T / copies
@@ -139,5 +139,5 @@ def test_frames_with_a_short_past_are_whitened_as_well_and_weighted():
 
 def test_without_prediction_every_frame_stays_as_it_is():
     rows = np.arange(12.0).reshape(6, 2)
-    past = known_past(np.array([1, 1, 0, 1, 1, 1], bool), 0)
-    np.testing.assert_array_equal(filter_by_past(rows, [np.ones(1)], past), rows[[0, 1, 3, 4, 5]])
+    past = count_known_history(np.array([1, 1, 0, 1, 1, 1], bool), 0)
+    np.testing.assert_array_equal(apply_history_filters(rows, [np.ones(1)], past), rows[[0, 1, 3, 4, 5]])

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from escape_drivers.asm_driver import AsmMirror, make_asm
+from escape_drivers.asm.mirror import AsmMirror, make_asm
 from escape_hw.api.emulator import EmulatorRequest
-from escape_hw.config.load import load_system
-from escape_sim.emulators import asm_wire
-from escape_sim.emulators.asm import AsmEmulator, make_emulator
+from escape_hw.config.loader import load_system
+from escape_sim.emulators.asm import protocol as asm_wire
+from escape_sim.emulators.asm.emulator import AsmEmulator, make_emulator
 
 #: Longest wait for something that takes milliseconds on an idle machine, seconds.
 PATIENCE_S = 30.0
@@ -95,7 +95,7 @@ class RawClient:
     def reply(self, kind: int) -> bytes:
         """Payload of the next frame of a type; others are passed over."""
         while True:
-            while (found := asm_wire.take(self._arrived)) is None:
+            while (found := asm_wire.decode_frame(self._arrived)) is None:
                 data = self.socket.recv(65536)
                 assert data, "the emulator hung up"
                 self._arrived += data

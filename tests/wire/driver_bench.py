@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from escape_hw.config.load import load_system
-from escape_hw.config.models import SystemConfig
+from escape_hw.config.loader import load_system
 from escape_hw.config.registry import device_factory
+from escape_hw.config.system import SystemConfig
 from escape_sim.stand_ins import StandIn, StandInUnavailable
 
 #: Driver, key in [devices] and stand-in.

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from escape_hw.io.interchange import milk_layout as layout
+from escape_hw.io.interchange.milk import layout
 
 NAME = os.environ.get("ESCAPE_IMAGESTREAMIO_LIBRARY") or ctypes.util.find_library("ImageStreamIO")
 #: Where the structure that its functions take points to what; room for all of it.
@@ -61,12 +61,12 @@ class Image:
 
     @property
     def array(self) -> np.ndarray:
-        return self._array_at(self._pointer(_ARRAY), layout.shape_of(self.md))
+        return self._array_at(self._pointer(_ARRAY), layout.image_shape(self.md))
 
     def copied(self, number: int) -> np.ndarray:
         """One of the copies in the ring."""
         at = self._pointer(_RING) + number * self.md.data_bytes
-        return self._array_at(at, layout.shape_of(self.md))
+        return self._array_at(at, layout.image_shape(self.md))
 
     def _array_at(self, at: int, shape: tuple[int, ...]) -> np.ndarray:
         dtype = layout.DTYPES[self.md.datatype]
@@ -82,7 +82,7 @@ class Image:
         at = ctypes.c_void_p()
         assert self.library.ImageStreamIO_readBufferAt(self.raw, ctypes.c_uint(number), ctypes.byref(at)) == 0
         assert at.value is not None
-        return self._array_at(at.value, layout.shape_of(self.md)[1:])
+        return self._array_at(at.value, layout.image_shape(self.md)[1:])
 
     def stamp(self, number: int) -> tuple[int, int, int]:
         """Seconds, nanoseconds and count of a slice."""

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from escape_hw.config.models import SystemConfig
-from escape_hw.io.interchange.milk_stream import MilkStream
-from escape_hw.io.interchange.shmem_stream import ShmemStream
+from escape_hw.config.system import SystemConfig
+from escape_hw.io.interchange.milk.stream import MilkStream
+from escape_hw.io.interchange.pyrtc.stream import ShmemStream
 from escape_hw.io.interchange.stream import Stream
 
 PERIOD_S = 0.004

@@ -8,8 +8,7 @@ from driver_bench import fresh, make, stand_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from escape_drivers.alpao_errors import ERRORS, explain
-from escape_drivers.alpao_library import version_text
+from escape_drivers.alpao.library import ERRORS, describe_error, format_version
 from escape_hw.config.registry import available
 from escape_hw.errors import CommandRejected, ConfigError, DeviceError, DeviceLost
 
@@ -140,26 +139,26 @@ def test_every_error_of_the_sdk_is_explained(asdk, number) -> None:
 
 
 def test_an_unknown_error_keeps_the_librarys_words() -> None:
-    assert explain(0x999, "smoke") == "error 0x999, unknown error; the library says: smoke"
+    assert describe_error(0x999, "smoke") == "error 0x999, unknown error; the library says: smoke"
 
 
 @given(st.integers(0, 9), st.integers(0, 99), st.integers(0, 99), st.integers(0, 99999))
 def test_versions_are_written_as_the_vendor_does(major, minor, patch, build) -> None:
     number = ((major * 100 + minor) * 100 + patch) * 100000 + build
-    assert version_text(float(number)) == f"{major}.{minor:02}.{patch:02}.{build:04}"
+    assert format_version(float(number)) == f"{major}.{minor:02}.{patch:02}.{build:04}"
 
 
 def test_patterns_reach_the_electronics_and_stop_before_anything_else(asdk) -> None:
     wave = 0.01 * np.sin(np.arange(8) / 8 * 2 * np.pi)[:, None] * np.ones(97)
     with make("alpao") as dm:
-        dm.play(wave, repeats=0)
+        dm.play_patterns(wave, repeats=0)
         assert dm.is_playing
-        dm.play(wave, repeats=3)
+        dm.play_patterns(wave, repeats=3)
         assert asdk.calls[3:] == ["asdkSendPattern 8 0", "asdkStop", "asdkSendPattern 8 3"]
         dm.send(np.zeros(97))
         assert asdk.names()[6:] == ["asdkStop", "asdkSend"]
         assert not dm.is_playing
-        dm.play(wave, repeats=0)
+        dm.play_patterns(wave, repeats=0)
     assert asdk.names()[-5:] == ["asdkStop", "asdkSend", "asdkStop", "asdkReset", "asdkRelease"]
     assert not asdk.complaints
 
@@ -170,16 +169,16 @@ def test_a_pattern_that_breaks_a_limit_anywhere_is_refused_whole(asdk) -> None:
     with make("alpao", "devices.dm.limits.max_slew=0.1") as dm:
         for wrong, why in ((high, "shape 2 .* exceeds max_stroke"), (still[:0], "0 shapes")):
             with pytest.raises(CommandRejected, match=why):
-                dm.play(wrong, repeats=0)
+                dm.play_patterns(wrong, repeats=0)
         jump = still.copy()
         jump[1:, 5] = [0.1, 0.2]
-        dm.play(jump, repeats=1)
+        dm.play_patterns(jump, repeats=1)
         dm.send(np.zeros(97))
         dm.flatten()
         with pytest.raises(CommandRejected, match=r"shape 0 .* further from the one before than max_slew"):
-            dm.play(jump, repeats=2)
+            dm.play_patterns(jump, repeats=2)
         with pytest.raises(CommandRejected, match=r"not finite|NaN|nan"):
-            dm.play(still * np.nan)
+            dm.play_patterns(still * np.nan)
         assert asdk.names().count("asdkSendPattern") == 1
 
 

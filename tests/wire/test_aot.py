@@ -14,15 +14,14 @@ from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.errors import IncompatibleProduct, ProductError
-from escape_hw.io.interchange.aot_read import read_aot
-from escape_hw.io.interchange.aot_write import ERRORS, AotFacts, write_aot
-from escape_hw.io.telemetry import LoopTelemetry
+from escape_hw.io.fits.telemetry import LoopTelemetry
+from escape_hw.io.interchange.aot import ERRORS, AotSystem, read_aot, write_aot
 
 aotpy = pytest.importorskip("aotpy", reason="needs aotpy: pip install 'escape-hw[interchange]'")
 pytestmark = pytest.mark.filterwarnings("ignore::astropy.utils.exceptions.AstropyWarning")
 
 PLACES = tuple((k * 1e-3, -k * 2e-3) for k in range(97))
-FACTS = AotFacts(6.75e-3, 635e-9, 2.2e-6, PLACES, 500.0)
+FACTS = AotSystem(6.75e-3, 635e-9, 2.2e-6, PLACES, 500.0)
 
 
 def telemetry(result: CalibrationResult, frames: int = 40) -> LoopTelemetry:

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from driver_bench import fresh, make, stand_in
 
-from escape_drivers.aravis_library import ARAVIS, AravisLibrary, Received
-from escape_hw.api.frames import Region
+from escape_drivers.aravis.library import ARAVIS, AravisLibrary, ReceivedBuffer
+from escape_hw.api.camera import Region
 from escape_hw.errors import ConfigError, DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
 from escape_hw.testing import Check, Factory, parametrize_device_checks
 
@@ -84,7 +84,7 @@ def test_lost_and_damaged_frames_are_counted(arv) -> None:
     with make("aravis", "devices.science.frame_rate_hz=500", "devices.science.exposure_s=1e-3") as camera:
         indices = [camera.next_frame(1.0).index for _ in range(3)]
         assert np.diff(indices).tolist() == [4, 2]
-        assert (camera.status().lost, camera.damaged_frames) == (4, 1)
+        assert (camera.status().lost, camera.incomplete_frames) == (4, 1)
 
 
 @pytest.mark.parametrize(
@@ -102,9 +102,9 @@ def test_pixel_formats(arv, format_, shift, top) -> None:
 def test_a_buffer_shorter_than_the_frame_is_never_read(arv) -> None:
     with make("aravis") as camera:
         held = ctypes.create_string_buffer(100)
-        short = Received(ctypes.addressof(held), 100, 0, 1, 1, 128, 128)
+        short = ReceivedBuffer(ctypes.addressof(held), 100, 0, 1, 1, 128, 128)
         with pytest.raises(DeviceError, match="delivered 128 x 128 pixels in 100 bytes"):
-            camera._counts(short)
+            camera._pixel_counts(short)
 
 
 def test_newest_skips_what_waits(arv) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from driver_bench import fresh
 
-from escape_drivers.alpao_library import AlpaoLibrary
-from escape_sim.stand_ins import StandInUnavailable, build
+from escape_drivers.alpao.library import AlpaoLibrary
+from escape_sim.stand_ins import StandInUnavailable, build_library
 
 ZEROS = np.zeros(97)
 
@@ -158,7 +158,7 @@ def test_without_a_compiler_the_reason_is_given(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("CC", "nocc")
     with pytest.raises(StandInUnavailable, match=r"tried nocc, cc, gcc, clang.*libc6-dev.*CC"):
-        build("asdk")
+        build_library("asdk")
 
 
 def test_a_compiler_that_fails_is_quoted(monkeypatch, tmp_path) -> None:
@@ -167,17 +167,17 @@ def test_a_compiler_that_fails_is_quoted(monkeypatch, tmp_path) -> None:
     broken.chmod(0o755)
     monkeypatch.setenv("CC", str(broken))
     with pytest.raises(StandInUnavailable, match=r"no string\.h here"):
-        build("asdk")
+        build_library("asdk")
 
 
 def test_a_cache_that_cannot_be_written_is_named(monkeypatch, tmp_path) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with pytest.raises(StandInUnavailable, match=r"file/escape/stand-ins writable.*XDG_CACHE_HOME"):
-        build("asdk")
+        build_library("asdk")
 
 
 def test_the_cache_lies_outside_the_package(asdk) -> None:
     assert "site-packages" not in str(asdk.path)
     assert not (asdk.path.parent / "asdk.c").exists()
-    assert build("asdk") == asdk.path
+    assert build_library("asdk") == asdk.path

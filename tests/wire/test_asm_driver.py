@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from asm_bench import driver, emulator, port_of, wait_for
 
-from escape_drivers import asm_messages as m
-from escape_drivers.asm_codec import AsmCodec
-from escape_drivers.asm_driver import AsmMirror, make_asm
-from escape_drivers.asm_observer import AsmObserver
-from escape_drivers.asm_options import AsmOptions
+from escape_drivers.asm import messages as m
+from escape_drivers.asm.codec import AsmCodec
+from escape_drivers.asm.mirror import AsmMirror, make_asm
+from escape_drivers.asm.observer import AsmObserver
+from escape_drivers.asm.options import AsmOptions
 from escape_hw.api.adaptive_secondary import ShellState
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, DeviceError, FrameTimeout, SettingRejected
 from escape_hw.testing import Check, Factory, parametrize_device_checks
-from escape_sim.emulators.asm import AsmEmulator
+from escape_sim.emulators.asm.emulator import AsmEmulator
 
 # --------------------------------------------------------------------- contract
 _EMULATOR = emulator()
@@ -162,7 +162,7 @@ def test_a_mirror_left_set_stays_set_and_is_found_so() -> None:
     with emulator() as made:
         with driver(port_of(made)) as mirror:
             mirror.leave_set = True
-        assert made.body.shell.state is ShellState.SET
+        assert made.controller.shell.state is ShellState.SET
         with driver(port_of(made), lift=False) as again:
             assert again.state is ShellState.SET
         assert made.complaints == ()
@@ -172,18 +172,18 @@ def test_many_may_look_while_one_controls() -> None:
     with emulator() as made, driver(port_of(made)) as owner:
         others = [driver(port_of(made)) for _ in range(5)]
         for other in others:
-            health = other.glance()
+            health = other.observe_health()
             assert health.state is ShellState.RUNNING
             assert "pid" in health.owner
             assert health.contaminated == owner.limits.disabled
-        assert owner.send(np.zeros(336)).guard.untouched
+        assert owner.send(np.zeros(336)).guard.is_unchanged
         assert made.complaints == ()
 
 
 def test_nobody_looks_at_another_mirror_than_configured() -> None:
     with emulator() as made:
         with pytest.raises(DeviceError, match=r"is 'SIM336', not 'MMT336'; correct devices.dm.serial"):
-            driver(port_of(made), "devices.dm.serial=MMT336").glance()
+            driver(port_of(made), "devices.dm.serial=MMT336").observe_health()
         assert made.complaints == ()
 
 
@@ -221,7 +221,7 @@ def test_another_mirror_than_configured_is_refused(
     with emulator() as made:
         with pytest.raises(error, match=words):
             driver(port_of(made), *more).open()
-        assert made.body.shell.state is ShellState.OFF
+        assert made.controller.shell.state is ShellState.OFF
         assert not [name for name, _ in made.server.calls if name in ("SET_STATE", "COMMAND")]
 
 
@@ -330,7 +330,7 @@ def _told_health(observer: AsmObserver) -> bool:
 
 def test_silence_is_told_to_an_observer() -> None:
     with emulator() as made, AsmObserver("watch", "127.0.0.1", port_of(made)) as observer:
-        made.body.parameters["telemetry_hz"] = 1e-9
+        made.controller.parameters["telemetry_hz"] = 1e-9
         with contextlib.suppress(FrameTimeout):
             observer.sample(0.3)  # one may have been on its way
         with pytest.raises(FrameTimeout, match=r"no telemetry within 0\.05 s"):

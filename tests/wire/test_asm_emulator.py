@@ -13,13 +13,13 @@ from asm_bench import RawClient, command, emulator, frame, hello, port_of, wait_
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from escape_hw.api.adaptive_secondary import LADDER, ShellState
+from escape_hw.api.adaptive_secondary import STATE_ORDER, ShellState
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.config.registry import emulator_factory
 from escape_hw.errors import ConfigError
-from escape_sim.emulators import asm_wire as w
-from escape_sim.emulators.asm import AsmEmulator
-from escape_sim.emulators.asm_connection import Connection
+from escape_sim.emulators.asm import protocol as w
+from escape_sim.emulators.asm.emulator import AsmEmulator
+from escape_sim.emulators.asm.server import AsmConnection
 
 
 def told(payload: bytes) -> tuple[int, str]:
@@ -104,15 +104,15 @@ def test_commands_that_are_not_fresh_finite_and_alone_are_refused() -> None:
         ):
             client.send(data)
             assert words in told(client.reply(w.NAK))[1]
-        assert made.body.applied == 1
-        assert made.body.present_m[0] == pytest.approx(1e-7)
+        assert made.controller.applied == 1
+        assert made.controller.present_m[0] == pytest.approx(1e-7)
         # Several at once: only the newest is applied.
         client.send(command(last + 5, 8, 1e-7) + command(last + 6, 9, 2e-7) + command(last + 7, 10, 3e-7))
         assert "newer" in told(client.reply(w.NAK))[1]
         assert "newer" in told(client.reply(w.NAK))[1]
         client.reply(w.ACK)
-        assert made.body.applied == 2
-        assert made.body.present_m[0] == pytest.approx(3e-7)
+        assert made.controller.applied == 2
+        assert made.controller.present_m[0] == pytest.approx(3e-7)
         assert any("did not wait" in complaint for complaint in made.complaints)
 
 
@@ -132,7 +132,7 @@ def test_who_only_watches_moves_nothing() -> None:
         client.reply(w.WELCOME)
         client.send(frame(w.SET_STATE, 2, bytes([1])))
         assert "only watches" in told(client.reply(w.NAK))[1]
-        assert made.body.shell.state is ShellState.OFF
+        assert made.controller.shell.state is ShellState.OFF
         assert client.reply(w.TELEM)
 
 
@@ -140,9 +140,9 @@ def test_a_shell_left_running_is_noticed_and_rested() -> None:
     with emulator(hold=0.05, rest=0.2) as made:
         with RawClient(port_of(made)) as client:
             running(client)
-        wait_for(lambda: made.body.shell.state is ShellState.RESTED, "the watchdog rests it")
+        wait_for(lambda: made.controller.shell.state is ShellState.RESTED, "the watchdog rests it")
         assert "the owner left the shell running" in made.complaints
-        assert "watchdog" in made.body.note
+        assert "watchdog" in made.controller.note
 
 
 def test_limits_of_the_mirror_itself_skip_a_command() -> None:
@@ -156,7 +156,7 @@ def test_limits_of_the_mirror_itself_skip_a_command() -> None:
             found = struct.unpack_from("<H", client.reply(w.ACK), 4)[0]
             # Actuators out of service are among those that move here.
             assert (found == w.SKIPPED) == (result == w.SKIPPED)
-        assert made.body.skipped == 2
+        assert made.controller.skipped == 2
 
 
 # --------------------------------------------------------------------- whatever comes in whatever pieces
@@ -184,21 +184,21 @@ class Wire:
         """Nothing to set."""
 
 
-def offline() -> tuple[AsmEmulator, Connection, Wire]:
+def offline() -> tuple[AsmEmulator, AsmConnection, Wire]:
     """An emulator that runs, and a connection that bytes are put into by hand."""
     made = emulator_factory("asm")(EmulatorRequest(port=0, options={"hold": "100", "rest": "1000"}))
     assert isinstance(made, AsmEmulator)
-    for state in LADDER[1:]:
-        made.body.ask_state(state, time.monotonic())
-        made.body.tick(time.monotonic() + 100, 0.0)
-    connection, wire = Connection(made.server), Wire()
+    for state in STATE_ORDER[1:]:
+        made.controller.request_state(state, time.monotonic())
+        made.controller.tick(time.monotonic() + 100, 0.0)
+    connection, wire = AsmConnection(made.server), Wire()
     connection.connection_made(wire)  # type: ignore[arg-type]
     connection.data_received(hello(1))
     wire.written.clear()
     return made, connection, wire
 
 
-def in_pieces(connection: Connection, wire: Wire, data: bytes, places: list[int]) -> None:
+def in_pieces(connection: AsmConnection, wire: Wire, data: bytes, places: list[int]) -> None:
     marks = [0, *sorted({place % (len(data) + 1) for place in places}), len(data)]
     for a, b in pairwise(marks):
         if not wire.ended:
@@ -211,13 +211,13 @@ def test_commands_in_any_pieces_are_applied_whole_and_once(count: int, places: l
     made, connection, wire = offline()
     data = b"".join(command(1 + k, k, k * 1e-7) for k in range(1, count + 1))
     in_pieces(connection, wire, data, places)
-    assert made.body.present_m[0] == pytest.approx(count * 1e-7)
+    assert made.controller.present_m[0] == pytest.approx(count * 1e-7)
     # Those that came together with a newer one were left out; every one was answered.
-    answers = 0
-    while w.take(wire.written) is not None:
-        answers += 1
-    assert answers == count
-    assert 1 <= made.body.applied <= count
+    replies = 0
+    while w.decode_frame(wire.written) is not None:
+        replies += 1
+    assert replies == count
+    assert 1 <= made.controller.applied <= count
 
 
 @settings(deadline=None, max_examples=100)
@@ -230,8 +230,8 @@ def test_no_command_that_was_not_whole_is_applied(
     where %= len(sound)
     data = sound[:where] + (b"" if cut_short else bytes([byte]) + sound[where + 1 :])
     in_pieces(connection, wire, data, places)
-    assert made.body.applied == int(data == sound)
-    assert made.body.present_m.any() == (data == sound)
+    assert made.controller.applied == int(data == sound)
+    assert made.controller.present_m.any() == (data == sound)
 
 
 @settings(deadline=None, max_examples=100)
@@ -239,8 +239,8 @@ def test_no_command_that_was_not_whole_is_applied(
 def test_garbage_is_hung_up_on_and_moves_nothing(garbage: bytes, places: list[int]) -> None:
     made, connection, wire = offline()
     in_pieces(connection, wire, garbage, places)
-    assert made.body.applied == 0
-    assert made.body.shell.state is ShellState.RUNNING
+    assert made.controller.applied == 0
+    assert made.controller.shell.state is ShellState.RUNNING
     assert wire.ended or b"ASM1".startswith(garbage[:4])
 
 
@@ -249,25 +249,27 @@ def test_garbage_is_hung_up_on_and_moves_nothing(garbage: bytes, places: list[in
 def test_sound_frames_with_nonsense_in_them_are_answered(kind: int, payload: bytes) -> None:
     made, connection, wire = offline()
     connection.data_received(frame(kind, 2, payload))
-    assert made.body.applied == 0
-    assert w.take(wire.written) is not None
+    assert made.controller.applied == 0
+    assert w.decode_frame(wire.written) is not None
     connection.data_received(command(3, 1, 1e-7))
     # Whatever it was, the mirror may have been stepped down, no more than that.
-    assert made.body.applied == int(made.body.shell.state is ShellState.RUNNING and not made.body.stepping)
+    assert made.controller.applied == int(
+        made.controller.shell.state is ShellState.RUNNING and not made.controller.is_changing_state
+    )
 
 
 def test_an_observer_that_does_not_read_gets_only_the_newest() -> None:
     made, connection, wire = offline()
-    observer, wire = Connection(made.server), Wire()
+    observer, wire = AsmConnection(made.server), Wire()
     observer.connection_made(wire)  # type: ignore[arg-type]
     observer.data_received(hello(1, role=1))
     wire.written.clear()
     observer.pause_writing()
     for _ in range(1000):
-        observer.push(w.TELEM, made.server.answers.telemetry())
+        observer.send_unsolicited(w.TELEM, made.server.replies.telemetry())
     assert not wire.written
     observer.resume_writing()
-    assert w.take(wire.written) is not None
+    assert w.decode_frame(wire.written) is not None
     assert not wire.written
     assert connection is made.server.owner
 
@@ -300,9 +302,9 @@ def test_a_port_that_is_taken_is_named() -> None:
 def test_contaminated_actuators_are_reported_with_what_their_neighbours_do() -> None:
     made, connection, _ = offline()
     connection.data_received(command(2, 1, 4e-7))
-    off = sorted(made.body.out_of_service)
-    assert not made.body.present_m[off].any()
-    payload = made.server.answers.telemetry()
+    off = sorted(made.controller.out_of_service)
+    assert not made.controller.present_m[off].any()
+    payload = made.server.replies.telemetry()
     shape = np.frombuffer(payload, "<f4", 336, 16)
     assert shape[off] == pytest.approx(4e-7)
     flags = np.frombuffer(payload, np.uint8, 336, 16 + 3 * 4 * 336)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from asm_bench import RawClient, driver, emulator, hello, port_of, wait_for
 
-from escape_drivers.asm_driver import AsmMirror
+from escape_drivers.asm.mirror import AsmMirror
 from escape_hw.api.adaptive_secondary import ShellState
 from escape_hw.errors import DeviceError, DeviceLost
-from escape_sim.emulators import asm_wire
-from escape_sim.emulators.asm import AsmEmulator
+from escape_sim.emulators.asm import protocol as asm_wire
+from escape_sim.emulators.asm.emulator import AsmEmulator
 
 #: Requests of the session below; more are tried than it has.
 N_CALLS = 34
@@ -44,8 +44,8 @@ def ends_safe(fault: str) -> tuple[str, str, AsmEmulator]:
         except DeviceError as error:
             said = str(error)
         assert not mirror.is_open
-        wait_for(lambda: made.body.shell.state in SAFE, f"{fault}: the shell lies at rest")
-        return said, str(made.body.shell.state), made
+        wait_for(lambda: made.controller.shell.state in SAFE, f"{fault}: the shell lies at rest")
+        return said, str(made.controller.shell.state), made
 
 
 def test_a_reset_at_every_call_ends_at_rest_and_is_told() -> None:
@@ -59,7 +59,7 @@ def test_a_reset_at_every_call_ends_at_rest_and_is_told() -> None:
         assert "open it again" in said
         # Nothing came twice.
         counters = [what for name, what in made.server.calls if name == "COMMAND"]
-        assert len(counters) == made.body.applied
+        assert len(counters) == made.controller.applied
 
 
 @pytest.mark.parametrize("fault", ["close", "half", "crc", "stale", "silent", "garbage", "delay:3"])
@@ -90,29 +90,29 @@ def broken(mirror: AsmMirror, made: AsmEmulator) -> None:
 def test_a_link_comes_back_by_itself_and_nothing_is_sent_again() -> None:
     with emulator() as made, driver(port_of(made), heartbeat_s=0.02, retry_s=0.05) as mirror:
         mirror.send(0.02 * np.ones(336))
-        sent = made.body.applied
+        sent = made.controller.applied
         broken(mirror, made)
         wait_for(lambda: made.server.owner is not None, "the driver has connected again")
         wait_for(lambda: mirror._link.is_up, "and has been welcomed")
-        assert made.body.applied == sent
-        assert made.body.shell.state is ShellState.RUNNING
+        assert made.controller.applied == sent
+        assert made.controller.shell.state is ShellState.RUNNING
         wait_for(lambda: mirror.shape[0] == pytest.approx(0.02), "the guard knows the shape")
         assert mirror.send(0.03 * np.ones(336)).guard.slewed == 0
-        assert made.body.applied == sent + 1
+        assert made.controller.applied == sent + 1
         assert not [c for c in made.complaints if "refused" in c]
 
 
 def test_a_command_into_a_broken_link_is_lost_and_says_so() -> None:
     with emulator() as made:
         mirror = driver(port_of(made)).open()
-        sent = made.body.applied
+        sent = made.controller.applied
         broken(mirror, made)
         shape = mirror.shape
         for _ in range(2):
             with pytest.raises(DeviceLost, match=r"nothing is sent twice, .* open it again"):
                 mirror.send(0.02 * np.ones(336))
         assert np.array_equal(mirror.shape, shape)
-        assert made.body.applied == sent
+        assert made.controller.applied == sent
         with pytest.raises(DeviceLost):
             mirror.close()
         with mirror:
@@ -128,7 +128,7 @@ def test_numbers_begin_anew_after_four_thousand_million() -> None:
             # As a peer that has counted along.
             assert made.server.owner is not None
             made.server.owner._sequence_in = made.server.counter = 0xFFFFFFFF - 31
-            mirror.go(ShellState.RUNNING)
+            mirror.go_to(ShellState.RUNNING)
             for _ in range(60):
                 mirror.send(np.zeros(336))
             assert 0 < mirror._link._sequence < 100
@@ -153,23 +153,23 @@ def test_who_comes_back_takes_over_from_his_own_half_open_connection() -> None:
         mirror = driver(port_of(made), reply_s=0.3, heartbeat_s=0.02, retry_s=0.05).open()
         first = made.server.owner
         assert first is not None
-        first._silent = True  # the way back is cut, and nobody tells either side
+        first._is_muted = True  # the way back is cut, and nobody tells either side
         wait_for(lambda: made.server.owner not in (None, first), "the same client owns it anew")
         wait_for(lambda: mirror._link.is_up, "the link is up")
         mirror.close()
-        assert made.body.shell.state is ShellState.RESTED
+        assert made.controller.shell.state is ShellState.RESTED
 
 
 def test_a_rest_while_the_link_was_gone_is_not_undone() -> None:
     with emulator(hold=0.05, rest=0.2) as made:
         mirror = driver(port_of(made), heartbeat_s=0.02, retry_s=1.0).open()
         broken(mirror, made)
-        wait_for(lambda: made.body.shell.state is ShellState.RESTED, "the watchdog rests the shell")
+        wait_for(lambda: made.controller.shell.state is ShellState.RESTED, "the watchdog rests the shell")
         wait_for(lambda: made.server.owner is not None and mirror._link.is_up, "the link is back")
         assert mirror.state is ShellState.RESTED
         with pytest.raises(DeviceError, match=r"is rested and follows no commands.*go\(ShellState.RUNNING\)"):
             mirror.send(np.zeros(336))
-        mirror.go(ShellState.RUNNING)
+        mirror.go_to(ShellState.RUNNING)
         mirror.send(np.zeros(336))
         mirror.close()
 
@@ -189,7 +189,7 @@ def test_a_port_that_never_answers_is_told() -> None:
             mirror.open()
         assert not mirror.is_open
         with pytest.raises(DeviceLost, match="no answer within"):
-            mirror.glance()
+            mirror.observe_health()
 
 
 def test_a_port_where_nobody_listens_is_told() -> None:
@@ -232,9 +232,11 @@ def test_an_unplugged_mirror_is_told_and_is_there_again_when_it_is_back() -> Non
 def test_silence_is_first_held_and_then_rested() -> None:
     with emulator(hold=0.1, rest=1.0) as made:
         mirror = driver(port_of(made), heartbeat_s=600.0).open()
-        wait_for(lambda: made.body.holding or made.body.shell.state is ShellState.RESTED, "it holds")
-        wait_for(lambda: made.body.shell.state is ShellState.RESTED, "it rests")
-        assert "no news for 1 s" in made.body.note
+        wait_for(
+            lambda: made.controller.holding or made.controller.shell.state is ShellState.RESTED, "it holds"
+        )
+        wait_for(lambda: made.controller.shell.state is ShellState.RESTED, "it rests")
+        assert "no news for 1 s" in made.controller.note
         assert any("was silent for 1 s" in complaint for complaint in made.complaints)
         with pytest.raises(DeviceError, match="link to"):
             mirror.send(np.zeros(336))
@@ -256,7 +258,7 @@ def test_a_panic_is_latched_until_an_operator_clears_it() -> None:
             with pytest.raises(DeviceError, match=r"fault latched: panic, as arranged; .* recover\(\)"):
                 mirror.send(np.zeros(336))
             with pytest.raises(DeviceError, match="fault latched"):
-                mirror.go(ShellState.RUNNING)
+                mirror.go_to(ShellState.RUNNING)
         # Neither closing nor opening clears it.
         with pytest.raises(DeviceError, match="fault latched"):
             driver(port_of(made)).open()
@@ -264,7 +266,7 @@ def test_a_panic_is_latched_until_an_operator_clears_it() -> None:
             assert mirror.health.fault == "panic, as arranged"
             mirror.recover()
             assert mirror.state is ShellState.RESTED
-            mirror.go(ShellState.RUNNING)
+            mirror.go_to(ShellState.RUNNING)
             mirror.send(np.zeros(336))
 
 
@@ -276,7 +278,7 @@ def test_a_cause_that_persists_is_not_cleared() -> None:
             mirror.recover()
         made.inject("calm")
         mirror.recover()
-        mirror.go(ShellState.RUNNING)
+        mirror.go_to(ShellState.RUNNING)
 
 
 def test_dust_on_the_way_stops_the_work_and_says_what_to_configure() -> None:
@@ -309,6 +311,6 @@ def test_a_rest_by_the_watchdog_is_told_with_its_reason() -> None:
         made.inject("watchdog")
         with pytest.raises(DeviceError, match=r"is rested and follows no commands \(the watchdog rested it"):
             mirror.send(np.zeros(336))
-        mirror.go(ShellState.RUNNING)
+        mirror.go_to(ShellState.RUNNING)
         mirror.send(np.zeros(336))
         assert made.complaints == ()

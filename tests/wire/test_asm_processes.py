@@ -22,8 +22,8 @@ _ESCAPE = [sys.executable, "-c", "from escape_hw.cli import main; main()"]
 #: A client that leads the mirror to running and then does nothing any more.
 _CLIENT = """
 import sys, time
-from escape_hw.config.load import load_system
-from escape_drivers.asm_driver import make_asm
+from escape_hw.config.loader import load_system
+from escape_drivers.asm.mirror import make_asm
 words = ["devices.dm.mode=hardware", "devices.dm.options.port=" + sys.argv[1]]
 mirror = make_asm("dm", load_system("maps-nir", overrides=words), {}).open()
 print(mirror.state, flush=True)
@@ -67,8 +67,8 @@ def test_a_peer_that_is_stopped_is_told_in_time_and_rests_when_it_goes_on(
         mirror.close()
     process.send_signal(signal.SIGCONT)
     watcher = driver(port, reply_s=10.0)
-    wait_for(lambda: watcher.glance().state is ShellState.RESTED, "it rests by itself")
-    assert "watchdog" in watcher.glance().fault
+    wait_for(lambda: watcher.observe_health().state is ShellState.RESTED, "it rests by itself")
+    assert "watchdog" in watcher.observe_health().fault
     with watcher:
         watcher.send(np.zeros(336))
     process.send_signal(signal.SIGINT)
@@ -83,7 +83,7 @@ def test_a_client_that_dies_or_hangs_leaves_the_shell_at_rest(number: signal.Sig
             assert client.stdout is not None
             assert client.stdout.readline().strip() == "running"
             os.kill(client.pid, number)
-            wait_for(lambda: made.body.shell.state is ShellState.RESTED, "the shell is rested")
+            wait_for(lambda: made.controller.shell.state is ShellState.RESTED, "the shell is rested")
             # And the mirror is free for the next.
             wait_for(lambda: made.server.owner is None, "nobody owns it")
             with driver(port_of(made), heartbeat_s=0.05) as mirror:

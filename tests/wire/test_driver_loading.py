@@ -9,7 +9,7 @@ import sys
 import pytest
 from driver_bench import PARTS, stand_in
 
-from escape_sim.benchmarks import drivers
+from escape_benchmarks.drivers import vendor_libraries as drivers
 from escape_sim.stand_ins import StandInUnavailable
 
 
@@ -18,7 +18,7 @@ def test_nothing_is_loaded_before_open(driver: str, key: str) -> None:
     code = (
         "import sys, ctypes\n"
         "ctypes.CDLL = lambda *a, **k: sys.exit('a library was loaded')\n"
-        "from escape_hw.config.load import load_system\n"
+        "from escape_hw.config.loader import load_system\n"
         "from escape_hw.config.registry import device_factory\n"
         "config = load_system('razor-shwfs', mode='hardware')\n"
         f"print(device_factory({driver!r}, hardware=True)({key!r}, config, {{}}).is_open)"

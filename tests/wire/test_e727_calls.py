@@ -8,12 +8,12 @@ import time
 import numpy as np
 import pytest
 
-from escape_drivers.pi_modulator import PiModulator, make_modulator
+from escape_drivers.pi.modulator import PiModulator, make_modulator
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.api.modulator import Modulation
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceError, DeviceLost, SettingRejected
-from escape_sim.emulators.e727 import E727, make_emulator
+from escape_sim.emulators.e727.emulator import E727Emulator, make_emulator
 
 URAD = 1e-6
 #: 3 lambda/D of the bundled system, and the frequency of 66 servo periods.
@@ -27,14 +27,14 @@ def emulator():
         yield running
 
 
-def driver(emulator: E727, *overrides: str) -> PiModulator:
+def driver(emulator: E727Emulator, *overrides: str) -> PiModulator:
     wire = ['devices.modulator.wire.host="127.0.0.1"', f"devices.modulator.wire.port={emulator.server.port}"]
     return make_modulator("stage", load_system("razor-pywfs", overrides=[*wire, *overrides]), {})
 
 
-def said(emulator: E727, since: int = 0) -> list[str]:
+def said(emulator: E727Emulator, since: int = 0) -> list[str]:
     """Commands that set something, in order; ``ERR?`` stands for itself."""
-    everything = emulator.controller.seen[since:]
+    everything = emulator.controller.received_commands[since:]
     questions = [line for line in everything if line.partition(" ")[0].endswith("?") or line == "#9"]
     return [line for line in everything if line not in questions or line == "ERR?"]
 
@@ -56,7 +56,7 @@ def test_opening_goes_in_the_order_of_the_manual(emulator):
         assert stage.info.serial == "SIMMOD"
         assert stage.info.max_tilt_rad == pytest.approx(1e-3)
         assert stage.modulation is None
-        before = len(emulator.controller.seen)
+        before = len(emulator.controller.received_commands)
     closing = ["ERR?", *confirmed("TWC", "MOV 1 1000 2 1000", "SVO 1 0 2 0", "SVA 1 0 2 0")]
     assert said(emulator, before) == closing
     assert emulator.complaints == ()
@@ -67,14 +67,14 @@ def test_a_zeroed_stage_with_servos_on_is_only_centred(emulator):
     with stage:
         stage.modulate(CIRCLE)
         assert stage.release()
-    before = len(emulator.controller.seen)
+    before = len(emulator.controller.received_commands)
     with driver(emulator):
         assert said(emulator, before) == ["ERR?", *confirmed("WGO 1 0 2 0", "TWC", "MOV 1 1000 2 1000")]
 
 
 def test_a_circle_is_written_started_at_once_and_triggered(emulator):
     with driver(emulator, 'devices.modulator.stage.correct="none"') as stage:
-        before = len(emulator.controller.seen)
+        before = len(emulator.controller.received_commands)
         assert stage.modulate(CIRCLE) == Modulation(141 * URAD, 1 / (66 * 50e-6))
         lines = said(emulator, before)
         waves, rest = lines[3:15], lines[15:]
@@ -105,10 +105,12 @@ def test_a_circle_is_written_started_at_once_and_triggered(emulator):
 def test_the_recorder_makes_the_circle_round(emulator):
     with driver(emulator) as stage:
         stage.modulate(CIRCLE)
-        recording = [line for line in emulator.controller.seen if line[:3] in ("DRC", "RTR", "WGR", "DRR")]
+        recording = [
+            line for line in emulator.controller.received_commands if line[:3] in ("DRC", "RTR", "WGR", "DRR")
+        ]
         assert recording[:7] == ["DRC 1 1 2", "DRC 2 2 2", "DRC 3 1 1", "DRC 4 2 1", "RTR 2", "WGR",
                                  "DRR? 1 132 1 2 3 4"]  # fmt: skip
-        turned = emulator.controller.turn()
+        turned = emulator.controller.steady_cycle()
         assert turned is not None
         radii = np.hypot(*(turned[1] - 1000.0).T)
         assert radii == pytest.approx(np.full(256, 141.0), rel=5e-3)
@@ -125,11 +127,11 @@ def test_the_recorder_makes_the_circle_round(emulator):
 
 def test_slow_circles_are_drawn_by_the_controller(emulator):
     with driver(emulator, 'devices.modulator.stage.correct="none"') as stage:
-        answer = stage.modulate(Modulation(100 * URAD, 0.5, (5 * URAD, -5 * URAD)))
-        assert "WAV 1 X SIN_P 4000 200 905 4000 2000 2000" in emulator.controller.seen
-        assert "WAV 2 X SIN_P 4000 200 895 4000 3000 2000" in emulator.controller.seen
-        assert "WTR 1 10 1 2 10 1" in emulator.controller.seen
-        assert answer.frequency_hz == pytest.approx(0.5)
+        execute = stage.modulate(Modulation(100 * URAD, 0.5, (5 * URAD, -5 * URAD)))
+        assert "WAV 1 X SIN_P 4000 200 905 4000 2000 2000" in emulator.controller.received_commands
+        assert "WAV 2 X SIN_P 4000 200 895 4000 3000 2000" in emulator.controller.received_commands
+        assert "WTR 1 10 1 2 10 1" in emulator.controller.received_commands
+        assert execute.frequency_hz == pytest.approx(0.5)
     assert emulator.complaints == ()
 
 
@@ -146,13 +148,13 @@ def test_a_table_of_corrections_is_used_and_has_to_fit(emulator):
         # Half the amplitude takes twice the drive; a lag of a quarter turn takes a quarter turn of lead.
         assert emulator.controller.waves.tables[1] == pytest.approx(1000 + 200 * np.cos(angle))
         assert emulator.controller.waves.tables[2] == pytest.approx(1000 + 400 * np.cos(angle))
-        assert "WGR" not in emulator.controller.seen
+        assert "WGR" not in emulator.controller.received_commands
 
 
 def test_auto_zero_may_be_forbidden(emulator, caplog):
     with driver(emulator, 'devices.modulator.stage.auto_zero="never"'):
         assert "servos on without auto-zero" in caplog.text
-        assert "ATZ 1 NaN" not in emulator.controller.seen
+        assert "ATZ 1 NaN" not in emulator.controller.received_commands
     assert all("before auto-zero" in complaint for complaint in emulator.complaints)
 
 
@@ -162,7 +164,7 @@ def test_axes_may_be_crossed_reversed_and_weak(emulator):
         stage.modulate(Modulation(100 * URAD, 500.0))
         tables = emulator.controller.waves.tables
         angle = 2 * np.pi * np.arange(40) / 40
-        assert "WSL 2 1 1 2" in emulator.controller.seen
+        assert "WSL 2 1 1 2" in emulator.controller.received_commands
         assert tables[1] == pytest.approx(1000 - 100 * np.cos(angle))
         assert tables[2] == pytest.approx(1000 + 200 * np.sin(angle))
 
@@ -176,7 +178,7 @@ def test_looking_at_a_closed_stage_moves_nothing(emulator):
     with stage:
         stage.modulate(CIRCLE)
         stage.release()
-    before = len(emulator.controller.seen)
+    before = len(emulator.controller.received_commands)
     found = driver(emulator).status().modulation
     assert {line.split()[0] for line in said(emulator, before)} <= {"ERR?", "DRC", "RTR", "WGR"}
     assert found is not None
@@ -187,7 +189,7 @@ def test_looking_at_a_closed_stage_moves_nothing(emulator):
 def test_somebody_elses_stop_is_noticed(emulator):
     with driver(emulator) as stage:
         stage.modulate(CIRCLE)
-        emulator.controller.answer("\x18")
+        emulator.controller.execute("\x18")
         assert stage.modulation is None
 
 
@@ -247,7 +249,7 @@ def test_ctrl_c_during_auto_zero_stops_the_sweep(emulator):
         stage.open()
     assert said(emulator)[-6:] == confirmed("STP", "SVO 1 0 2 0", "SVA 1 0 2 0")
     assert emulator.controller.state.describe() == "at rest"
-    assert not emulator.controller.state.zeroing("1")
+    assert not emulator.controller.state.is_zeroing("1")
     assert not stage.is_open
 
 

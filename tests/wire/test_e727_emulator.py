@@ -7,13 +7,12 @@ import pytest
 
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.errors import ConfigError
-from escape_sim.emulators import gcs_syntax
-from escape_sim.emulators.e727 import make_emulator
-from escape_sim.emulators.e727_controller import Controller
-from escape_sim.emulators.e727_stage import SERVO_S
-from escape_sim.emulators.e727_state import Make
-from escape_sim.emulators.e727_wires import UsbPipe
-from escape_sim.emulators.faults import FaultyWire, parse
+from escape_sim.emulators.e727 import gcs as gcs_syntax
+from escape_sim.emulators.e727.controller import E727Controller
+from escape_sim.emulators.e727.emulator import make_emulator
+from escape_sim.emulators.e727.stage import SERVO_S
+from escape_sim.emulators.e727.state import ControllerSettings
+from escape_sim.emulators.e727.transports import FaultInjector, UsbPipe, parse_fault_script
 
 
 class Client:
@@ -21,10 +20,12 @@ class Client:
 
     def __init__(self, *, zeroed: bool = True) -> None:
         self.time = 0.0
-        self.controller = Controller(Make(zeroed=zeroed, auto_zero_s=1.0), lambda: self.time)
+        self.controller = E727Controller(
+            ControllerSettings(zeroed=zeroed, auto_zero_s=1.0), lambda: self.time
+        )
 
     def say(self, text: str) -> str:
-        answers = [self.controller.answer(line) for line in self.controller.received(text.encode() + b"\n")]
+        answers = [self.controller.execute(line) for line in self.controller.receive(text.encode() + b"\n")]
         return b"".join(answers).decode("cp1252")
 
     def error(self, text: str) -> int:
@@ -121,7 +122,7 @@ def test_errors_have_to_be_asked_for(client):
     client.say("SVO 1 1")
     client.say("SVO 2 1")
     assert client.complaints == ["no ERR? after 'SVO 1 1' (then: 'SVO 2 1')"]
-    client.controller.hang_up()
+    client.controller.end_session()
     assert client.complaints[1:] == ["no ERR? after 'SVO 2 1' (then: 'hung up')"]
 
 
@@ -172,7 +173,7 @@ def test_one_line_starts_both_axes_in_one_cycle_and_two_do_not(servo):
     circle(servo)
     assert servo.error("WGO 1 1 2 1") == 0
     axes = servo.controller.state.stage.axes
-    assert axes["1"].source.start == axes["2"].source.start
+    assert axes["1"].trajectory.start == axes["2"].trajectory.start
     assert servo.error("WGO 1 0 2 0") == 0
     servo.wait(0.1)
     assert servo.error("MOV 1 900 2 1000") == 0
@@ -209,10 +210,10 @@ def test_a_wave_beyond_the_travel_does_not_start(servo):
 def test_waves_are_quantised_by_the_clock_and_the_rate(servo):
     circle(servo, points=40, extra="WTR 0 3 0")
     assert servo.error("WGO 1 1 2 1") == 0
-    turned = servo.controller.turn()
+    turned = servo.controller.steady_cycle()
     assert turned is not None
     assert turned[0] == pytest.approx(40 * 3 * 50e-6)
-    assert servo.controller.turn() is turned, "nothing has changed"
+    assert servo.controller.steady_cycle() is turned, "nothing has changed"
 
 
 def test_so_many_cycles_and_no_more(servo):
@@ -256,7 +257,7 @@ def test_a_reset_forgets_all_but_auto_zero_and_a_power_cut_that_too(servo):
 
 
 def test_usb_transfers_are_even():
-    pipe = UsbPipe(Controller(), FaultyWire())
+    pipe = UsbPipe(E727Controller(), FaultInjector())
     pipe.write(b"ERR?\n\0")
     assert pipe.read(64, 0.0) == b"0\n"
     pipe.write(b"ERR?\n")
@@ -288,5 +289,8 @@ def test_a_port_in_use_is_told():
 
 
 def test_faults_are_read_from_text():
-    assert [(fault.kind, fault.at) for fault in parse("drop@12,close@40")] == [("drop", 12), ("close", 40)]
+    assert [(fault.kind, fault.at) for fault in parse_fault_script("drop@12,close@40")] == [
+        ("drop", 12),
+        ("close", 40),
+    ]
     assert gcs_syntax.ERRORS[73] == "wave generator active"

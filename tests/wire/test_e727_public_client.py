@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from escape_hw.api.emulator import EmulatorRequest
-from escape_sim.emulators.e727 import make_emulator
+from escape_sim.emulators.e727.emulator import make_emulator
 
 if importlib.util.find_spec("pipython") is None:
     pytest.skip(

@@ -17,7 +17,7 @@ def use_mirror(dm: Any) -> None:
     with dm:
         dm.send(np.full(97, 0.15))
         dm.send(np.full(97, -0.15))
-        dm.play(np.full((2, 97), -0.15))
+        dm.play_patterns(np.full((2, 97), -0.15))
         dm.flatten()
 
 

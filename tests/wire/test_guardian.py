@@ -13,16 +13,16 @@ from pathlib import Path
 from asm_bench import emulator, port_of, wait_for
 
 from escape_hw.api.adaptive_secondary import ShellState
-from escape_hw.config.load import load_system
-from escape_hw.server.guardian import Incident, Watch
+from escape_hw.config.loader import load_system
+from escape_hw.server.safety.failsafe import FailsafeSettings, IncidentReport
 from escape_hw.streams.segments import process_start
 
 #: What an engine does, as far as its guardian is concerned: holds the mirror and the pipe, and a shape.
 _ENGINE = """
 import sys, time
 import numpy as np
-from escape_hw.config.load import load_text
-from escape_drivers.asm_driver import make_asm
+from escape_hw.config.loader import load_text
+from escape_drivers.asm.mirror import make_asm
 mirror = make_asm("dm", load_text(open(sys.argv[1]).read()), {}).open()
 shape = np.zeros(336); shape[100] = 0.01
 mirror.send(shape)
@@ -36,7 +36,7 @@ os.write(int(sys.argv[2]), b"bye")
 
 def guarded(
     tmp_path: Path, port: int, end: str, meanwhile: Callable[[], object] = lambda: None
-) -> Incident | None:
+) -> IncidentReport | None:
     """Run an engine of that kind until it is killed or says goodbye; what its guardian wrote.
 
     ``meanwhile`` runs when the engine has ended, before the guardian looks.
@@ -54,12 +54,12 @@ def guarded(
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=(held,),
         )  # fmt: skip
         ends.callback(finished, engine)
-        watch = Watch(
+        watch = FailsafeSettings(
             config_text=config.read_text(), incidents=str(tmp_path), pid=engine.pid,
             started=process_start(engine.pid) or 0,
         )  # fmt: skip
         guardian = subprocess.Popen(
-            [sys.executable, "-m", "escape_hw.server.guardian", str(watched)],
+            [sys.executable, "-m", "escape_hw.server.safety.failsafe", str(watched)],
             stdin=subprocess.PIPE, text=True, pass_fds=(watched,),
         )  # fmt: skip
         ends.callback(finished, guardian)
@@ -76,7 +76,7 @@ def guarded(
         guardian.communicate(watch.model_dump_json(), timeout=120)
         assert guardian.returncode == 0
     found = list(tmp_path.glob("*.incident.json"))
-    return Incident.model_validate_json(found[0].read_bytes()) if found else None
+    return IncidentReport.model_validate_json(found[0].read_bytes()) if found else None
 
 
 def finished(process: subprocess.Popen[str]) -> None:
@@ -92,21 +92,21 @@ def test_a_floating_shell_is_flattened_and_rested(tmp_path: Path) -> None:
         assert incident is not None
         assert incident.flat is True
         assert incident.mirror == "the mirror is flat"
-        wait_for(lambda: made.body.shell.state is ShellState.RESTED, "the shell is rested")
+        wait_for(lambda: made.controller.shell.state is ShellState.RESTED, "the shell is rested")
 
 
 def test_a_shell_that_went_to_rest_by_itself_is_not_lifted(tmp_path: Path) -> None:
     states = []
     with emulator(hold=1.0, rest=2.0) as made:
         port = port_of(made)
-        step = made.body.ask_state
-        made.body.ask_state = lambda wanted, now: (states.append(wanted), step(wanted, now))[1]
-        shell = made.body.shell
+        step = made.controller.request_state
+        made.controller.request_state = lambda wanted, now: (states.append(wanted), step(wanted, now))[1]
+        shell = made.controller.shell
         at_rest = partial(wait_for, lambda: shell.state is ShellState.RESTED, "the shell is at rest")
         incident = guarded(tmp_path, port, "kill", at_rest)
         assert incident is not None
         assert incident.flat is True
-        assert made.body.shell.state is ShellState.RESTED
+        assert made.controller.shell.state is ShellState.RESTED
     lifted = states.index(ShellState.RUNNING)
     assert ShellState.RUNNING not in states[lifted + 1 :]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from driver_bench import fresh
 
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -14,13 +14,13 @@ from streams import published
 
 from escape_hw.api.procedure import run
 from escape_hw.bench import build_bench
-from escape_hw.calibration.push_pull import push_pull
+from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.cli import main
-from escape_hw.config.load import load_system
-from escape_hw.io.fits import load_matrix, save_matrix
-from escape_hw.io.interchange.milk_stream import MilkStream
+from escape_hw.config.loader import load_system
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
+from escape_hw.io.fits.telemetry import load_telemetry
+from escape_hw.io.interchange.milk.stream import MilkStream
 from escape_hw.io.provenance import Provenance
-from escape_hw.io.telemetry import load_telemetry
 
 SETS = [word for one in SMALL for word in ("--set", one)]
 Command = Callable[..., tuple[int, dict[str, Any]]]

@@ -15,11 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_system import SMALL
 
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceError, DeviceLost
-from escape_hw.runtime.system import System
+from escape_hw.runtime.session.system import System
 from escape_sim.stand_ins import bench_server
-from escape_sim.stand_ins.bench_server import BenchServer, Verb, in_environment
+from escape_sim.stand_ins.bench_server import RequestKind, StandInBench, stand_in_environment
 
 #: The region lies on the increments of the real camera; the screen of the real bench is moved by hand.
 JOINED = (
@@ -31,10 +31,10 @@ JOINED = (
 
 
 @pytest.fixture
-def server() -> Iterator[BenchServer]:
+def server() -> Iterator[StandInBench]:
     for name in ("asdk", "m3api", "aravis"):
         stand_in(name).clear(record=False)
-    with BenchServer(load_system("razor-shwfs", overrides=JOINED)) as one, in_environment(one):
+    with StandInBench(load_system("razor-shwfs", overrides=JOINED)) as one, stand_in_environment(one):
         yield one
 
 
@@ -55,7 +55,7 @@ def test_real_drivers_calibrate_and_close_the_loop_as_the_twins_devices_do(serve
     through_drivers, twin = results["hardware"], results["sim"]
     assert np.array_equal(through_drivers[0], twin[0]), "not one bit of the matrix depends on the way"
     assert through_drivers[1].lost == twin[1].lost
-    assert server.requests[Verb.SEND] > 300
+    assert server.requests[RequestKind.SEND] > 300
     for name in ("asdk", "m3api", "aravis"):
         assert not stand_in(name).complaints
 
@@ -113,7 +113,7 @@ def test_nonsense_on_the_socket_disturbs_nobody(server, nonsense) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(
-    st.lists(st.tuples(st.sampled_from(list(Verb)), st.binary(max_size=300)), min_size=1, max_size=5),
+    st.lists(st.tuples(st.sampled_from(list(RequestKind)), st.binary(max_size=300)), min_size=1, max_size=5),
     st.lists(st.integers(1, 400), min_size=1),
     st.integers(0, 50),
 )

@@ -21,11 +21,11 @@ import pytest
 from milk_peer import CIRCULAR, Image, ramp
 from streams import SHAPE, camera_config, mirror_config
 
-from escape_hw.config.load import load_system
+from escape_hw.config.loader import load_system
 from escape_hw.config.registry import device_factory
 from escape_hw.errors import ProductError
-from escape_hw.io.interchange import milk_layout as layout
-from escape_hw.io.interchange.milk_stream import MilkStream
+from escape_hw.io.interchange.milk import layout
+from escape_hw.io.interchange.milk.stream import MilkStream
 
 needs_library = pytest.mark.skipif(
     not milk_peer.NAME, reason="needs ImageStreamIO; ESCAPE_IMAGESTREAMIO_LIBRARY names it"
@@ -62,7 +62,7 @@ def _no_folder_left() -> Iterator[None]:
 def version(library: Any) -> str:
     """Version of the library; skips where it opens only images of its own special make."""
     probe = Image(library).create("probe", (8,), "u1")
-    found = layout.found_sections(probe.md, layout.shm_path("probe").stat().st_size)
+    found = layout.detect_sections(probe.md, layout.shm_path("probe").stat().st_size)
     assert found is not None
     if found.data != layout.HEADER_BYTES:
         pytest.skip("this library was compiled with DAO_COMPAT, and opens only images of its like")
@@ -108,7 +108,7 @@ def test_we_read_and_write_what_the_library_made(library: Any, shape: tuple[int,
         np.testing.assert_array_equal(image.array, data + data.dtype.type(1))
         assert image.md.cnt0 == 2
         assert image.md.write == 0
-        assert layout.found_sections(image.md, layout.shm_path("made").stat().st_size) is not None
+        assert layout.detect_sections(image.md, layout.shm_path("made").stat().st_size) is not None
     finally:
         stream.close()
         image.destroy()
@@ -164,7 +164,7 @@ def test_an_image_of_ours_is_one_of_the_librarys_byte_for_byte(
             setattr(head, field, layout.Metadata().atime)
         head.inode = 0
     assert bytes(heads[0]) == bytes(heads[1])
-    log = layout.sections(heads[0], 8).log
+    log = layout.compute_sections(heads[0], 8).log
     for begin, end in ((layout.HEADER_BYTES, log), (log + layout.SEMAPHORE_BYTES, len(theirs))):
         assert theirs[begin:end] == ours[begin:end]
     # The loggers' semaphore: the library leaves it as it finds it, we make it one between processes.
@@ -248,14 +248,14 @@ def test_each_wakes_the_other(library: Any) -> None:
     ours, answers = MilkStream.open("wake"), MilkStream.open("answer")
     try:
         # A semaphore of ours is ours to the library, too: one with this process's number is found again.
-        assert answers.after(0, 0.01) is None
-        assert ours.after(0, 0.01) is None
+        assert answers.read_after(0, 0.01) is None
+        assert ours.read_after(0, 0.01) is None
         assert library.ImageStreamIO_getsemwaitindex(image.raw, 5) == 0
         with another_process("echo", "wake", "answer", n) as said:
             assert said == "waiting on 1", "ours is taken"
             for number in range(1, n + 1):
                 ours.write(np.full((48, 64), number))
-                found = answers.after(number - 1, 30.0)
+                found = answers.read_after(number - 1, 30.0)
                 assert found is not None
                 assert found.count == number
                 assert (found.data == number).all()
@@ -327,7 +327,7 @@ def test_a_mirror_writes_what_the_library_waits_for(library: Any) -> None:
                 for number in range(n):
                     command = generator.uniform(-0.2, 0.2, int(there.sum()))
                     mirror.send(command)
-                    found = seen.after(number, 30.0)
+                    found = seen.read_after(number, 30.0)
                     assert found is not None
                     np.testing.assert_allclose(found.data[there], 2 * command, rtol=1e-6)
                     assert not found.data[~there].any()

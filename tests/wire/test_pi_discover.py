@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import tomllib
 
-from escape_drivers.pi_discover import discover
+from escape_drivers.pi.discovery import discover
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.config.registry import emulator_factory
 

@@ -13,12 +13,21 @@ from small_system import SMALL
 
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.errors import ConfigError
-from escape_hw.io.interchange.pyrtc_file import MATRIX, REFERENCES, VALID, read_file, write_file
-from escape_hw.io.interchange.pyrtc_legacy import LegacyFrame
-from escape_hw.io.interchange.pyrtc_lenslets import PyrtcLenslets
-from escape_hw.io.interchange.pyrtc_pupils import PyrtcPupils
-from escape_hw.io.interchange.pyrtc_read import PyrtcConfig, import_matrix
-from escape_hw.io.interchange.pyrtc_write import FrameFacts, export_matrix
+from escape_hw.io.interchange.pyrtc.calibration import (
+    FrameSettings,
+    PyrtcConfig,
+    export_matrix,
+    import_matrix,
+)
+from escape_hw.io.interchange.pyrtc.files import (
+    MATRIX,
+    REFERENCES,
+    VALID,
+    LegacyConvention,
+    read_file,
+    write_file,
+)
+from escape_hw.io.interchange.pyrtc.geometry import PyrtcLenslets, PyrtcPupils
 
 theirs = pytest.importorskip("pyrtc.calibration", reason=NEEDED)
 resolve_class_symbol = pytest.importorskip("pyrtc.component_loading").resolve_class_symbol
@@ -51,7 +60,7 @@ def test_files_of_1x_are_converted_as_pyrtc_converts_them(way: str) -> None:
     valid, matrix = np.vstack([mask, mask]), rng.standard_normal((2 * int(mask.sum()), 5))
     references = rng.standard_normal((12, 6)).astype(np.float32)
     for window in (7, 8):
-        frame = LegacyFrame(way, window=window)
+        frame = LegacyConvention(way, window=window)
         np.testing.assert_array_equal(frame.map(valid), theirs.slope_map_from_legacy(valid, way))
         expected = theirs.shwfs_ref_slopes_from_legacy(references, way, window)
         np.testing.assert_allclose(frame.references(references), expected, atol=1e-6)
@@ -61,7 +70,7 @@ def test_files_of_1x_are_converted_as_pyrtc_converts_them(way: str) -> None:
     half = rng.random((6, 6)) > 0.3
     both, rows = np.hstack([half, half]), rng.standard_normal((2 * int(half.sum()), 5))
     for swap in (False, True):
-        frame = LegacyFrame(way, pyramid=True, default_pupils=swap)
+        frame = LegacyConvention(way, pyramid=True, default_pupils=swap)
         moved = theirs.slope_map_from_legacy(both, way, "pywfs", swap_pywfs_halves=swap)
         np.testing.assert_array_equal(frame.map(both), moved)
         moved = theirs.interaction_matrix_from_legacy(rows, way, both, "pywfs", swap_pywfs_halves=swap)
@@ -76,7 +85,7 @@ def test_windows_are_those_of_its_kernel() -> None:
     at_x, at_y = windows.centres()
     for i in range(windows.n):
         for j in range(windows.n):
-            if windows.inside()[i, j]:
+            if windows.windows_on_frame()[i, j]:
                 # Even windows: four pixels around the middle.
                 for y in (at_y[i] - 0.5, at_y[i] + 0.5):
                     for x in (at_x[j] - 0.5, at_x[j] + 0.5):
@@ -131,19 +140,19 @@ def test_a_pyramids_pixels_and_slopes_are_its_own(tmp_path: Path) -> None:
     from pyrtc.wavefront_sensor import WavefrontSensor
 
     from escape_hw.api.pyramid import PyramidPupils
-    from escape_hw.pipeline.pyramid_slopes import slopes_of_image
+    from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 
     result = pyramid()
     pupils = result.grid
     assert isinstance(pupils, PyramidPupils)
-    paths = export_matrix(tmp_path, result, FrameFacts((48, 48), 0.0))
+    paths = export_matrix(tmp_path, result, FrameSettings((48, 48), 0.0))
     found = sections(paths["settings"])
     frame = np.random.default_rng(2).poisson(400, (48, 48)).astype(np.int32)
     with rig("pyramid") as made:
         made.camera(WavefrontSensor, width=48, height=48)
         process: Any = made.slopes(**found["slopes"])
         assert isinstance(process, SlopesProcess)
-        np.testing.assert_array_equal(process.valid_sub_aps, PyrtcPupils.of(pupils).mask_of())
+        np.testing.assert_array_equal(process.valid_sub_aps, PyrtcPupils.from_pupils(pupils).mask_of())
         theirs_now = np.array(process._process_image(frame)[0])
         loop_rows = read_file(paths["im"]).data.shape[0]
         assert loop_rows == process.signal_size
@@ -151,7 +160,7 @@ def test_a_pyramids_pixels_and_slopes_are_its_own(tmp_path: Path) -> None:
     ours_map = np.zeros((2, 16, 16))
     ours_map[:, pupils.valid] = slopes_of_image(frame, pupils).reshape(2, -1)
     their_map = np.zeros((2, 16, 16))
-    disk = PyrtcPupils.of(pupils).disk()
+    disk = PyrtcPupils.from_pupils(pupils).disk()
     their_map[:, disk] = theirs_now.reshape(2, -1)
     both = pupils.valid & disk
     np.testing.assert_allclose(their_map[:, both], ours_map[:, both], atol=2e-3)

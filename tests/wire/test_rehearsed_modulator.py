@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from driver_bench import stand_in
 
-from escape_hw.config.load import load_system
-from escape_hw.runtime.system import System
-from escape_sim.devices import shared_bench
-from escape_sim.stand_ins.bench_server import BenchServer, in_environment
+from escape_hw.config.loader import load_system
+from escape_hw.runtime.session.system import System
+from escape_sim.devices.twins import shared_bench
+from escape_sim.stand_ins.bench_server import StandInBench, stand_in_environment
 
 #: A small pyramid on increments of the real camera.
 SMALL = (
@@ -27,14 +27,14 @@ def test_the_modulators_driver_turns_the_twins_beam() -> None:
     for name in ("asdk", "m3api", "aravis"):
         stand_in(name).clear(record=False)
     config = load_system("razor-pywfs", overrides=SMALL)
-    with BenchServer(config) as server, in_environment(server):
-        circle = shared_bench(config, server.shared).beam_circle
+    with StandInBench(config) as server, stand_in_environment(server):
+        circle = shared_bench(config, server.shared).beam_path
         with System.from_config(load_system("razor-pywfs", mode="hardware", overrides=SMALL)) as bench:
             assert bench.simulated
             assert circle.points().points.tolist() == [[0.0, 0.0]]
             bench.find_sensor(frames=5)
             assert np.hypot(*circle.points().points.T) == pytest.approx(np.full(20, 3.0), rel=5e-3)
-            assert circle.turn_s == pytest.approx(66 * 50e-6)
-        assert circle.turn_s is None
+            assert circle.cycle_period_s == pytest.approx(66 * 50e-6)
+        assert circle.cycle_period_s is None
         assert server.modulator is not None
         assert server.modulator.complaints == ()

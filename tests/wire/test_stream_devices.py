@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from streams import SHAPE, camera_config, create, mirror_config, published, ramp
 
-from escape_hw.config.load import load_system
-from escape_hw.config.models import SystemConfig
+from escape_hw.config.loader import load_system
 from escape_hw.config.registry import device_factory
+from escape_hw.config.system import SystemConfig
 from escape_hw.errors import ConfigError, DeviceError, FrameTimeout
 from escape_hw.testing import Check, Factory, parametrize_device_checks
 
@@ -162,7 +162,7 @@ def test_signed_and_floating_streams_become_counts() -> None:
 
 
 def test_the_folder_of_images_is_milks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from escape_hw.io.interchange.milk_layout import shm_folder
+    from escape_hw.io.interchange.milk.layout import shm_folder
 
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
     assert shm_folder() == tmp_path

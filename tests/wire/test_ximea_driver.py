@@ -13,9 +13,8 @@ from driver_bench import fresh, make, stand_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from escape_drivers.ximea_errors import ERRORS, explain
-from escape_drivers.ximea_library import XiImage
-from escape_hw.api.frames import Region
+from escape_drivers.ximea.library import ERRORS, XiImage, describe_error
+from escape_hw.api.camera import Region
 from escape_hw.config.registry import available
 from escape_hw.errors import ConfigError, DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
 
@@ -282,7 +281,7 @@ def test_every_code_is_explained(xi, code) -> None:
         with pytest.raises(DeviceError, match=f"xiGetImage: error {code}, {ERRORS[code][0]}") as failed:
             camera.next_frame(1.0)
         assert isinstance(failed.value, DeviceLost) == (code in (1, 55, 56))
-    assert explain(999).startswith("error 999, unknown error")
+    assert describe_error(999).startswith("error 999, unknown error")
 
 
 def test_a_buffer_shorter_than_its_rows_is_never_read(xi) -> None:
@@ -290,7 +289,7 @@ def test_a_buffer_shorter_than_its_rows_is_never_read(xi) -> None:
         camera.next_frame(1.0)
         short = XiImage(bp=camera._image.bp, bp_size=400 * 400 * 2 - 1, width=400, height=400)
         with pytest.raises(DeviceError, match="delivered 400 x 400 pixels in 319999 bytes"):
-            camera._view(short)
+            camera._frame_view(short)
 
 
 def test_a_camera_that_was_reset_has_stopped_already(xi, caplog) -> None:

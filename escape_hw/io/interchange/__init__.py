@@ -1,4 +1,1 @@
-"""Files and streams of other adaptive-optics software, read and written.
-
-Other packages are imported when they are needed, never before; the extra ``interchange`` brings them.
-"""
+"""Files and streams of other adaptive-optics software (pyRTC, milk/CACAO, AOT). Optional packages are imported when they are used; the extra 'interchange' installs them."""

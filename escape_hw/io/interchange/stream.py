@@ -60,7 +60,7 @@ class Stream(Protocol):
         """
         ...
 
-    def after(self, count: int, timeout_s: float) -> Publication | None:
+    def read_after(self, count: int, timeout_s: float) -> Publication | None:
         """The newest array once it is newer than a write; ``None`` when none is in time.
 
         Parameters
@@ -92,5 +92,5 @@ class Stream(Protocol):
         ...
 
 
-class StreamLost(Exception):
+class StreamReadError(Exception):
     """A stream's newest array cannot be read whole."""

@@ -1,1 +1,1 @@
-"""Sweeps over loop parameters and matrices: every matrix at its own best, compared on the same air."""
+"""Sweeps over loop parameters and matrices with Optuna: search space, study, workers, analysis. The closed loop itself is in calibration/loop."""

@@ -13,18 +13,18 @@ from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExec
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol
 
-from escape_hw.api.threads import share_cores
+from escape_hw.api.concurrency import disable_helper_threads
 from escape_hw.errors import CalibrationError, ConfigError
-from escape_hw.runtime.sweep.trial import Task, run_trial
+from escape_hw.runtime.sweep.trials import TrialSpec, run_trial
 
 log = logging.getLogger(__name__)
 
 #: One thread for every library of a worker: there are as many workers as cores.
-ONE_THREAD = {
+SINGLE_THREAD_VARIABLES = {
     name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 }
 #: Seconds to wait for a Dask scheduler that has gone.
-PATIENCE_S = 120.0
+SCHEDULER_TIMEOUT_S = 120.0
 
 
 class Workers(Protocol):
@@ -35,20 +35,20 @@ class Workers(Protocol):
         """Trials that run at a time."""
         ...
 
-    def submit(self, task: Task) -> Future[dict[str, Any]]:
+    def submit(self, task: TrialSpec) -> Future[dict[str, Any]]:
         """Run a trial."""
         ...
 
-    def lost(self, future: Future[dict[str, Any]]) -> bool:
+    def is_lost(self, future: Future[dict[str, Any]]) -> bool:
         """Whether an ended future says nothing of its trial: who ran it has died."""
         ...
 
     @property
-    def gone(self) -> bool:
+    def is_disconnected(self) -> bool:
         """Whether nobody is left who could end a future."""
         ...
 
-    def heal(self) -> None:
+    def restart(self) -> None:
         """Replace what has died; futures from before are worthless."""
         ...
 
@@ -68,17 +68,17 @@ class LocalWorkers:
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self._pool = self._make()
+        self._pool = self._make_pool()
 
-    def _make(self) -> ProcessPoolExecutor:
+    def _make_pool(self) -> ProcessPoolExecutor:
         context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self.count, mp_context=context, initializer=_begin)
+        return ProcessPoolExecutor(self.count, mp_context=context, initializer=_initialise_worker)
 
-    def submit(self, task: Task) -> Future[dict[str, Any]]:
+    def submit(self, task: TrialSpec) -> Future[dict[str, Any]]:
         """Run a trial; one that cannot even be handed over is lost."""
         # Libraries read these when they are loaded, which a new process does after it has begun.
-        before = {name: os.environ.get(name) for name in ONE_THREAD}
-        os.environ.update(ONE_THREAD)
+        before = {name: os.environ.get(name) for name in SINGLE_THREAD_VARIABLES}
+        os.environ.update(SINGLE_THREAD_VARIABLES)
         try:
             return self._pool.submit(run_trial, task)
         except BrokenProcessPool as error:
@@ -92,19 +92,19 @@ class LocalWorkers:
                 else:
                     os.environ[name] = value
 
-    def lost(self, future: Future[dict[str, Any]]) -> bool:
+    def is_lost(self, future: Future[dict[str, Any]]) -> bool:
         """See :class:`Workers`."""
         return future.cancelled() or isinstance(future.exception(), BrokenProcessPool)
 
     @property
-    def gone(self) -> bool:
+    def is_disconnected(self) -> bool:
         """See :class:`Workers`; a pool that breaks ends its futures itself."""
         return False
 
-    def heal(self) -> None:
+    def restart(self) -> None:
         """See :class:`Workers`."""
         self.close()
-        self._pool = self._make()
+        self._pool = self._make_pool()
 
     def close(self) -> None:
         """See :class:`Workers`."""
@@ -133,12 +133,12 @@ class DaskWorkers:
         There is no scheduler.
     """
 
-    def __init__(self, address: str, patience_s: float = PATIENCE_S) -> None:
+    def __init__(self, address: str, timeout_s: float = SCHEDULER_TIMEOUT_S) -> None:
         try:
             self._dask: Any = importlib.import_module("distributed")
         except ImportError:
             raise ConfigError("--scheduler needs Dask's distributed: pip install 'escape-hw[dask]'") from None
-        self.address, self._patience = address, patience_s
+        self.address, self._timeout_s = address, timeout_s
         self._client: Any = None
         self._executor: Executor | None = None
         self._connect()
@@ -152,7 +152,7 @@ class DaskWorkers:
             return 1
 
     def _connect(self) -> None:
-        deadline = time.monotonic() + self._patience
+        deadline = time.monotonic() + self._timeout_s
         while True:
             try:
                 self._client = self._dask.Client(self.address, timeout=5, set_as_default=False)
@@ -161,13 +161,13 @@ class DaskWorkers:
             except (OSError, TimeoutError) as error:
                 if time.monotonic() > deadline:
                     raise CalibrationError(
-                        f"no Dask scheduler answers at {self.address} for {self._patience:.0f} s; start one "
+                        f"no Dask scheduler answers at {self.address} for {self._timeout_s:.0f} s; start one "
                         "(dask scheduler) and workers (dask worker --nthreads 1), then resume"
                     ) from error
                 log.warning("no Dask scheduler at %s; trying again", self.address)
                 time.sleep(1.0)
 
-    def submit(self, task: Task) -> Future[dict[str, Any]]:
+    def submit(self, task: TrialSpec) -> Future[dict[str, Any]]:
         """Run a trial."""
         if self._executor is None:
             raise RuntimeError("the workers are closed")
@@ -178,7 +178,7 @@ class DaskWorkers:
             future.set_exception(error)
             return future
 
-    def lost(self, future: Future[dict[str, Any]]) -> bool:
+    def is_lost(self, future: Future[dict[str, Any]]) -> bool:
         """See :class:`Workers`."""
         if future.cancelled():
             return True
@@ -189,11 +189,11 @@ class DaskWorkers:
         return isinstance(future.exception(), gone)
 
     @property
-    def gone(self) -> bool:
+    def is_disconnected(self) -> bool:
         """See :class:`Workers`."""
         return self._client is None or self._client.status in ("closing", "closed")
 
-    def heal(self) -> None:
+    def restart(self) -> None:
         """See :class:`Workers`."""
         self.close()
         self._connect()
@@ -205,15 +205,15 @@ class DaskWorkers:
             client.close(timeout=2)
 
 
-def _begin() -> None:
+def _initialise_worker() -> None:
     """A new worker process: Ctrl-C is the parent's business, and without a parent there is none."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    share_cores()
+    disable_helper_threads()
     parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+        threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
 
 
-def _end_with(parent: Any) -> None:
+def _exit_with_parent(parent: Any) -> None:
     parent.join()
     os._exit(1)

@@ -1,10 +1,5 @@
-"""Stand-ins of the vendors' C libraries: compiled on demand, strict, with faults by script.
+"""Stand-ins of vendors' C libraries (ALPAO, XIMEA, Aravis): compiled on demand, strict, with faults by script, and a server that connects them to a simulated bench."""
 
-A driver is tested through its real path, down to the C calls, by giving it a stand-in's file where the
-vendor's library would be.
-"""
+from escape_sim.stand_ins.library import LIBRARIES, StandIn, StandInUnavailable, build_library
 
-from escape_sim.stand_ins.build import LIBRARIES, StandInUnavailable, build
-from escape_sim.stand_ins.control import StandIn
-
-__all__ = ["LIBRARIES", "StandIn", "StandInUnavailable", "build"]
+__all__ = ["LIBRARIES", "StandIn", "StandInUnavailable", "build_library"]

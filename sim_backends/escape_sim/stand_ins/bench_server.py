@@ -27,26 +27,25 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from escape_hw.api.camera import Camera
+from escape_hw.api.camera import Camera, CameraSettings, Region
 from escape_hw.api.emulator import EmulatorRequest
-from escape_hw.api.frames import CameraSettings, Region
 from escape_hw.errors import EscapeError, FrameTimeout
-from escape_sim.devices import make_mirror, make_science_camera, make_wfs_camera, shared_bench
-from escape_sim.emulators.e727 import E727
-from escape_sim.stand_ins.build import build
+from escape_sim.devices.twins import make_mirror, make_science_camera, make_wfs_camera, shared_bench
+from escape_sim.emulators.e727.emulator import E727Emulator
+from escape_sim.stand_ins.library import build_library
 
 if TYPE_CHECKING:
-    from escape_hw.config.models import SystemConfig
+    from escape_hw.config.system import SystemConfig
 
 log = logging.getLogger(__name__)
 
-_HEAD, _ANSWER = struct.Struct("=II"), struct.Struct("=ii")
+_REQUEST_HEAD, _REPLY_HEAD = struct.Struct("=II"), struct.Struct("=ii")
 _START, _FRAME, _FRAME_HEAD = struct.Struct("=4I3d"), struct.Struct("=d"), struct.Struct("=qq")
-_GOOD, _LATE, _REFUSED = 0, 1, 2
+_OK, _TIMEOUT, _REFUSED = 0, 1, 2
 #: Larger requests than any shape are nonsense.
-_LONGEST = 1 << 20
+_MAX_REQUEST_BYTES = 1 << 20
 #: A wait that only asks whether a frame is there; the twin's clock hardly moves.
-_NO_WAIT_S = 1e-6
+_POLL_S = 1e-6
 #: Environment variable that names each stand-in's library to its driver.
 VARIABLES = {
     "asdk": "ESCAPE_ALPAO_LIBRARY",
@@ -57,10 +56,10 @@ _SOCKET_VARIABLE = "ESCAPE_STAND_IN_BENCH"
 #: Environment variable that leads the modulator's driver to an emulated controller.
 E727_VARIABLE = "ESCAPE_E727"
 
-Answer = tuple[int, bytes]
+Reply = tuple[int, bytes]
 
 
-class Verb(enum.IntEnum):
+class RequestKind(enum.IntEnum):
     """What a stand-in asks, see ``stand_in.h``."""
 
     HELLO = 1
@@ -70,7 +69,7 @@ class Verb(enum.IntEnum):
     STOP = 5
 
 
-class BenchServer:
+class StandInBench:
     """The twin of a system behind a local socket; usable as a context manager.
 
     Parameters
@@ -94,12 +93,12 @@ class BenchServer:
         self.config = config
         self.shared: dict[str, object] = {} if shared is None else shared
         self.environment: dict[str, str] = {}
-        self.requests = dict.fromkeys(Verb, 0)
+        self.requests = dict.fromkeys(RequestKind, 0)
         # The twin is one world with one clock; its devices take turns.
-        self._turn = threading.Lock()
+        self._twin_lock = threading.Lock()
         self._listener: socket.socket | None = None
         self._folder: Path | None = None
-        self.modulator: E727 | None = None
+        self.modulator: E727Emulator | None = None
         self._connections: set[socket.socket] = set()
         self._threads: list[threading.Thread] = []
 
@@ -111,27 +110,27 @@ class BenchServer:
         StandInUnavailable
             The stand-ins cannot be compiled on this machine.
         """
-        libraries = {variable: str(build(name)) for name, variable in VARIABLES.items()}
+        libraries = {variable: str(build_library(name)) for name, variable in VARIABLES.items()}
         shared_bench(self.config, self.shared)
         self._folder = Path(tempfile.mkdtemp(prefix="escape-"))
         path = str(self._folder / "bench")
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(path)
         self._listener.listen()
-        self.environment = {**libraries, _SOCKET_VARIABLE: path, **self._emulated_modulator()}
+        self.environment = {**libraries, _SOCKET_VARIABLE: path, **self._start_modulator_emulator()}
         thread = threading.Thread(target=self._accept, name="bench", daemon=True)
         thread.start()
         self._threads.append(thread)
         return path
 
-    def _emulated_modulator(self) -> dict[str, str]:
+    def _start_modulator_emulator(self) -> dict[str, str]:
         """Start the controller of a modulator, which turns the twin's beam; returns where it listens."""
         section = self.config.devices.modulator
         if section is None or section.driver != "pi-e727":
             return {}
         options = {"serial": section.serial, "zeroed": "1"}
         request = EmulatorRequest(port=0, options=options, shared=self.shared, config=self.config)
-        self.modulator = E727(request)
+        self.modulator = E727Emulator(request)
         return {E727_VARIABLE: self.modulator.start().removeprefix("tcp ")}
 
     def stop(self) -> None:
@@ -141,9 +140,9 @@ class BenchServer:
             self.modulator = None
         listener, self._listener = self._listener, None
         if listener is not None:
-            for one in (listener, *self._connections):
+            for endpoint in (listener, *self._connections):
                 with contextlib.suppress(OSError):
-                    one.shutdown(socket.SHUT_RDWR)
+                    endpoint.shutdown(socket.SHUT_RDWR)
             listener.close()
         for thread in self._threads:
             thread.join(timeout=10)
@@ -176,90 +175,90 @@ class BenchServer:
 
     def _serve(self, connection: socket.socket) -> None:
         """Answer one device's stand-in until it hangs up."""
-        answer: Callable[[Verb, bytes], Answer] = self._greeted
+        handle_request: Callable[[RequestKind, bytes], Reply] = self._refuse_before_hello
         with connection:
             try:
                 while (request := _receive(connection)) is not None:
                     verb, payload = request
                     self.requests[verb] += 1
-                    if verb is Verb.HELLO:
-                        status, reply, answer = self._hello(payload)
+                    if verb is RequestKind.HELLO:
+                        status, reply, handle_request = self._select_device(payload)
                     else:
-                        with self._turn:
-                            status, reply = answer(verb, payload)
-                    connection.sendall(_ANSWER.pack(status, len(reply)) + reply)
+                        with self._twin_lock:
+                            status, reply = handle_request(verb, payload)
+                    connection.sendall(_REPLY_HEAD.pack(status, len(reply)) + reply)
             except (OSError, ValueError, struct.error) as error:
                 log.info("a stand-in hung up: %s", error)
             finally:
                 self._connections.discard(connection)
 
-    def _greeted(self, verb: Verb, payload: bytes) -> Answer:
+    def _refuse_before_hello(self, verb: RequestKind, payload: bytes) -> Reply:
         """Refuse what comes before the greeting."""
         return _REFUSED, b""
 
-    def _hello(self, payload: bytes) -> tuple[int, bytes, Callable[[Verb, bytes], Answer]]:
+    def _select_device(self, payload: bytes) -> tuple[int, bytes, Callable[[RequestKind, bytes], Reply]]:
         """Find the device that a stand-in wants to be; its serial number must be the configured one."""
         kind, _, serial = payload.decode(errors="replace").partition(" ")
         devices = self.config.devices
         section = {"mirror": devices.dm, "wfs": devices.wfs, "science": devices.science}.get(kind)
         if section is None or serial.upper() != section.serial.upper():
             log.warning("no %s with serial number %r on this bench", kind, serial)
-            return _REFUSED, b"", self._greeted
-        with self._turn:
+            return _REFUSED, b"", self._refuse_before_hello
+        with self._twin_lock:
             if kind == "mirror":
-                return _GOOD, struct.pack("=I", devices.dm.n_act), self._mirror()
+                return _OK, struct.pack("=I", devices.dm.n_act), self._open_mirror()
             make = make_wfs_camera if kind == "wfs" else make_science_camera
             camera = make(kind, self.config, self.shared).open()
-            return _GOOD, struct.pack("=I", camera.info.bit_depth), _CameraEnd(camera)
+            return _OK, struct.pack("=I", camera.info.bit_depth), _CameraEndpoint(camera)
 
-    def _mirror(self) -> Callable[[Verb, bytes], Answer]:
+    def _open_mirror(self) -> Callable[[RequestKind, bytes], Reply]:
         mirror = make_mirror("dm", self.config, self.shared).open()
 
-        def answer(verb: Verb, payload: bytes) -> Answer:
-            if verb is not Verb.SEND or len(payload) != 8 * mirror.info.n_act:
+        def handle_request(verb: RequestKind, payload: bytes) -> Reply:
+            if verb is not RequestKind.SEND or len(payload) != 8 * mirror.info.n_act:
                 return _REFUSED, b""
             # The guard stands before the driver; electronics take any shape, such as that of a reset.
-            mirror._send(np.frombuffer(payload))  # noqa: SLF001
-            return _GOOD, b""
+            mirror._send(np.frombuffer(payload))
+            return _OK, b""
 
-        return answer
+        return handle_request
 
 
-class _CameraEnd:
+class _CameraEndpoint:
     """What a stand-in of a camera's library gets to see of the twin's camera."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
 
-    def __call__(self, verb: Verb, payload: bytes) -> Answer:
+    def __call__(self, verb: RequestKind, payload: bytes) -> Reply:
         try:
-            if verb is Verb.START:
+            if verb is RequestKind.START:
                 return self._start(*_START.unpack(payload))
-            if verb is Verb.FRAME:
+            if verb is RequestKind.FRAME:
                 return self._frame(*_FRAME.unpack(payload))
-            if verb is Verb.STOP:
+            if verb is RequestKind.STOP:
                 self._camera.stop()
-                return _GOOD, b""
+                return _OK, b""
         except FrameTimeout:
-            return _LATE, b""
+            return _TIMEOUT, b""
         except EscapeError as error:
             log.warning("the twin refuses: %s", error)
         return _REFUSED, b""
 
-    def _start(self, *numbers: float) -> Answer:
+    def _start(self, *numbers: float) -> Reply:
         region = Region(*(int(number) for number in numbers[:4]))
         exposure_us, rate_hz, gain_db = numbers[4:]
         self._camera.stop()
         self._camera.configure(CameraSettings(region, exposure_us * 1e-6, rate_hz, gain_db))
         self._camera.start()
-        return _GOOD, b""
+        return _OK, b""
 
-    def _frame(self, wait_s: float) -> Answer:
-        frame = self._camera.next_frame(max(wait_s, _NO_WAIT_S))
-        return _GOOD, _FRAME_HEAD.pack(frame.index, frame.exposed_ns) + frame.data.tobytes()
+    def _frame(self, wait_s: float) -> Reply:
+        frame = self._camera.next_frame(max(wait_s, _POLL_S))
+        return _OK, _FRAME_HEAD.pack(frame.index, frame.exposed_ns) + frame.data.tobytes()
 
 
-def _receive(connection: socket.socket) -> tuple[Verb, bytes] | None:
+def _receive(connection: socket.socket) -> tuple[RequestKind, bytes] | None:
     """One whole request, or ``None`` when the other side has hung up.
 
     Raises
@@ -267,17 +266,17 @@ def _receive(connection: socket.socket) -> tuple[Verb, bytes] | None:
     ValueError
         It is nonsense.
     """
-    head = _exactly(connection, _HEAD.size)
+    head = _receive_exactly(connection, _REQUEST_HEAD.size)
     if head is None:
         return None
-    verb, length = _HEAD.unpack(head)
-    if length > _LONGEST:
+    verb, length = _REQUEST_HEAD.unpack(head)
+    if length > _MAX_REQUEST_BYTES:
         raise ValueError(f"a request of {length} bytes")
-    payload = _exactly(connection, length)
-    return None if payload is None else (Verb(verb), payload)
+    payload = _receive_exactly(connection, length)
+    return None if payload is None else (RequestKind(verb), payload)
 
 
-def _exactly(connection: socket.socket, length: int) -> bytes | None:
+def _receive_exactly(connection: socket.socket, length: int) -> bytes | None:
     parts = bytearray()
     while len(parts) < length:
         part = connection.recv(length - len(parts))
@@ -288,7 +287,7 @@ def _exactly(connection: socket.socket, length: int) -> bytes | None:
 
 
 @contextmanager
-def in_environment(server: BenchServer) -> Iterator[None]:
+def stand_in_environment(server: StandInBench) -> Iterator[None]:
     """Let the drivers of this very process find the stand-ins and the bench."""
     before = {key: os.environ.get(key) for key in server.environment}
     os.environ.update(server.environment)

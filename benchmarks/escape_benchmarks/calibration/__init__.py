@@ -1,0 +1,1 @@
+"""Benchmarks of DO-CRIME, SPRINT and parameter sweeps."""

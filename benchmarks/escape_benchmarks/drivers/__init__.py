@@ -1,0 +1,1 @@
+"""Benchmarks of the device drivers against the least that the vendor's interface allows."""

@@ -1,0 +1,434 @@
+"""Tracker on a drifting bench, compared with a loop that uses the true registration and one that is never updated; with its figure. (Keep the usage text of the script below this line.)"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from array import array
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from escape_hw.api.procedure import Progress
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.results import CalibrationResult
+from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, prepare_sensor
+from escape_hw.calibration.loop.performance import build_integrator
+from escape_hw.calibration.loop.runner import RunningLoop
+from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_matrix
+from escape_hw.calibration.tracking.tracker import track
+from escape_hw.errors import CalibrationError
+from escape_hw.io.fits.matrix import load_matrix, save_matrix
+from escape_hw.pipeline.psf.frame_stack import FrameStack
+from escape_hw.pipeline.psf.strehl import strehl
+from escape_hw.report.figures import style
+from escape_hw.runtime.session.system import System, open_system
+from escape_sim.devices.bench import SimBench
+
+#: Seconds of tracking that are not judged.
+SETTLED_S = 10.0
+#: Seconds before and after an exchange that are held against each other.
+TRANSIENT_S = 0.1
+#: How far off the shift may be [% of a sub-aperture], and the Strehl ratio beside the loop that knows [%].
+SHIFT_LIMIT, STREHL_LIMIT = 2.0, 1.0
+LABELS = {"knows": "knows the truth, no pokes", "never": "never looks, no pokes"}
+
+
+def read_comparison(out: Path, loop: str) -> NDArray[np.float64]:
+    """Looks at another loop so far ``(n, 3)``: end in seconds, Strehl ratio, its error."""
+    path = out / f"{loop}.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    return np.array(sorted(json.loads(line) for line in lines)).reshape(-1, 3)
+
+
+def draw(out: Path, figure: Path) -> None:
+    """Errors in numbers, and the figure."""
+    tracked = json.loads((out / "track.json").read_text())
+    rows = {name: np.array(values, float) for name, values in tracked["rows"].items()}
+    truth, t = np.array(tracked["truth"]), rows["seconds"]
+    settled = t > SETTLED_S
+    for k, name in enumerate(PARAMETERS):
+        error = (rows[name] - truth[:, k])[settled]
+        chi2 = np.mean(np.square(error / rows[f"{name}_sigma"][settled]))
+        rms, worst = np.sqrt(np.mean(error**2)), np.abs(error).max()
+        print(
+            f"{name}: rms error {rms:.4f}, largest {worst:.4f}, chi2 {chi2:.2f}; mean {error.mean():+.4f}, "
+            f"scatter about it {error.std():.4f}"
+        )
+    gains = np.array(tracked["gains"])
+    gains = gains[gains[:, 0] > SETTLED_S]
+    share = np.interp(gains[:, 0], t, rows["optical_gain"]) / gains[:, 1] - 1
+    print(f"optical gain: mean error {share.mean():+.4f}, rms {np.sqrt(np.mean(share**2)):.4f},", end=" ")
+    print(f"largest {np.abs(share).max():.4f}; true {gains[:, 1].min():.3f} to {gains[:, 1].max():.3f}")
+    print(exchange_transients(out, t, rows["exchanged"] > 0))
+    others = {}
+    for loop in ("knows", "never"):
+        comparisons = read_comparison(out, loop)
+        if len(comparisons):
+            others[loop] = comparisons
+            print(difference(loop, others[loop], t, rows["strehl"]))
+    picture(rows, truth, gains, others).savefig(figure, dpi=110, facecolor="white")
+
+
+def exchange_transients(out: Path, t: Any, exchanged: Any) -> str:
+    """Wavefront error in front of the sensor just after exchanges, beside that just before, and elsewhere."""
+    ripples = np.load(out / "ripples.npz")
+    # An answer is taken up, and its matrix into use, when the second after it ends.
+    edges, exchanged_here = t[1:-1], exchanged[:-2]
+    at = np.searchsorted(ripples["seconds"], edges)
+    span = np.searchsorted(ripples["seconds"], edges + TRANSIENT_S) - at
+    squares = np.concatenate([[0.0], np.cumsum(np.square(ripples["nm"], dtype=float))])
+    after = np.sqrt((squares[at + span] - squares[at]) / span)
+    before = np.sqrt((squares[at] - squares[at - span]) / span)
+    step = after - before
+    if not exchanged_here.any():
+        return "no exchange"
+    own, others = step[exchanged_here], step[~exchanged_here]
+    return (
+        f"wavefront in front of the sensor (mean {before.mean():.0f} nm), {TRANSIENT_S:g} s after beside before "
+        f"{len(own)} exchanges: {own.mean():+.2f} +- {own.std() / np.sqrt(len(own)):.2f} nm, "
+        f"rms {own.std():.2f}, largest {np.abs(own).max():.2f}; at the {len(others)} other seconds "
+        f"rms {others.std():.2f}, largest {np.abs(others).max():.2f}"
+    )
+
+
+def at_same_times(comparisons: NDArray[np.float64], t: Any, ratios: Any) -> NDArray[np.float64]:
+    """The tracked loop's Strehl ratios at the moments of looks at another one ``(n,)``."""
+    return np.array([ratios[np.argmin(np.abs(t - end))] for end in comparisons[:, 0]])
+
+
+def difference(loop: str, comparisons: NDArray[np.float64], t: Any, ratios: Any) -> str:
+    """Mean Strehl ratios of the tracked loop and another one at the same moments, and of their difference."""
+    here = at_same_times(comparisons, t, ratios)
+    strehl_difference = here - comparisons[:, 1]
+    error = strehl_difference.std(ddof=1) / np.sqrt(len(strehl_difference))
+    return (
+        f"Strehl ratio: tracked {100 * here.mean():.2f} %, {loop} {100 * comparisons[:, 1].mean():.2f} %, tracked "
+        f"minus {loop} {100 * strehl_difference.mean():+.2f} +- {100 * error:.2f} % ({len(strehl_difference)} looks), relative "
+        f"{100 * strehl_difference.mean() / comparisons[:, 1].mean():+.2f} +- {100 * error / comparisons[:, 1].mean():.2f} %; "
+        f"last quarter {100 * strehl_difference[-len(strehl_difference) // 4 :].mean():+.2f} %"
+    )
+
+
+def band(panel: Any, t: Any, value: Any, sigma: Any) -> None:
+    """A course with the band of its standard errors."""
+    panel.fill_between(t, value - sigma, value + sigma, color=style.SERIES[0], alpha=0.3, lw=0)
+    panel.plot(t, value, color=style.SERIES[0], lw=1.2, label="tracked")
+
+
+def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]) -> Figure:
+    """Shift and its error, rotation, gain, Strehl ratio and what it lacks, against time."""
+    figure = style.new_figure(9.2, 9.0)
+    panels = figure.subplots(3, 2, sharex=True).ravel()
+    t = rows["seconds"]
+    for panel, name, k, title in (
+        (panels[0], "shift_x", 0, "shift x [% of a sub-aperture]"),
+        (panels[2], "rotation", 2, "rotation [deg]"),
+    ):
+        band(panel, t, rows[name] - truth[0, k], rows[f"{name}_sigma"])
+        panel.plot(t, truth[:, k] - truth[0, k], ":", color=style.INK, lw=1.4, label="truth")
+        style.style_axes(panel).set_title(f"{title}, since the start", fontsize=9.5)
+    band(panels[1], t, rows["shift_x"] - truth[:, 0], rows["shift_x_sigma"])
+    panels[1].axhline(0, color=style.INK, lw=0.8)
+    for limit in (-SHIFT_LIMIT, SHIFT_LIMIT):
+        panels[1].axhline(limit, color=style.MUTED, lw=1.0, ls=":", label="asked for" if limit > 0 else None)
+    panels[1].margins(y=0.2)
+    style.style_axes(panels[1]).set_title("shift x, tracked less truth [% of a sub-aperture]", fontsize=9.5)
+    band(panels[3], t, rows["optical_gain"], rows["optical_gain_sigma"])
+    panels[3].plot(gains[:, 0], gains[:, 1], "o", ms=3, color=style.INK, label="truth")
+    style.style_axes(panels[3]).set_title("optical gain, beside the start's matrix", fontsize=9.5)
+    strehl_panels(panels[4], panels[5], rows, others)
+    for panel in panels:
+        panel.legend(frameon=False, fontsize=8)
+    for panel in panels[4:]:
+        panel.set_xlabel("seconds")
+    return figure
+
+
+def strehl_panels(panel: Any, deficit_panel: Any, rows: dict[str, Any], others: dict[str, Any]) -> None:
+    """Strehl ratios, and what each loop lacks of the one that knows on the same air."""
+    t, ratio = rows["seconds"], np.isfinite(rows["strehl"])
+    panel.errorbar(
+        t[ratio], 100 * rows["strehl"][ratio], 100 * rows["strehl_sigma"][ratio],
+        color=style.SERIES[0], lw=1.0, elinewidth=0.5, label="tracked, with pokes",
+    )  # fmt: skip
+    known = others.get("knows")
+    for (loop, comparisons), mark, colour in zip(
+        others.items(), "os", (style.INK, style.SERIES[1]), strict=False
+    ):
+        panel.plot(comparisons[:, 0], 100 * comparisons[:, 1], mark, ms=3.5, color=colour, label=LABELS[loop])
+        if known is not None and len(known) == len(comparisons) and loop != "knows":
+            deficit = 100 * (comparisons[:, 1] / known[:, 1] - 1)
+            deficit_panel.plot(comparisons[:, 0], deficit, mark, ms=3.5, color=colour, label=LABELS[loop])
+    if known is not None:
+        deficit = 100 * (at_same_times(known, t, rows["strehl"]) / known[:, 1] - 1)
+        deficit_panel.plot(
+            known[:, 0], deficit, "-", color=style.SERIES[0], lw=1.2, label="tracked, with pokes"
+        )
+    deficit_panel.axhline(-STREHL_LIMIT, color=style.MUTED, lw=1.0, ls=":", label="asked for")
+    style.style_axes(panel).set_title("Strehl ratio, peak [%]", fontsize=9.5)
+    style.style_axes(deficit_panel).set_title("Strehl ratio beside the loop that knows [%]", fontsize=9.5)
+
+
+#: Seconds of a look at the other loops, and how long they close before.
+COMPARISON_S, CLOSING_S = 5.0, 1.0
+#: Modes and wavefronts that the true optical gain is found on; size of the poke in strokes.
+GAIN_MODES, WAVEFRONTS, GAIN_POKE = 12, 4, 3e-3
+#: Seconds from one of those wavefronts to the next.
+WAVEFRONT_SPACING_S = 0.4
+
+
+def drift_overrides(options: argparse.Namespace) -> list[str]:
+    """Configuration of the drift: linear in shift x, and a swing of the seeing."""
+    rate = options.drift / options.seconds
+    return [
+        f"twin.drift.rate.shift_x={rate:.8g}",
+        f"twin.drift.swing.rotation={options.swing:.8g}",
+        f"twin.drift.period_s={options.seconds:.8g}",
+        f"twin.seeing.swing={options.seeing:.8g}",
+        f"twin.seeing.period_s={options.seconds:.8g}",
+        *options.set,
+    ]
+
+
+def open_bench(options: argparse.Namespace) -> System:
+    """The bench, drifting, with its streams of random numbers at their beginning."""
+    return open_system(options.system, set=drift_overrides(options), seed=options.seed)
+
+
+def load_or_make_start(options: argparse.Namespace) -> tuple[CalibrationResult, NDArray[np.float32]]:
+    """The calibration to start from and the model PSF, made on a bench that does not drift, once."""
+    matrix, image = options.out / "start.fits", options.out / "psf.npy"
+    if not matrix.exists():
+        with open_system(options.system, set=options.set, seed=options.seed) as bench:
+            result = bench.calibrate(frames=options.frames)
+            np.save(image, bench.take_model_psf(frames=10))
+            if bench.config.sensor.kind == "pyramid":
+                result = bench.find_optical_gains(result, accuracy=0.05, frames=2000).rescaled_calibration
+            save_matrix(matrix, result)
+    return load_matrix(matrix).result, np.load(image)
+
+
+def twin_of(bench: System) -> SimBench:
+    """The simulated bench behind a system."""
+    twin = getattr(bench.dm, "twin", None)
+    if not isinstance(twin, SimBench):
+        raise SystemExit(f"{bench.config.system.name} has no twin with a truth to look at")
+    return twin
+
+
+class WavefrontRms:
+    """Keeps the rms of the wavefront in front of the sensor, mirror included, of every moment it is seen."""
+
+    def __init__(self, twin: SimBench) -> None:
+        self._share = (twin.pupil.lit / np.count_nonzero(twin.pupil.lit)).astype(np.float32).ravel()
+        self.seconds, self.nm = array("d"), array("f")
+        twin.path_callbacks.append(self)
+
+    def __call__(self, opd: NDArray[np.float32], time_s: float) -> None:
+        """Take the optical path ``(n, n)`` in metres."""
+        self.seconds.append(time_s)
+        path = opd.ravel()
+        self.nm.append(1e9 * math.sqrt(float((path * path) @ self._share) - float(path @ self._share) ** 2))
+
+
+class WavefrontSampler:
+    """Keeps a few wavefronts in front of the sensor from certain moments on, by time."""
+
+    def __init__(self, twin: SimBench, starts: NDArray[np.float64]) -> None:
+        self.samples: list[list[tuple[float, NDArray[np.float32]]]] = []
+        self._twin = twin
+        self._sample_times = [
+            float(start + k * WAVEFRONT_SPACING_S) for start in starts for k in range(WAVEFRONTS)
+        ]
+        twin.path_callbacks.append(self)
+
+    def __call__(self, opd: NDArray[np.float32], time_s: float) -> None:
+        """Take the optical path ``(n, n)`` in metres of a frame."""
+        if self._sample_times and time_s >= self._sample_times[0]:
+            self._sample_times.pop(0)
+            if not self.samples or len(self.samples[-1]) == WAVEFRONTS:
+                self.samples.append([])
+            self.samples[-1].append((time_s, self._twin.sensor_opd(opd, time_s)))
+
+
+def matrix_at(bench: System, start: CalibrationResult, here: Registration) -> NDArray[np.float64]:
+    """The start's matrix moved to a registration ``(n_slopes, n_modes)``, each mode as strong as it was."""
+    known, matrix, model = start.registration, start.matrix, bench.model(start.grid)
+    assert known is not None
+    then, now = (
+        compute_fitted_matrix(model, where, known, matrix.m2c) for where in (known.registration, here)
+    )
+    return np.asarray(now * ((then * matrix.data).sum(axis=0) / np.square(then).sum(axis=0)))
+
+
+def true_optical_gain(
+    bench: System, twin: SimBench, result: CalibrationResult, wavefronts: list[tuple[float, Any]]
+) -> float:
+    """Mean optical gain around wavefronts by push-pull, relative to the start's matrix.
+
+    The start's matrix is moved to the true registration of the moment first: what is wanted is how much
+    weaker the sensor answers, not where the mirror sits.
+    """
+    m2c, slopes_of = result.matrix.m2c, build_slope_function(bench, result.grid)
+    light = twin.wfs_light(bench.wfs.settings.exposure_s)
+    unit = matrix_at(bench, result, twin.flexure.at(wavefronts[0][0]))
+    shares = []
+    for time_s, opd in wavefronts:
+        for mode in np.linspace(0, m2c.shape[1] - 1, GAIN_MODES).astype(int):
+            shape = twin.mirror_opd(GAIN_POKE * m2c[:, mode], time_s)
+            slopes = []
+            for sign in (1, -1):
+                image = np.zeros(twin.wfs_detector.shape, np.float32)
+                twin.sensor().frame(opd + sign * shape, image)
+                # The camera's own frame: its black level and noise decide what the threshold cuts.
+                frame, _ = twin.wfs_detector.expose(image, *light)
+                slopes.append(slopes_of(frame).astype(float).copy())
+            answer = (slopes[0] - slopes[1]) / (2 * GAIN_POKE)
+            shares.append(float(answer @ unit[:, mode]) / float(unit[:, mode] @ unit[:, mode]))
+    return float(np.mean(shares))
+
+
+def run_tracker(options: argparse.Namespace) -> None:
+    """Run the tracker and write what it said beside the truth."""
+    result, psf = load_or_make_start(options)
+    with open_bench(options) as bench:
+        twin = twin_of(bench)
+        origin = twin.now_s
+        ripples = WavefrontRms(twin)
+        frozen = WavefrontSampler(
+            twin, np.linspace(origin + 3, origin + options.seconds - 1, 2 * options.looks)
+        )
+        (options.out / "live.jsonl").unlink(missing_ok=True)
+        found = bench.run(
+            track(
+                bench, result.matrix, result.grid, seconds=options.seconds, registration=result.registration,
+                response=result.response, model_psf=psf, memory_s=options.memory, poke=options.poke,
+            ),
+            observers=(ProgressLog(options.out / "live.jsonl"),),
+        )  # fmt: skip
+        seconds = origin + found.column("seconds")
+        truth = np.array([twin.flexure.at(t).to_array() for t in seconds])
+        gains = [
+            [near[0][0] - origin, true_optical_gain(bench, twin, result, near)] for near in frozen.samples
+        ]
+    document = {
+        "origin": origin, "rows": found.rows, "truth": truth.tolist(), "gains": gains,
+        "exchanges": sum(e.accepted for e in found.exchanges), "frames": found.frames,
+        "alarms": [a.text for a in found.alarms], "poke": found.poke, "system": options.system,
+    }  # fmt: skip
+    (options.out / "track.json").write_text(json.dumps(document))
+    np.savez(options.out / "ripples.npz", seconds=np.array(ripples.seconds) - origin, nm=ripples.nm)
+    print(f"{found.frames} frames, {document['exchanges']} exchanges, alarms: {document['alarms']}")
+
+
+class ProgressLog:
+    """Writes what the tracker tells every second to a file, and now and then to the terminal."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._last = path, 0
+
+    def __call__(self, progress: Progress) -> None:
+        """Take a progress report."""
+        if progress.stage != "tracking" or progress.done == self._last or not progress.metrics:
+            return
+        self._last = progress.done
+        with self._path.open("a") as lines:
+            lines.write(json.dumps({"second": progress.done, **progress.metrics}) + "\n")
+        if progress.done % 20 == 0:
+            print(f"{progress.done} of {progress.total} s", flush=True)
+
+
+def measure_strehl(
+    bench: System, result: CalibrationResult, psf: Any, at_s: float, matrix: Any
+) -> tuple[float, float]:
+    """Strehl ratio of a loop closed for a few seconds at a moment of the twin's clock; 0 where it is lost."""
+    prepare_sensor(bench)
+    bench.dm.flatten()
+    twin_of(bench).advance_to(at_s - CLOSING_S)
+    control = build_integrator(bench, matrix, result.grid)
+    loop = RunningLoop(bench, matrix.m2c, build_slope_function(bench, result.grid), control, science=True)
+    rate = bench.wfs.settings.frame_rate_hz
+    bench.run(loop.run(round(CLOSING_S * rate)))
+    loop.record.science = FrameStack()
+    if not loop.record.diverged:
+        bench.run(loop.run(round(COMPARISON_S * rate)))
+    bench.dm.flatten()
+    if loop.record.diverged:
+        return 0.0, 0.0
+    try:
+        peak = strehl(loop.record.science.images(), psf).peak
+    except CalibrationError as error:
+        print(f"{at_s:.0f} s: {error}")
+        return 0.0, 0.0
+    return peak.value, peak.sigma
+
+
+def compare(options: argparse.Namespace) -> None:
+    """Strehl ratios of a loop that knows or that never looks, now and then."""
+    tracked = json.loads((options.out / "track.json").read_text())
+    result, psf = load_or_make_start(options)
+    gains = np.array(tracked["gains"])
+    done = read_comparison(options.out, options.loop)
+    with open_bench(options) as bench:
+        twin = twin_of(bench)
+        for end in comparison_times(tracked, options.looks):
+            if any(abs(end - one[0]) < COMPARISON_S for one in done):
+                continue
+            at, matrix = tracked["origin"] + end - COMPARISON_S, result.matrix
+            if options.loop == "knows":
+                gain = float(np.interp(end, *gains.T))
+                data = gain * matrix_at(bench, result, twin.flexure.at(at + COMPARISON_S / 2))
+                matrix = replace(matrix, data=data.astype(np.float32))
+            one = [float(end), *measure_strehl(bench, result, psf, at, matrix)]
+            with (options.out / f"{options.loop}.jsonl").open("a") as lines:
+                lines.write(json.dumps(one) + "\n")
+            print(options.loop, *(f"{value:.4f}" for value in one), flush=True)
+
+
+def comparison_times(tracked: dict[str, Any], looks: int) -> NDArray[np.float64]:
+    """When the looks at the other loops end: where the tracker's Strehl ratios do."""
+    rows = {name: np.array(tracked["rows"][name], float) for name in ("seconds", "strehl")}
+    # A ratio holds the science frames of the five updates before.
+    ends = rows["seconds"][np.isfinite(rows["strehl"])][1:]
+    # Two rows apart at least: a look takes longer than the time that it covers.
+    return np.asarray(ends[:: max(2, len(ends) // looks)])
+
+
+def main() -> None:
+    """Parse, and do one of the three."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=["track", "compare", "draw"])
+    parser.add_argument("--system", default="razor-shwfs")
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument(
+        "--drift", type=float, default=20.0, help="shift x over the run, %% of a sub-aperture"
+    )
+    parser.add_argument("--swing", type=float, default=0.0, help="swing of the rotation, degrees")
+    parser.add_argument("--seeing", type=float, default=0.2, help="swing of r0, fraction")
+    parser.add_argument("--memory", type=float, default=10.0)
+    parser.add_argument("--poke", type=float, default=None, help="as configured by default")
+    parser.add_argument("--frames", type=int, default=2000, help="frames of the calibration before")
+    parser.add_argument("--looks", type=int, default=24, help="how often the other loops are closed")
+    parser.add_argument("--loop", choices=["knows", "never"], default="knows", help="what compare closes")
+    parser.add_argument("--seed", type=int, default=5)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--out", type=Path, default=Path("."))
+    parser.add_argument("--figure", type=Path, default=Path("tracking.png"))
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.what == "draw":
+        draw(options.out, options.figure)
+    else:
+        {"track": run_tracker, "compare": compare}[options.what](options)
+
+
+if __name__ == "__main__":
+    main()

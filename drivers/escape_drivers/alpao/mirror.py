@@ -1,0 +1,282 @@
+"""ALPAO deformable mirrors through the vendor's libasdk."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from ctypes import c_void_p
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from escape_drivers.alpao.library import AlpaoLibrary, format_version
+from escape_drivers.common.options import parse_options, require_in_range, require_serial
+from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.errors import CommandRejected, DeviceError
+
+if TYPE_CHECKING:
+    from escape_hw.config.devices import MirrorConfig
+    from escape_hw.config.system import SystemConfig
+
+log = logging.getLogger(__name__)
+
+#: ``TriggerIn`` and ``TriggerMode`` as the SDK numbers them.
+_TRIGGER_IN = {"off": 0.0, "rising": 1.0, "falling": 2.0}
+_TRIGGER_OUT = {"long": 0.0, "short": 1.0}
+#: Where the SDK looks for a mirror's configuration files.
+_CONFIG_VARIABLE = "ACECFG"
+
+
+@dataclass(frozen=True, slots=True)
+class AlpaoOptions:
+    """The ``[devices.dm.options]`` of this driver; what is left at its default is not sent.
+
+    Parameters
+    ----------
+    library
+        Path of ``libasdk.so``; empty: ``ESCAPE_ALPAO_LIBRARY``, then the system's loader.
+    config_folder
+        Folder of the mirror's ``.acfg`` and binary configuration (``ACECFG``).
+    sync
+        ``"wait"``: a send returns when the electronics have the shape; ``"return"``: after checks.
+    ack_timeout_ms
+        Longest wait for the electronics' acknowledgement; 0: as the SDK has it.
+    trigger_in
+        Wait for an edge before each shape.
+    trigger_out
+        Length of the pulse that goes out with each shape.
+    """
+
+    library: str = ""
+    config_folder: str = ""
+    sync: Literal["", "wait", "return"] = ""
+    ack_timeout_ms: int = 0
+    trigger_in: Literal["", "off", "rising", "falling"] = ""
+    trigger_out: Literal["", "long", "short"] = ""
+
+    def sdk_parameters(self) -> list[tuple[str, float]]:
+        """Parameters to set after opening, in order."""
+        wanted: list[tuple[str, float]] = []
+        if self.sync:
+            wanted.append(("SyncMode", float(self.sync == "return")))
+        if self.ack_timeout_ms:
+            wanted.append(("AckTimeout", float(self.ack_timeout_ms)))
+        if self.trigger_out:
+            wanted.append(("TriggerMode", _TRIGGER_OUT[self.trigger_out]))
+        if self.trigger_in:
+            wanted.append(("TriggerIn", _TRIGGER_IN[self.trigger_in]))
+        return wanted
+
+
+def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> AlpaoMirror:
+    """Entry point ``alpao``.
+
+    Raises
+    ------
+    ConfigError
+        No serial number, or an option that this driver does not know.
+    """
+    section = config.devices.dm
+    require_serial(name, section)
+    options = parse_options(AlpaoOptions, name, section)
+    require_in_range(name, options, {"ack_timeout_ms": (0, 60_000)})
+    return AlpaoMirror(name, section, options)
+
+
+class AlpaoMirror(DeformableMirror):
+    """An ALPAO mirror. Closing ramps to flat, stops, resets and releases it, in this order.
+
+    Parameters
+    ----------
+    name
+        Key in ``[devices]``.
+    section
+        Geometry, serial number and limits.
+    options
+        Of this driver.
+    """
+
+    def __init__(self, name: str, section: MirrorConfig, options: AlpaoOptions) -> None:
+        super().__init__(name, section.limits.to_limits())
+        self._section, self._options = section, options
+        self._buffer = np.zeros(section.n_act)
+        # The buffer never moves, so its address is made once.
+        self._pointer = c_void_p(self._buffer.ctypes.data)
+        self._library: AlpaoLibrary | None = None
+        self._handle: c_void_p | None = None
+        self._transfer: Callable[[], int] = _raise_not_connected
+        self._playing = False
+        self._info = self._build_info("ALPAO mirror", False)
+
+    @property
+    def info(self) -> DMInfo:
+        """Identity and geometry."""
+        return self._info
+
+    @property
+    def is_playing(self) -> bool:
+        """True after :meth:`play_patterns`, until the next command or :meth:`stop_pattern`."""
+        return self._playing
+
+    @property
+    def handle(self) -> c_void_p:
+        """The SDK's handle, for calls that this driver does not make.
+
+        Raises
+        ------
+        NotOpen
+            The mirror is not connected.
+        """
+        self.require_open()
+        return self._require_connected()[1]
+
+    def play_patterns(self, patterns: ArrayLike, repeats: int = 1) -> None:
+        """Have the electronics send shapes by themselves, one after the other; returns at once.
+
+        With ``trigger_in`` each edge brings the next shape. Nothing is made legal here: a sequence that
+        breaks a limit anywhere, from the present shape on and from its end to its beginning, is
+        refused whole.
+
+        Parameters
+        ----------
+        patterns
+            Shapes ``(n_patterns, n_act)``, fractions of full stroke.
+        repeats
+            How often the sequence is sent; 0: until it is stopped.
+
+        Raises
+        ------
+        CommandRejected
+            A shape is malformed or breaks a limit; nothing is sent.
+        NotOpen, DeviceError
+            The mirror is not connected, or the transfer failed.
+        """
+        with self._lock:
+            sequence = self._validate_sequence(patterns, repeats)
+            self._stop_playing()
+            library, handle = self._require_connected()
+            self._playing = True
+            pointer = c_void_p(sequence.ctypes.data)
+            library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
+            # What the mirror shows from now on nobody knows: the next flatten() always sends.
+            self._guard_when_open().reset(sequence[-1])
+            self._shape_known = False
+
+    def stop_pattern(self) -> None:
+        """Stop a sequence; the mirror keeps the shape it has. Does nothing when none runs.
+
+        Raises
+        ------
+        NotOpen, DeviceError
+            The mirror is not connected, or did not stop.
+        """
+        with self._lock:
+            self._guard_when_open()
+            self._stop_playing()
+
+    def parameter(self, name: str) -> float:
+        """Read a parameter of the SDK, such as ``"ItfState"``.
+
+        Raises
+        ------
+        NotOpen, DeviceError
+            The mirror is not connected, or there is no such parameter.
+        """
+        with self._lock:
+            self.require_open()
+            library, handle = self._require_connected()
+            return library.get(handle, name)
+
+    def _open(self) -> None:
+        if self._options.config_folder:
+            os.environ[_CONFIG_VARIABLE] = self._options.config_folder
+        library = self._library = AlpaoLibrary(self.name, self._options.library)
+        # The files of a mirror are named in capitals, and so is what the SDK looks for.
+        handle = self._handle = library.init(self._section.serial.strip().upper())
+        n_act = round(library.get(handle, "NbOfActuator"))
+        if n_act != self._section.n_act:
+            raise DeviceError(
+                self.name,
+                f"has {n_act} actuators, but the layout {self._section.layout!r} has {self._section.n_act}; "
+                "correct devices.dm.layout or the serial number",
+            )
+        version = format_version(library.get(handle, "VersionInfo"))
+        log.info("%s: SDK %s, mirror %s", self.name, version, self._section.serial)
+        for name, value in self._options.sdk_parameters():
+            library.set(handle, name, value)
+        self._playing = False
+        # A function object of its own without prototype: both arguments are C pointers for good already,
+        # and checking them at every call costs as much as the call.
+        self._transfer = partial(library.c["asdkSend"], handle, self._pointer)
+        self._info = self._build_info(f"ALPAO mirror, SDK {version}", library.stand_in)
+
+    def _close(self) -> None:
+        library, handle = self._library, self._handle
+        self._library = self._handle = None
+        self._playing, self._transfer = False, _raise_not_connected
+        if library is None or handle is None:
+            return
+        for name in ("asdkStop", "asdkReset", "asdkRelease"):
+            try:
+                library.call(name, handle)
+            except DeviceError as error:
+                # It may have gone; what is left to do is still tried.
+                log.warning("while closing: %s", error)
+
+    def _release_after_failed_open(self) -> None:
+        """Release a mirror that was opened in vain; nothing has moved, so nothing is reset."""
+        library, handle = self._library, self._handle
+        self._library = self._handle = None
+        if library is not None and handle is not None:
+            library.call("asdkRelease", handle)
+
+    def _send(self, command: NDArray[np.float64]) -> None:
+        if self._playing:
+            self._stop_playing()
+        self._buffer[:] = command
+        if self._transfer() != 0:
+            raise self._require_connected()[0].error_for("asdkSend")
+
+    def _stop_playing(self) -> None:
+        library, handle = self._require_connected()
+        if self._playing:
+            library.call("asdkStop", handle)
+            self._playing = False
+
+    def _validate_sequence(self, patterns: ArrayLike, repeats: int) -> NDArray[np.float64]:
+        guard = self._guard_when_open()
+        rows = [guard.validate(row) for row in np.asarray(patterns)]
+        if not rows or repeats < 0:
+            raise CommandRejected(
+                self.name, f"{len(rows)} shapes, {repeats} repeats; need one and none below 0"
+            )
+        cyclic_rows = rows if repeats == 1 else [*rows, rows[0]]
+        last = guard.last
+        try:
+            for number, row in enumerate(cyclic_rows):
+                if not guard.is_legal(row):
+                    slew_message = f"is further from the one before than max_slew = {self.limits.max_slew}"
+                    why = guard.find_violation(row) or slew_message
+                    raise CommandRejected(self.name, f"shape {number % len(rows)} of the sequence: {why}")
+                guard.set_last(row)
+        finally:
+            guard.set_last(last)
+        return np.ascontiguousarray(rows)
+
+    def _require_connected(self) -> tuple[AlpaoLibrary, c_void_p]:
+        if self._library is None or self._handle is None:
+            raise DeviceError(self.name, "is not connected; call open() first")
+        return self._library, self._handle
+
+    def _build_info(self, model: str, stand_in: bool) -> DMInfo:
+        name = f"{model} (stand-in)" if stand_in else model
+        return self._section.info(name, simulated=stand_in)
+
+
+def _raise_not_connected() -> int:
+    """Take the place of the transfer while there is none."""
+    raise RuntimeError("a command passed the guard of a mirror that is not connected")

@@ -1,0 +1,1 @@
+"""GenICam cameras through Aravis: the driver and the binding. Exports ``AravisCamera``, ``AravisOptions``."""

@@ -1,0 +1,248 @@
+"""GenICam cameras (USB3 Vision, GigE Vision) through Aravis: the science camera."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_drivers.aravis.library import AravisLibrary, ReceivedBuffer
+from escape_drivers.common.camera import BlockingCamera
+from escape_drivers.common.camera_limits import CameraLimits, ParameterRange
+from escape_drivers.common.options import camera_section, parse_options, require_in_range, require_serial
+from escape_hw.api.camera import CameraSettings, Frame, Region
+from escape_hw.errors import DeviceError, DeviceLost, NotOpen
+
+if TYPE_CHECKING:
+    from escape_hw.config.devices import CameraConfig
+    from escape_hw.config.system import SystemConfig
+
+log = logging.getLogger(__name__)
+
+#: After block 65535 of GigE Vision comes 1; longer identifiers go on.
+_BLOCK_ID_RANGE = (1, 65535)
+_SUCCESS = 0
+_STATUS_TEXT = {
+    1: "cleared", 2: "time-out", 3: "packets missing", 4: "wrong packet", 5: "wrong size", 6: "not filled",
+    7: "aborted", 8: "payload not supported",
+}  # fmt: skip
+#: Cameras name the switch of their frame rate differently; the first that is there is used.
+_RATE_SWITCHES = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
+#: What would change exposure, gain or rate behind our back, and how it is switched off.
+_AUTO_FEATURES = ("ExposureAuto", "GainAuto", "AcquisitionFrameRateAuto")
+
+
+@dataclass(frozen=True, slots=True)
+class AravisOptions:
+    """The ``[devices.science.options]`` of this driver.
+
+    Parameters
+    ----------
+    library
+        Path of ``libaravis-0.8.so.0``; empty: ``ESCAPE_ARAVIS_LIBRARY``, then the system's loader.
+    interface
+        Interface to switch on first: ``"Fake"`` brings Aravis's own simulated camera.
+    pixel_format
+        Format with 16 bits per pixel, or ``Mono8`` for 8; its name as GenICam has it.
+    shift
+        Bits to shift counts right: for cameras that fill a 16-bit word from the top.
+    buffers
+        Frames that may wait to be read.
+    newest
+        Skip to the newest frame when late; false: deliver every one.
+    """
+
+    library: str = ""
+    interface: Literal["", "Fake"] = ""
+    pixel_format: Literal["Mono16", "Mono14", "Mono12", "Mono10", "Mono8"] = "Mono16"
+    shift: int = 0
+    buffers: int = 8
+    newest: bool = False
+
+
+def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> AravisCamera:
+    """Entry point ``aravis``.
+
+    Raises
+    ------
+    ConfigError
+        No such camera, no serial number, or an option that this driver does not know.
+    """
+    section = camera_section(name, config)
+    require_serial(name, section)
+    options = parse_options(AravisOptions, name, section)
+    require_in_range(name, options, {"shift": (0, 8), "buffers": (2, 64)})
+    return AravisCamera(name, section, options)
+
+
+class AravisCamera(BlockingCamera):
+    """A GenICam camera.
+
+    Parameters
+    ----------
+    name
+        Key in ``[devices]``.
+    section
+        Serial number, sensor, region, exposure and rate to begin with.
+    options
+        Of this driver.
+    """
+
+    def __init__(self, name: str, section: CameraConfig, options: AravisOptions) -> None:
+        super().__init__(name, section, "GenICam camera", _BLOCK_ID_RANGE)
+        self._options = options
+        self._library: AravisLibrary | None = None
+        self._incomplete = 0
+
+    @property
+    def incomplete_frames(self) -> int:
+        """Frames since ``start`` that arrived incomplete and were thrown away; they count as lost."""
+        return self._incomplete
+
+    def _open(self) -> None:
+        library = self._library = AravisLibrary(self.name, self._options.library)
+        library.open(self._section.serial.strip(), self._options.interface)
+        model = (library.call("camera_get_model_name") or b"GenICam camera").decode(errors="replace")
+        library.call("camera_set_pixel_format_from_string", self._options.pixel_format.encode())
+        for feature in _AUTO_FEATURES:
+            if library.first_available([feature]):
+                library.call("camera_set_string", feature.encode(), b"Off")
+        switch = library.first_available(_RATE_SWITCHES)
+        if switch is not None:
+            library.call("camera_set_boolean", switch.encode(), 1)
+        width, height = library.get_ints("camera_get_sensor_size", 2)
+        self._require_sensor((width, height), "to what the camera is")
+        library.call("camera_set_region", 0, 0, width, height)
+        self._read_limits = _read_limits(library)
+        self._info = self._build_info(model, library.stand_in or self._options.interface == "Fake")
+        log.info("%s: %s, serial number %s", self.name, model, self._section.serial)
+        self._settings = self._apply_settings(self._check(self._section.settings()))
+
+    def _disconnect(self) -> None:
+        library, self._library = self._library, None
+        if library is not None:
+            library.close()
+
+    def _apply_settings(self, want: CameraSettings) -> CameraSettings:
+        library, limits, region = self._require_connected(), self._require_limits(), want.region
+        # Size and offsets limit each other: from the corner both can change.
+        library.call("camera_set_region", 0, 0, region.width, region.height)
+        library.call("camera_set_region", region.x, region.y, region.width, region.height)
+        library.call("camera_set_exposure_time", want.exposure_s * 1e6)
+        if limits.gain.high > limits.gain.low:
+            library.call("camera_set_gain", want.gain_db)
+        self._min_rate_hz, self._max_rate_hz = library.get_float_bounds("frame_rate")
+        self._require_rate(want)
+        library.call("camera_set_frame_rate", want.frame_rate_hz)
+        return self._read_back(library, limits)
+
+    def _read_back(self, library: AravisLibrary, limits: CameraLimits) -> CameraSettings:
+        exposure_us = limits.exposure.nearest_valid(library.call("camera_get_exposure_time"))
+        gain = library.call("camera_get_gain") if limits.gain.high > limits.gain.low else limits.gain.low
+        region = Region(*library.get_ints("camera_get_region", 4))
+        rate = float(library.call("camera_get_frame_rate"))
+        return CameraSettings(region, exposure_us * 1e-6, rate, limits.gain.nearest_valid(gain))
+
+    def _start_acquisition(self) -> None:
+        self._incomplete = 0
+        library = self._require_connected()
+        try:
+            library.start_stream(self._options.buffers)
+        except DeviceError:
+            library.stop_stream()
+            raise
+
+    def _stop_acquisition(self) -> None:
+        library = self._require_connected()
+        try:
+            library.call("camera_stop_acquisition")
+        finally:
+            library.stop_stream()
+
+    def _read_frame(self, wait_ms: int) -> Frame | None:
+        library = self._require_connected()
+        buffer = library.pop_buffer(wait_ms)
+        while buffer is not None and self._options.newest:
+            newer = library.pop_buffer(0)
+            if newer is None:
+                break
+            library.push_buffer(buffer)
+            buffer = newer
+        if buffer is None:
+            self._require_responding(library, wait_ms)
+            return None
+        try:
+            return self._frame_from_buffer(library.read_buffer(buffer))
+        finally:
+            library.push_buffer(buffer)
+
+    def _require_responding(self, library: AravisLibrary, wait_ms: int) -> None:
+        """Find out whether a silent camera is still there; not asked when nothing was waited for."""
+        if wait_ms == 0:
+            return
+        try:
+            library.call("camera_get_exposure_time")
+        except DeviceError as error:
+            raise DeviceLost(
+                self.name, f"does not answer any more ({error}); check cable and power, then open it again"
+            ) from error
+
+    def _frame_from_buffer(self, buffer_info: ReceivedBuffer) -> Frame | None:
+        if buffer_info.status != _SUCCESS:
+            self._incomplete += 1
+            why = _STATUS_TEXT.get(buffer_info.status, f"status {buffer_info.status}")
+            log.info("%s: frame %d thrown away: %s", self.name, buffer_info.frame_id, why)
+            return None
+        return self._make_frame(
+            self._pixel_counts(buffer_info), buffer_info.frame_id, buffer_info.timestamp_ns
+        )
+
+    def _pixel_counts(self, buffer_info: ReceivedBuffer) -> NDArray[np.uint16]:
+        """Counts in a buffer; a look at it where that is possible."""
+        region = self._settings.region
+        kind: Any = np.uint8 if self._options.pixel_format == "Mono8" else np.uint16
+        needed = region.width * region.height * np.dtype(kind).itemsize
+        if (
+            (buffer_info.width, buffer_info.height) != (region.width, region.height)
+            or not buffer_info.address
+            or buffer_info.size < needed
+        ):
+            raise DeviceError(
+                self.name,
+                f"delivered {buffer_info.width} x {buffer_info.height} pixels in {buffer_info.size} bytes for a region of "
+                f"{region.width} x {region.height} in {self._options.pixel_format}",
+            )
+        raw_bytes = (ctypes.c_ubyte * needed).from_address(buffer_info.address)
+        counts = np.ndarray((buffer_info.height, buffer_info.width), kind, buffer=raw_bytes).astype(
+            np.uint16, copy=False
+        )
+        return np.right_shift(counts, np.uint16(self._options.shift)) if self._options.shift else counts
+
+    def _require_connected(self) -> AravisLibrary:
+        if self._library is None:
+            raise NotOpen(self.name, "is not connected; call open() first")
+        return self._library
+
+
+def _read_limits(library: AravisLibrary) -> CameraLimits:
+    """Ask the camera, whose region must be the whole sensor."""
+    sides = ("width", "height", "x_offset", "y_offset")
+    steps = [library.call(f"camera_get_{name}_increment") for name in sides]
+    width, height = (library.get_ints(f"camera_get_{name}_bounds", 2) for name in ("width", "height"))
+    try:
+        gain = ParameterRange(*library.get_float_bounds("gain"), 0.0)
+    except DeviceError as error:
+        log.info("no gain: %s", error)
+        gain = ParameterRange(0.0, 0.0, 0.0)
+    return CameraLimits(
+        ParameterRange(width[0], width[1], steps[0]),
+        ParameterRange(height[0], height[1], steps[1]),
+        steps[2],
+        steps[3],
+        ParameterRange(*library.get_float_bounds("exposure_time"), 0.0),
+        gain,
+    )

@@ -1,0 +1,428 @@
+"""Driver ``asm``: an adaptive secondary mirror behind a TCP link, and the check of its configuration."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_drivers.asm import messages as m
+from escape_drivers.asm.codec import AsmCodec
+from escape_drivers.asm.link import AsmLink, RequestRefused
+from escape_drivers.asm.messages import Welcome
+from escape_drivers.asm.options import EMULATOR, OPTION_RANGES, AsmOptions
+from escape_drivers.common.options import parse_options, require_in_range, require_serial
+from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
+from escape_hw.api.emulator import Emulator, EmulatorRequest
+from escape_hw.api.mirror import DMInfo
+from escape_hw.config.registry import emulator_factory
+from escape_hw.errors import DeviceError, SettingRejected
+
+if TYPE_CHECKING:
+    from escape_hw.config.devices import MirrorConfig
+    from escape_hw.config.system import SystemConfig
+
+
+#: Head-room for the mirror's limits, which come as single-precision numbers.
+_ROUNDING = 1e-6
+
+
+def require_identity(name: str, section: MirrorConfig, welcome: Welcome) -> None:
+    """Require the mirror that was meant; who only looks needs no more.
+
+    Raises
+    ------
+    DeviceError
+        It is another mirror.
+    """
+    if welcome.last_command_m.size != section.n_act:
+        raise DeviceError(
+            name,
+            f"has {welcome.last_command_m.size} actuators, devices.{name}.layout = '{section.layout}' has "
+            f"{section.n_act}; correct the layout or the address",
+        )
+    if section.serial and section.serial != welcome.serial:
+        raise DeviceError(
+            name,
+            f"is {welcome.serial!r}, not {section.serial!r}; correct devices.{name}.serial or the address",
+        )
+
+
+def require_compatible(name: str, section: MirrorConfig, welcome: Welcome) -> tuple[int, ...]:
+    """Require the mirror that was meant, and limits of ours that lie within its own.
+
+    Parameters
+    ----------
+    name
+        The device's.
+    section
+        Its configuration.
+    welcome
+        What the mirror says.
+
+    Returns
+    -------
+    tuple of int
+        Configured actuators to be taken out of service that still are in service; empty: none.
+
+    Raises
+    ------
+    DeviceError
+        It is another mirror.
+    SettingRejected
+        A limit of ours exceeds the mirror's, or actuators are out of service that the configuration
+        counts on.
+    """
+    require_identity(name, section, welcome)
+    limits, stroke = section.limits, section.stroke_m
+    slew = limits.max_slew if limits.max_slew is not None else 2 * limits.max_stroke
+    for key, configured, reported in (
+        ("max_stroke", limits.max_stroke, welcome.max_command_m / stroke),
+        ("max_slew", slew, welcome.max_step_m / stroke),
+    ):
+        if configured > reported * (1 + _ROUNDING):
+            raise SettingRejected(
+                name,
+                f"devices.{name}.limits.{key} is {configured:g}; the mirror itself skips commands beyond "
+                f"{reported:.4g}: set it to that or less",
+            )
+    unexpected = sorted(set(welcome.disabled) - set(limits.disabled))
+    if unexpected:
+        all_disabled = sorted({*welcome.disabled, *limits.disabled})
+        raise SettingRejected(
+            name,
+            f"actuators {unexpected} are out of service that the configuration counts on; put this into "
+            f"[devices.{name}.limits]: disabled = {all_disabled}",
+        )
+    return () if set(limits.disabled) == set(welcome.disabled) else limits.disabled
+
+
+log = logging.getLogger(__name__)
+
+#: Pause between two looks at a step that is on its way, seconds.
+_STEP_POLL_S = 0.02
+
+
+def make_asm(name: str, config: SystemConfig, shared: dict[str, object]) -> AsmMirror:
+    """Entry point ``asm``.
+
+    Raises
+    ------
+    ConfigError
+        No serial number, or an option is wrong.
+    """
+    section = config.devices.dm
+    require_serial(name, section)
+    options = parse_options(AsmOptions, name, section)
+    require_in_range(name, options, OPTION_RANGES)
+    emulator = None
+    if options.host == EMULATOR:
+        emulator = emulator_factory("asm")(EmulatorRequest(port=0, shared=shared, config=config))
+    return AsmMirror(name, section, options, emulator=emulator)
+
+
+class AsmMirror(AdaptiveSecondary):
+    """An adaptive secondary behind ESCAPE's own link, or behind another by another codec.
+
+    Every command is acknowledged with measured positions before the next one leaves: nothing queues.
+    While nothing else is sent a thread gives signs of life, so that the mirror's watchdog knows that
+    somebody is there. A link that breaks is reported by the call that meets it and got back in the
+    background; nothing is sent again by itself, the mirror stays in the state it is in.
+
+    Parameters
+    ----------
+    name
+        Of the device.
+    section
+        Geometry, limits and serial number.
+    options
+        Of the link.
+    make_codec
+        Makes the codec of a connection; the observatory's own goes here.
+    emulator
+        Started before and stopped after, instead of the configured address.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        section: MirrorConfig,
+        options: AsmOptions,
+        *,
+        make_codec: Callable[[], m.Codec] = AsmCodec,
+        emulator: Emulator | None = None,
+    ) -> None:
+        super().__init__(name, section.limits.to_limits(), lift=options.lift)
+        self._section, self._options, self._make_codec = section, options, make_codec
+        self._emulator = emulator
+        self._link = self._make_link(m.Role.CONTROL)
+        self._info = section.info("adaptive secondary over TCP", simulated=False)
+        self._metres = np.empty(section.n_act)
+        self._stop = threading.Event()
+        self._heartbeat_thread: threading.Thread | None = None
+        self._ack: m.Ack | None = None
+        self._last_state, self._fault_text = ShellState.OFF, ""
+        self._initial_shape: NDArray[np.float64] | None = None
+        self._last_attempt_s = 0.0
+        self._last_warning = ""
+        self._consecutive_skips = self._skipped = 0
+
+    # ------------------------------------------------------------------ identity
+    @property
+    def info(self) -> DMInfo:
+        """Identity and geometry."""
+        return self._info
+
+    @property
+    def last_ack(self) -> m.Ack | None:
+        """The last acknowledgement: result, times on the mirror's clock, measured positions in metres."""
+        return self._ack
+
+    def parameter(self, key: str) -> float:
+        """One of the mirror's own parameters, such as ``telemetry_hz``.
+
+        Raises
+        ------
+        NotOpen, DeviceError
+            Not connected, or the mirror knows no such parameter.
+        """
+        return self._parameter(m.GetParam(key))
+
+    def set_parameter(self, key: str, value: float) -> float:
+        """Set one of the mirror's own parameters; returns the value in force.
+
+        Raises
+        ------
+        NotOpen, DeviceError
+            Not connected, or the mirror refused the name or the value.
+        """
+        return self._parameter(m.SetParam(key, value))
+
+    def _parameter(self, request: m.GetParam | m.SetParam) -> float:
+        self.require_open()
+        with self._lock:
+            return self._link.request(request, m.Param).value
+
+    # ------------------------------------------------------------------ connection
+    def _make_link(self, role: m.Role) -> AsmLink:
+        o = self._options
+        return AsmLink(
+            self.name, (o.host, o.port), role, self._make_codec,
+            connect_s=o.connect_s, reply_s=o.reply_s, on_unsolicited=self._on_unsolicited,
+        )  # fmt: skip
+
+    def _open(self) -> None:
+        self._link.address = self._start_address()
+        self._apply_welcome(self._link.connect())
+        self._stop.clear()
+        self._heartbeat_thread = threading.Thread(
+            target=self._run_heartbeat, name=f"{self.name} heartbeat", daemon=True
+        )
+        self._heartbeat_thread.start()
+
+    def _apply_welcome(self, welcome: m.Welcome) -> None:
+        """Take over what the mirror says of itself when a connection begins."""
+        disabled = require_compatible(self.name, self._section, welcome)
+        self._update_info(welcome)
+        if disabled:
+            self._link.request(m.SetDisabled(disabled, "devices.dm.limits.disabled"), m.Done)
+        self._last_state, self._consecutive_skips = welcome.state, 0
+        is_floating = welcome.state in (ShellState.SET, ShellState.RUNNING)
+        self._initial_shape = (
+            welcome.last_command_m.astype(np.float64) / self._section.stroke_m if is_floating else None
+        )
+
+    def _update_info(self, welcome: m.Welcome) -> None:
+        model = f"adaptive secondary over TCP, protocol {welcome.version}{', emulated' * welcome.simulated}"
+        self._info = self._section.info(model, simulated=welcome.simulated, serial=welcome.serial)
+
+    def _close(self) -> None:
+        self._stop.set()
+        if self._heartbeat_thread is not None:
+            self._heartbeat_thread.join()
+            self._heartbeat_thread = None
+        self._link.disconnect("it was closed")
+        if self._emulator is not None:
+            self._emulator.stop()
+
+    def _release_after_failed_open(self) -> None:
+        self._close()
+
+    def _present_shape(self) -> NDArray[np.float64] | None:
+        return self._initial_shape
+
+    # ------------------------------------------------------------------ signs of life
+    def _run_heartbeat(self) -> None:
+        """Give a sign of life whenever nothing else was said for a while; get a lost link back."""
+        pause = self._options.heartbeat_s
+        while not self._stop.wait(pause / 4):
+            if self._link.is_up and time.monotonic() - self._link.last_reply_s < pause:
+                continue
+            # Whoever holds the lock is talking to the mirror, which is a sign of life as well.
+            if self._lock.acquire(blocking=False):
+                try:
+                    self._send_heartbeat()
+                finally:
+                    self._lock.release()
+
+    def _send_heartbeat(self) -> None:
+        before = self._last_state
+        try:
+            if self._link.is_up:
+                self._ask_state()
+            elif self.is_open and time.monotonic() > self._retry_at_s():
+                self._reconnect()
+        except DeviceError as error:
+            # Nobody is there to raise it to; the next call meets it, too.
+            if str(error) != self._last_warning:
+                log.warning("%s", error)
+            self._last_warning = str(error)
+        else:
+            self._last_warning = ""
+            if self._last_state is not before:
+                log.warning(
+                    "%s: went from %s to %s by itself %s",
+                    self.name,
+                    before,
+                    self._last_state,
+                    self._fault_text,
+                )
+
+    def _retry_at_s(self) -> float:
+        """When a lost connection is tried again, on this computer's monotonic clock."""
+        return max(self._last_attempt_s, self._link.last_reply_s) + self._options.retry_s
+
+    def _reconnect(self) -> None:
+        """Get a lost connection back; the mirror stays as it is, nothing is sent again."""
+        self._last_attempt_s = time.monotonic()
+        welcome = self._link.connect()
+        try:
+            self._apply_welcome(welcome)
+        except DeviceError as error:
+            self._link.disconnect(f"it came back, but {error.args[1]}")
+            raise
+        # What became of the last command before the link broke is not known; its shape is.
+        self._guard_when_open().reset(self._initial_shape)
+        log.warning(
+            "%s: the link is back; the mirror is %s, nothing was sent again", self.name, self._last_state
+        )
+
+    def _on_unsolicited(self, message: m.Reply) -> None:
+        if isinstance(message, m.FaultReport):
+            self._last_state, self._fault_text = message.state, message.text
+            log.error("%s: fault: %s", self.name, message.text)
+
+    # ------------------------------------------------------------------ questions
+    def _ask_state(self) -> ShellState:
+        with self._lock:
+            return self._record_ack(self._link.request(m.Heartbeat(), m.Ack))
+
+    def _record_ack(self, ack: m.Ack) -> ShellState:
+        if ack.positions.size != self._metres.size:
+            raise DeviceError(
+                self.name, f"reported {ack.positions.size} positions for {self._metres.size} actuators"
+            )
+        self._ack, self._last_state = ack, ack.state
+        return ack.state
+
+    def _state(self) -> ShellState:
+        return self._ask_state()
+
+    def _known_state(self) -> ShellState:
+        return self._last_state
+
+    def _measure_positions(self) -> NDArray[np.float64]:
+        with self._lock:
+            ack = self._link.request(m.Heartbeat(), m.Ack)
+            self._record_ack(ack)
+        return ack.positions.astype(np.float64) / self._section.stroke_m
+
+    def _health(self) -> ShellHealth:
+        with self._lock:
+            return _to_shell_health(self._link.request(m.GetHealth(), m.HealthReport))
+
+    def _observe_health(self) -> ShellHealth:
+        link = self._make_link(m.Role.TELEMETRY)
+        link.address = self._start_address()
+        try:
+            welcome = link.connect()
+            require_identity(self.name, self._section, welcome)
+            self._update_info(welcome)
+            return _to_shell_health(link.request(m.GetHealth(), m.HealthReport))
+        finally:
+            link.disconnect("it was only looked at")
+            if self._emulator is not None:
+                self._emulator.stop()
+
+    def _start_address(self) -> tuple[str, int]:
+        """Where to connect; starts the emulator if there is one."""
+        if self._emulator is None:
+            return self._options.host, self._options.port
+        host, _, port = self._emulator.start().removeprefix("tcp ").rpartition(":")
+        return host, int(port)
+
+    # ------------------------------------------------------------------ what moves
+    def _step(self, state: ShellState) -> None:
+        if state is ShellState.SET:
+            self._consecutive_skips = 0
+        self._link.request(m.SetState(state), m.Done)
+        deadline = time.monotonic() + self._options.step_s
+        while (now := self._ask_state()) is not state and now is not ShellState.FAULT:
+            if time.monotonic() > deadline:
+                raise DeviceError(
+                    self.name, f"is {now} and not {state} after {self._options.step_s:g} s; see its health"
+                )
+            time.sleep(_STEP_POLL_S)
+
+    def _recover(self) -> None:
+        self._link.request(m.Recover(), m.Done)
+        self._fault_text = ""
+
+    def _send_to_shell(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        np.multiply(command, self._section.stroke_m, out=self._metres)
+        try:
+            ack = self._link.command(self._metres)
+        except RequestRefused as refusal:
+            raise self._device_error_for(refusal) from refusal
+        self._record_ack(ack)
+        if ack.result is m.Result.APPLIED:
+            self._consecutive_skips = 0
+            return None
+        if ack.result is not m.Result.SKIPPED:
+            raise DeviceError(
+                self.name,
+                f"changed a command ({ack.result.name.lower()}, {ack.clipped} actuators): some went out of "
+                "service, or its limits became tighter; open it again, which says what to configure",
+            )
+        self._skipped += 1
+        self._consecutive_skips += 1
+        if self._consecutive_skips >= self._options.max_skips:
+            raise DeviceError(
+                self.name,
+                f"skipped {self._consecutive_skips} commands in a row and kept its last shape; they exceed "
+                f"limits of its own: lower max_slew in devices.{self.name}.limits, and see its health",
+            )
+        return self._guard_when_open().last
+
+    def _device_error_for(self, refusal: RequestRefused) -> DeviceError:
+        """The error for a refused command, in the words of every adaptive secondary."""
+        nak = refusal.nak
+        self._last_state = nak.state
+        if nak.code is m.Result.PANIC:
+            self._fault_text = nak.text
+            return self._fault_error(nak.text)
+        if nak.code is m.Result.WRONG_STATE:
+            return self._not_running_error(nak.state, f" ({nak.text})")
+        return refusal
+
+
+def _to_shell_health(health: m.HealthReport) -> ShellHealth:
+    return ShellHealth(
+        health.time_ns, health.state, health.gap_m, health.current_a, health.temperature_c, health.skipped,
+        health.fault, health.contaminated, health.owner,
+    )  # fmt: skip

@@ -1,0 +1,289 @@
+"""Base class of cameras read through a blocking library call, with frame counter and camera clock."""
+
+from __future__ import annotations
+
+import abc
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_drivers.common.camera_limits import TOLERANCE, CameraLimits
+from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
+from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
+
+if TYPE_CHECKING:
+    from escape_hw.config.devices import CameraConfig
+
+
+class FrameCounter:
+    """Makes a rising index of a device's counter that starts over.
+
+    Parameters
+    ----------
+    first, last
+        After ``last`` comes ``first`` again (a 32-bit counter: 0 and 2**32 - 1; GigE Vision's short block
+        identifiers: 1 and 65535). A device whose numbers go beyond ``last`` never starts over.
+    """
+
+    def __init__(self, first: int, last: int) -> None:
+        self._last, self._period = last, last - first + 1
+        self._last_number = 0
+        self._wraps = 0
+
+    def index(self, number: int) -> int:
+        """The index of a number; one that fell by less than half a turn has not started over, and falls."""
+        newest, self._last_number = self._last_number, number
+        if newest - number > self._period // 2 and newest <= self._last:
+            self._wraps += 1
+        return number + self._wraps * self._period
+
+
+class CameraClock:
+    """Puts a camera's own time stamps on this computer's monotonic clock.
+
+    Spacing comes from the camera, which knows when it exposed. The offset is that of the frame that came
+    through quickest so far, counted from ``start``: so no frame is said to be exposed after it arrived.
+    """
+
+    def __init__(self) -> None:
+        self._offset: int | None = None
+
+    def exposed_ns(self, stamp_ns: int, arrived_ns: int) -> int:
+        """When a frame was exposed.
+
+        Parameters
+        ----------
+        stamp_ns
+            The camera's time stamp; 0: it gives none.
+        arrived_ns
+            Monotonic time of its arrival.
+        """
+        if stamp_ns == 0:
+            return arrived_ns
+        offset = arrived_ns - stamp_ns
+        if self._offset is None or offset < self._offset:
+            self._offset = offset
+        return stamp_ns + self._offset
+
+
+log = logging.getLogger(__name__)
+
+#: Longest wait inside a library; ``stop`` and ``close`` come through this soon, whatever the time-out.
+MAX_WAIT_MS = 50
+
+
+class BlockingCamera(Camera):
+    """A camera read through a blocking call, which is made in short slices.
+
+    Drivers fill in ``_start_acquisition``, ``_stop_acquisition``, ``_read_frame`` and ``_disconnect`` in place of ``_start``, ``_stop``,
+    ``_next_frame`` and ``_close``; none of them runs while another does.
+
+    Parameters
+    ----------
+    name
+        Key in ``[devices]``.
+    section
+        Serial number, sensor, region, exposure and rate to begin with.
+    kind
+        What kind of camera it is, until it tells.
+    counter
+        First and last number of its frame counter.
+    """
+
+    def __init__(self, name: str, section: CameraConfig, kind: str, counter: tuple[int, int]) -> None:
+        super().__init__(name)
+        self._section, self._settings = section, section.settings()
+        self._info = self._build_info(kind, stand_in=False)
+        self._full_scale = np.uint16(self._info.full_scale)
+        self._saturation_mask = np.empty((0, 0), np.bool_)
+        self._limits: CameraLimits | None = None
+        self._min_rate_hz, self._max_rate_hz = 0.0, math.inf
+        self._read_lock = threading.Lock()
+        self._stop_requested, self._acquiring = True, False
+        self._counter_range = counter
+        self._counter, self._clock = FrameCounter(*counter), CameraClock()
+
+    @property
+    def info(self) -> CameraInfo:
+        """Identity and fixed properties."""
+        return self._info
+
+    @property
+    def settings(self) -> CameraSettings:
+        """The settings in force, as read back from the camera."""
+        return self._settings
+
+    @abc.abstractmethod
+    def _apply_settings(self, want: CameraSettings) -> CameraSettings:
+        """Set the camera as ``_check`` found possible; read back what it made of it.
+
+        It calls ``_require_rate`` on the way. Limits of a camera depend on the order of setting them.
+        """
+
+    @abc.abstractmethod
+    def _start_acquisition(self) -> None:
+        """Start acquisition."""
+
+    @abc.abstractmethod
+    def _stop_acquisition(self) -> None:
+        """Stop acquisition of a camera that acquires."""
+
+    @abc.abstractmethod
+    def _read_frame(self, wait_ms: int) -> Frame | None:
+        """A frame, or ``None`` when there is none after so many milliseconds (0: at once)."""
+
+    @abc.abstractmethod
+    def _disconnect(self) -> None:
+        """Give the camera back, if it is connected."""
+
+    def _build_info(self, model: str, stand_in: bool) -> CameraInfo:
+        section = self._section
+        named = f"{model} (stand-in)" if stand_in else model
+        sensor = section.sensor_px[::-1]
+        return CameraInfo(named, section.serial, sensor, section.bit_depth, simulated=stand_in)
+
+    def _require_sensor(self, found: tuple[int, int], alternative: str) -> None:
+        """Refuse a camera whose sensor is not the configured one (width, height)."""
+        stated = self._section.sensor_px
+        if found != stated:
+            raise DeviceError(
+                self.name,
+                f"is read out as {found[0]} x {found[1]} pixels, but sensor_px says {stated[0]} x "
+                f"{stated[1]}; correct sensor_px {alternative}",
+            )
+
+    def _max_exposure_s(self, want: CameraSettings) -> float:
+        """Longest exposure that fits into a frame."""
+        return 1 / want.frame_rate_hz
+
+    def _require_limits(self) -> CameraLimits:
+        if self._limits is None:
+            raise NotOpen(self.name, "is not connected; call open() first")
+        return self._limits
+
+    def _check(self, want: CameraSettings) -> CameraSettings:
+        answer = self._require_limits().nearest_valid(self.name, want, self._max_exposure_s(want))
+        now = self._settings
+        # The camera tells its rates for the region and exposure it has; others are found out by trying.
+        if answer.region == now.region and answer.exposure_s >= now.exposure_s:
+            self._require_rate(answer)
+        return answer
+
+    def _require_rate(self, want: CameraSettings) -> None:
+        """Refuse a rate outside the limits that the camera tells at present."""
+        slowest, fastest = self._min_rate_hz, self._max_rate_hz
+        if want.frame_rate_hz > fastest * (1 + TOLERANCE):
+            raise SettingRejected(
+                self.name,
+                f"frame_rate_hz is {want.frame_rate_hz:g}; {want.region.height} rows and an exposure of "
+                f"{want.exposure_s:g} s allow at most {fastest:.1f}",
+            )
+        if want.frame_rate_hz < slowest * (1 - TOLERANCE):
+            raise SettingRejected(
+                self.name,
+                f"frame_rate_hz is {want.frame_rate_hz:g}; the camera goes no slower than {slowest:g}",
+            )
+
+    def _configure(self, settings: CameraSettings) -> None:
+        if self._acquiring:
+            raise DeviceError(
+                self.name, "could not be stopped, and keeps its settings; close and open it again"
+            )
+        before = self._settings
+        try:
+            self._settings = self._apply_settings(settings)
+        except DeviceLost:
+            raise
+        except DeviceError as error:
+            self._clean_up(lambda: self._restore_settings(before), error)
+            raise
+
+    def _restore_settings(self, before: CameraSettings) -> None:
+        self._settings = self._apply_settings(before)
+
+    def _timeout_hint(self) -> str:
+        """What to check when no frame comes."""
+        return f"cable, the exposure ({self.settings.exposure_s:g} s)"
+
+    def _start(self) -> None:
+        with self._read_lock:
+            if self._acquiring:
+                return
+            self._counter, self._clock = FrameCounter(*self._counter_range), CameraClock()
+            self._start_acquisition()
+            self._stop_requested, self._acquiring = False, True
+
+    def _stop(self) -> None:
+        self._stop_requested = True
+        with self._read_lock:
+            self._stop_if_acquiring()
+
+    def _close(self) -> None:
+        self._stop_requested = True
+        with self._read_lock:
+            # A reader that came in after stop() may have started it again.
+            self._stop_if_acquiring()
+            self._acquiring = False
+            self._disconnect()
+            self._limits = None
+            self._min_rate_hz, self._max_rate_hz = 0.0, math.inf
+
+    def _release_after_failed_open(self) -> None:
+        self._close()
+
+    def _stop_if_acquiring(self) -> None:
+        if self._acquiring:
+            self._acquiring = not self._attempt(self._stop_acquisition)
+
+    def _attempt(self, step: Callable[[], None]) -> bool:
+        """Take a step of stopping or closing, which a camera that has gone cannot; false when it failed."""
+        try:
+            step()
+        except DeviceError as error:
+            log.warning("while stopping or closing: %s", error)
+            return False
+        return True
+
+    def _next_frame(self, timeout_s: float) -> Frame:
+        deadline = time.monotonic() + timeout_s
+        left_s = timeout_s
+        while left_s > 0:
+            frame = self._read_frame_locked(min(MAX_WAIT_MS, math.ceil(left_s * 1e3)))
+            if frame is not None:
+                return frame
+            left_s = deadline - time.monotonic()
+        raise FrameTimeout(
+            self.name,
+            f"no frame within {timeout_s:g} s; check {self._timeout_hint()}, or allow a longer timeout",
+        )
+
+    def _poll(self) -> Frame | None:
+        return self._read_frame_locked(0)
+
+    def _read_frame_locked(self, wait_ms: int) -> Frame | None:
+        with self._read_lock:
+            if self._stop_requested:
+                raise NotOpen(self.name, "was stopped or closed while a frame was awaited")
+            return self._read_frame(wait_ms)
+
+    def _make_frame(self, view: NDArray[np.uint16], number: int, stamp_ns: int) -> Frame:
+        """Copy a frame out of the library's buffer, which is overwritten as soon as the lock goes."""
+        arrived_ns = time.monotonic_ns()
+        data = view.copy()
+        data.flags.writeable = False
+        # Frames with no saturated pixel are the rule, and the maximum is quicker than counting.
+        saturated = self._count_saturated(data) if data.max() >= self._full_scale else 0
+        exposed_ns = self._clock.exposed_ns(stamp_ns, arrived_ns)
+        return Frame(data, self._counter.index(number), exposed_ns, arrived_ns, saturated)
+
+    def _count_saturated(self, data: NDArray[np.uint16]) -> int:
+        """Number of pixels at the top of the scale."""
+        if self._saturation_mask.shape != data.shape:
+            self._saturation_mask = np.empty(data.shape, np.bool_)
+        return int(np.count_nonzero(np.equal(data, self._full_scale, out=self._saturation_mask)))

@@ -1,0 +1,91 @@
+"""What a camera can be set to: its limits and increments, and the nearest it can do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from escape_hw.api.camera import CameraSettings, Region
+from escape_hw.errors import SettingRejected
+
+#: The library's floats have 24 bits; so much and more is rounding.
+TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterRange:
+    """Smallest and largest value and increment of a parameter; 0: none."""
+
+    low: float
+    high: float
+    step: float
+
+    def nearest_valid(self, value: float) -> float:
+        """The value on the grid of increments, within the limits; its own answer is a fixed point."""
+        return (
+            self._value_at_step(round((value - self.low) / self.step)) if self.step > 0 else self._clip(value)
+        )
+
+    def round_down(self, value: float) -> float:
+        """The largest value on the grid that does not exceed ``value``, within the limits."""
+        return self._value_at_step(self._n_steps(value)) if self.step > 0 else self._clip(value)
+
+    def _clip(self, value: float) -> float:
+        return min(max(value, self.low), self.high)
+
+    def _n_steps(self, value: float) -> int:
+        """Whole increments from the smallest value; a rounding error short of the next one counts as it."""
+        return math.floor((value - self.low) / self.step + 1e-6)
+
+    def _value_at_step(self, steps: int) -> float:
+        return self.low + min(max(steps, 0), self._n_steps(self.high)) * self.step
+
+
+@dataclass(frozen=True, slots=True)
+class CameraLimits:
+    """Limits of one camera as set up; exposure in microseconds, gain in decibels."""
+
+    width: ParameterRange
+    height: ParameterRange
+    x_step: int
+    y_step: int
+    exposure: ParameterRange
+    gain: ParameterRange
+
+    def nearest_valid(self, device: str, want: CameraSettings, max_exposure_s: float) -> CameraSettings:
+        """The nearest settings, but for the frame rate; exposures are no longer than ``max_exposure_s``.
+
+        Raises
+        ------
+        SettingRejected
+            The gain is outside its limits.
+        """
+        region, gain = self.region(want.region), self.gain_db(device, want.gain_db)
+        return CameraSettings(
+            region, self.exposure_s(want.exposure_s, max_exposure_s), want.frame_rate_hz, gain
+        )
+
+    def region(self, want: Region) -> Region:
+        """The largest region on the sensor's increments that is within the one asked for, where possible."""
+        width, height = round(self.width.round_down(want.width)), round(self.height.round_down(want.height))
+        x = min(want.x, round(self.width.high) - width)
+        y = min(want.y, round(self.height.high) - height)
+        return Region(x - x % max(1, self.x_step), y - y % max(1, self.y_step), width, height)
+
+    def exposure_s(self, want_s: float, max_exposure_s: float) -> float:
+        """Exposure time that fits into a frame."""
+        us = self.exposure.nearest_valid(want_s * 1e6)
+        return (us if us <= max_exposure_s * 1e6 else self.exposure.round_down(max_exposure_s * 1e6)) * 1e-6
+
+    def gain_db(self, device: str, want_db: float) -> float:
+        """Gain on its increments.
+
+        Raises
+        ------
+        SettingRejected
+            Outside its limits.
+        """
+        low, high = self.gain.low, self.gain.high
+        if not low - TOLERANCE <= want_db <= high + TOLERANCE:
+            raise SettingRejected(device, f"gain_db is {want_db:g}; it must lie in {low:g}..{high:g}")
+        return self.gain.nearest_valid(want_db)

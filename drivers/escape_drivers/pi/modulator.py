@@ -1,0 +1,314 @@
+"""Driver ``pi-e727``: PI's E-727 controller with an S-330 tip-tilt platform, for a modulated pyramid; start-up and shut-down sequence."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from escape_drivers.pi.circle import AxisResponse, CircleGenerator
+from escape_drivers.pi.controller import E727
+from escape_drivers.pi.gcs import MalformedReply
+from escape_drivers.pi.link import GcsLink
+from escape_drivers.pi.transports import Transport, make_transport
+from escape_drivers.pi.travel import AxisTravel, read_travel
+from escape_hw.api.modulator import Modulation, ModulatorInfo, ModulatorStatus, TipTiltModulator
+from escape_hw.errors import ConfigError, DeviceError, DeviceLost
+
+if TYPE_CHECKING:
+    from escape_hw.config.devices import ModulatorConfig, StageConfig
+    from escape_hw.config.system import SystemConfig
+
+
+log = logging.getLogger(__name__)
+
+#: How often auto-zero is asked whether it has ended, in seconds.
+_POLL_S = 0.05
+
+
+def start_up(
+    name: str, controller: E727, stage: StageConfig, travel: AxisTravel, sleep: Callable[[float], None]
+) -> None:
+    """Generators stopped, servos off, auto-zero, no volts, servos on, centre (order of those who use it).
+
+    A servo is never switched on before auto-zero: its sensor would be off by an unknown amount. Where
+    auto-zero was done and the servos are on, nothing but the generators and the centre is touched.
+
+    Raises
+    ------
+    DeviceError
+        Refused, not in time, or not at the centre in the end.
+    """
+    if any(controller.running()):
+        log.warning("%s: was turning when it was opened; stopped", name)
+        controller.stop()
+    controller.clear_trigger()
+    zero = stage.auto_zero == "always" or (stage.auto_zero == "needed" and not all(controller.auto_zeroed()))
+    if zero or not all(controller.servo_states()):
+        controller.set_servo(False)
+        if not zero and not all(controller.auto_zeroed()):
+            log.warning("%s: servos on without auto-zero, as configured: places may be off", name)
+        if zero:
+            _auto_zero(name, controller, stage, sleep)
+        controller.set_volts(0.0)
+        controller.set_servo(True)
+    controller.move_and_wait(travel.centre, stage.settle_s, sleep)
+
+
+def shut_down(controller: E727) -> None:
+    """Servos off, no volts; the stage has been stopped and centred before."""
+    controller.set_servo(False)
+    controller.set_volts(0.0)
+
+
+def _auto_zero(name: str, controller: E727, stage: StageConfig, sleep: Callable[[float], None]) -> None:
+    """One axis after the other, each until it is done."""
+    for number, axis in enumerate(stage.axes):
+        log.warning("%s: auto-zero of axis %s sweeps its full range", name, axis)
+        controller.start_auto_zero(axis, stage.auto_zero_v)
+        deadline = time.monotonic() + stage.auto_zero_s
+        while not controller.auto_zeroed()[number]:
+            # A failure shows in the pending error only, which the next command would trip over.
+            controller.check_error(f"ATZ {axis}")
+            if time.monotonic() > deadline:
+                raise DeviceError(
+                    name,
+                    f"auto-zero of axis {axis} has not ended after {stage.auto_zero_s:g} s; is the "
+                    "platform free to move, its cable plugged in? The longest wait is "
+                    "devices.modulator.stage.auto_zero_s",
+                )
+            sleep(_POLL_S)
+
+
+#: What becomes of a stage that nobody can reach.
+_UNREACHABLE_NOTE = (
+    "the stage goes on as it was; opening it again stops and centres it, cutting its power lets it go"
+)
+
+
+def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> PiModulator:
+    """Entry point ``pi-e727``.
+
+    Raises
+    ------
+    ConfigError
+        The system has no modulator.
+    """
+    section = config.devices.modulator
+    if section is None:
+        raise ConfigError(f"system {config.system.name!r} has no [devices.modulator] section")
+    return PiModulator(name, section, lambda: make_transport(section, config, shared))
+
+
+class _Connection:
+    """What there is while the controller is connected."""
+
+    def __init__(
+        self, controller: E727, travel: AxisTravel, circle_generator: CircleGenerator, info: ModulatorInfo
+    ) -> None:
+        self.controller, self.travel, self.circle_generator, self.info = (
+            controller,
+            travel,
+            circle_generator,
+            info,
+        )
+
+
+class PiModulator(TipTiltModulator):
+    """The stage, driven in the order that its maker and users give.
+
+    Opening: generators stopped, servos off, auto-zero, no volts, servos on, centre. Closing: generators
+    stopped, centre, servos off, no volts. A turning circle is measured with the controller's recorder
+    and made round; both axes start in the same servo cycle.
+
+    When the link is lost the stage goes on as it was, for nobody can reach it: every call says so at
+    once, and opening anew stops and centres it.
+
+    Parameters
+    ----------
+    name
+        In messages.
+    section
+        Configuration.
+    connect
+        Makes the wire.
+    sleep
+        Waits.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        section: ModulatorConfig,
+        connect: Callable[[], Transport],
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        super().__init__(name)
+        self._section, self._connect, self._sleep = section, connect, sleep
+        self._connection: _Connection | None = None
+        self._modulation: Modulation | None = None
+        #: Survives closing: the mirror on the stage stays the same.
+        self._responses: dict[int, AxisResponse] = {}
+
+    @property
+    def info(self) -> ModulatorInfo:
+        """Identity and reach, as the controller tells them."""
+        return self._require_connection().info
+
+    @property
+    def modulation(self) -> Modulation | None:
+        """The modulation in force; the controller is asked whether it still turns."""
+        if self._connection is None:
+            return None
+        # Nobody knows what a stage does that has been lost.
+        self._connection.controller.link.require_connected()
+        if self._modulation is None:
+            return None
+        with self._translate_errors():
+            if all(self._connection.controller.running()):
+                return self._modulation
+        log.warning("%s: no longer turns; somebody or something else stopped it", self.name)
+        self._modulation = None
+        return None
+
+    # ------------------------------------------------------------------ opening and closing
+    def _open(self) -> None:
+        with self._open_connection() as connection:
+            try:
+                start_up(
+                    self.name, connection.controller, self._section.stage, connection.travel, self._sleep
+                )
+            except BaseException as failure:
+                self._clean_up(lambda: self._abort_start_up(connection.controller), failure)
+                raise
+        self._connection = connection
+
+    @contextmanager
+    def _open_connection(self) -> Iterator[_Connection]:
+        """Connect and learn what is there; moves nothing. Hangs up again when that, or the body, fails."""
+        link = GcsLink(self.name, self._connect(), self._section.wire.timeout_s)
+        try:
+            link.open()
+            controller = E727(link, self._section.stage.axes)
+            with self._translate_errors():
+                travel = read_travel(self.name, controller, self._section)
+                model = f"PI {controller.model} with {controller.stage_names()[0]}"
+                circle_generator = CircleGenerator(
+                    self.name, controller, self._section.stage, travel, self._responses, self._sleep
+                )
+                reach = min(travel.reach_rad, self._section.max_tilt_rad)
+                info = ModulatorInfo(model, controller.serial, reach, "emulated" in link.identity)
+                yield _Connection(controller, travel, circle_generator, info)
+        except BaseException:
+            link.close()
+            raise
+
+    def _close(self) -> None:
+        connection, self._connection, self._modulation = self._connection, None, None
+        if connection is None:
+            return
+        try:
+            self._switch_off(connection.controller)
+        finally:
+            connection.controller.link.close()
+
+    def _abort_start_up(self, controller: E727) -> None:
+        """Stop whatever a start-up had begun, then switch off."""
+        if controller.link.is_alive:
+            controller.stop_all()
+        self._switch_off(controller)
+
+    def _switch_off(self, controller: E727) -> None:
+        """Servos off and no volts, unless the link has been lost before, which was told then."""
+        if controller.link.is_alive:
+            shut_down(controller)
+
+    # ------------------------------------------------------------------ the hooks
+    def _check(self, want: Modulation) -> Modulation:
+        return self._require_connection().circle_generator.achievable(want)
+
+    def _modulate(self, modulation: Modulation) -> None:
+        connection = self._require_connection()
+        self._modulation = None
+        try:
+            with self._translate_errors():
+                connection.circle_generator.turn(modulation)
+        except DeviceLost as lost:
+            lost.add_note(_UNREACHABLE_NOTE)
+            raise
+        except DeviceError as failure:
+            # A circle that is not the one asked for is worse than none.
+            self._clean_up(self._park, failure)
+            raise
+        self._modulation = modulation
+
+    def _park(self) -> None:
+        connection = self._require_connection()
+        self._modulation = None
+        try:
+            with self._translate_errors():
+                connection.circle_generator.stop()
+                connection.controller.move_and_wait(
+                    connection.travel.centre, self._section.stage.settle_s, self._sleep
+                )
+        except DeviceLost as lost:
+            lost.add_note(_UNREACHABLE_NOTE)
+            raise
+
+    def _status(self) -> ModulatorStatus:
+        with self._translate_errors():
+            return self._read_status(self._require_connection())
+
+    def _status_when_closed(self) -> ModulatorStatus:
+        with self._open_connection() as connection:
+            status = self._read_status(connection)
+        connection.controller.link.close()
+        return status
+
+    def _read_status(self, connection: _Connection) -> ModulatorStatus:
+        controller, travel = connection.controller, connection.travel
+        tilt = travel.tilts(np.array(controller.positions()))
+        modulation = self.modulation or connection.circle_generator.read_modulation()
+        details: dict[str, Any] = {
+            "identity": controller.link.identity,
+            "servo": controller.servo_states(),
+            "auto_zeroed": controller.auto_zeroed(),
+            "travel": {
+                "lower": travel.lower.tolist(),
+                "upper": travel.upper.tolist(),
+                "unit_rad": travel.unit_rad,
+            },
+            "recoveries": controller.link.recoveries,
+            "circle_error": connection.circle_generator.error if self._modulation else None,
+            "corrections": connection.circle_generator.corrections(),
+        }
+        return ModulatorStatus(connection.info, modulation, (float(tilt[0]), float(tilt[1])), details)
+
+    def _release(self) -> bool:
+        if self._section.wire.kind == "emulator":
+            # It ends with the connection.
+            return False
+        connection, self._connection, self._modulation = self._require_connection(), None, None
+        connection.controller.link.close()
+        return True
+
+    # ------------------------------------------------------------------ tools
+    def _require_connection(self) -> _Connection:
+        if self._connection is None:
+            self.require_open()
+            raise DeviceLost(self.name, "not connected; close it and open it again")
+        return self._connection
+
+    @contextmanager
+    def _translate_errors(self) -> Iterator[None]:
+        """What the codec could not make sense of becomes this device's error."""
+        try:
+            yield
+        except MalformedReply as error:
+            raise DeviceError(
+                self.name, f"said something unexpected: {error}; see the bench checklist"
+            ) from error

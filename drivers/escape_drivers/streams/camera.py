@@ -1,0 +1,191 @@
+"""Streams of pyRTC and of milk as cameras."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_drivers.common.camera import BlockingCamera
+from escape_drivers.common.options import camera_section, parse_options
+from escape_drivers.streams.source import Opener, open_milk, open_pyrtc, open_stream, with_stream_serial
+from escape_hw.api.camera import CameraInfo, CameraSettings, Frame
+from escape_hw.errors import DeviceError, DeviceLost, NotOpen
+from escape_hw.io.interchange.stream import Publication, Stream, StreamReadError
+
+if TYPE_CHECKING:
+    from escape_hw.config.devices import CameraConfig
+    from escape_hw.config.system import SystemConfig
+
+#: How long an opening camera watches the stream to learn its rate: frames and seconds, whichever is first.
+_RATE_FRAMES, _RATE_TIMEOUT_S = 40, 1.0
+#: Fewer frames than these tell no rate.
+_MIN_RATE_FRAMES = 5
+_COUNTER_RANGE = (0, 2**63 - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamCameraOptions:
+    """The ``[devices.wfs.options]`` of these drivers.
+
+    Parameters
+    ----------
+    stream
+        Name of the stream.
+    offset
+        Counts added to every pixel, for streams that have had a dark frame subtracted.
+    simulated
+        What fills the stream is a simulator; whatever is made of it says so.
+    """
+
+    stream: str = ""
+    offset: float = 0.0
+    simulated: bool = False
+
+
+def make_pyrtc_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamCamera:
+    """Entry point ``pyrtc-camera``.
+
+    Raises
+    ------
+    ConfigError
+        No such camera, no stream named, or an option that this driver does not know.
+    """
+    return _build(name, config, open_pyrtc, "pyRTC stream")
+
+
+def make_milk_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamCamera:
+    """Entry point ``milk-camera``.
+
+    Raises
+    ------
+    ConfigError
+        No such camera, no stream named, or an option that this driver does not know.
+    """
+    return _build(name, config, open_milk, "milk image")
+
+
+def _build(name: str, config: SystemConfig, opener: Opener, kind: str) -> StreamCamera:
+    section = camera_section(name, config)
+    options = parse_options(StreamCameraOptions, name, section)
+    return StreamCamera(name, with_stream_serial(name, section, options.stream), options, opener, kind)
+
+
+class StreamCamera(BlockingCamera):
+    """A camera whose frames somebody else takes and publishes.
+
+    Its numbers are those of the writes, so a write that was overwritten before it was read is a lost frame.
+    Exposure and gain are stated as configured, for nobody can be asked; the rate is measured on opening,
+    while frames come. A region is cut out of the stream.
+
+    Parameters
+    ----------
+    name
+        Key in ``[devices]``.
+    section
+        Sensor, region and exposure.
+    options
+        Of this driver.
+    opener
+        Opens the stream.
+    kind
+        What kind of stream it is.
+    """
+
+    def __init__(
+        self, name: str, section: CameraConfig, options: StreamCameraOptions, opener: Opener, kind: str
+    ) -> None:
+        super().__init__(name, section, kind, _COUNTER_RANGE)
+        self._options, self._opener, self._kind = options, opener, kind
+        self._info = self._make_info(kind)
+        self._stream: Stream | None = None
+        self._last_count, self._written_ns = 0, 0
+
+    def _make_info(self, kind: str) -> CameraInfo:
+        return replace(self._build_info(kind, stand_in=False), simulated=self._options.simulated)
+
+    def _open(self) -> None:
+        stream = self._stream = open_stream(self.name, self._opener, self._options.stream, write=False)
+        if len(stream.shape) != 2:
+            raise DeviceError(
+                self.name, f"stream '{stream.name}' has shape {stream.shape}; a camera's frames have two axes"
+            )
+        self._require_sensor(stream.shape[::-1], "to the size of the stream")
+        self._info = self._make_info(f"{self._kind} {stream.name}")
+        now = self._section.settings()
+        rate = self._measure_rate(stream) or now.frame_rate_hz
+        self._settings = replace(now, frame_rate_hz=rate, exposure_s=min(now.exposure_s, 1 / rate))
+
+    def _disconnect(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
+
+    def _check(self, want: CameraSettings) -> CameraSettings:
+        """Any region; the rest is somebody else's to set."""
+        return replace(self._settings, region=want.region)
+
+    def _apply_settings(self, want: CameraSettings) -> CameraSettings:
+        return want
+
+    def _start_acquisition(self) -> None:
+        self._last_count, self._written_ns = self._require_connected().count, 0
+
+    def _stop_acquisition(self) -> None:
+        """Nothing to stop: who publishes goes on."""
+
+    def _timeout_hint(self) -> str:
+        return f"who writes the stream '{self._options.stream}'"
+
+    def _read_frame(self, wait_ms: int) -> Frame | None:
+        try:
+            publication = self._require_connected().read_after(self._last_count, wait_ms * 1e-3)
+        except StreamReadError as error:
+            raise DeviceLost(self.name, str(error)) from error
+        if publication is None:
+            return None
+        self._last_count = publication.count
+        return self._make_frame(
+            self._pixel_counts(publication.data), publication.count, self._exposure_stamp_ns(publication)
+        )
+
+    def _pixel_counts(self, data: NDArray[np.generic]) -> NDArray[np.uint16]:
+        """The region of an array as counts; what is below 0 or beyond the scale is cut off."""
+        region = self._settings.region
+        part = data[region.y : region.y + region.height, region.x : region.x + region.width]
+        if part.dtype == np.uint16 and self._options.offset == 0:
+            counts = part.astype(np.uint16, copy=False)
+            return counts if counts.max() <= self._full_scale else np.minimum(counts, self._full_scale)
+        shifted = np.asarray(part, np.float64) + self._options.offset
+        return np.clip(np.rint(shifted), 0, float(self._full_scale)).astype(np.uint16)
+
+    def _exposure_stamp_ns(self, publication: Publication) -> int:
+        """When it was written; 0, for its arrival, where the writer's clock does not advance."""
+        if publication.written_ns <= self._written_ns:
+            return 0
+        self._written_ns = publication.written_ns
+        return publication.written_ns
+
+    def _measure_rate(self, stream: Stream) -> float | None:
+        """Frames per second of the stream, if it is being written."""
+        deadline = time.monotonic() + _RATE_TIMEOUT_S
+        seen, times = stream.count, list[tuple[int, int]]()
+        while len(times) < _RATE_FRAMES and (left := deadline - time.monotonic()) > 0:
+            publication = stream.read_after(seen, left)
+            if publication is not None:
+                seen = publication.count
+                times.append((seen, publication.written_ns or time.time_ns()))
+        if len(times) < _MIN_RATE_FRAMES:
+            return None
+        steps = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(times)]
+        median_period_ns = float(np.median(steps))
+        return 1e9 / median_period_ns if median_period_ns > 0 else None
+
+    def _require_connected(self) -> Stream:
+        if self._stream is None:
+            raise NotOpen(self.name, "is not connected; call open() first")
+        return self._stream

@@ -1,0 +1,64 @@
+"""Where a stream that stands for a device comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from escape_hw.errors import ConfigError, DeviceError, EscapeError
+from escape_hw.io.interchange.milk.stream import MilkStream
+from escape_hw.io.interchange.pyrtc.stream import ShmemStream
+from escape_hw.io.interchange.stream import Stream
+
+if TYPE_CHECKING:
+    from escape_hw.config.devices import DeviceConfig
+
+S = TypeVar("S", bound="DeviceConfig")
+
+#: Opens a stream by its name, for reading or for writing.
+Opener = Callable[[str, bool], Stream]
+
+
+def open_pyrtc(name: str, write: bool) -> Stream:
+    """Open a stream of pyRTC's."""
+    return ShmemStream.open(name, write=write)
+
+
+def open_milk(name: str, write: bool) -> Stream:
+    """Open an image of milk's."""
+    return MilkStream.open(name)
+
+
+def open_stream(device: str, opener: Opener, name: str, *, write: bool) -> Stream:
+    """Open a stream for a device.
+
+    Raises
+    ------
+    DeviceError
+        It cannot be opened, or does not hold numbers.
+    """
+    try:
+        stream = opener(name, write)
+    except EscapeError as error:
+        raise DeviceError(device, str(error)) from error
+    if np.dtype(stream.dtype).kind not in "iuf":
+        stream.close()
+        raise DeviceError(device, f"stream '{name}' holds {stream.dtype}; real numbers are needed")
+    return stream
+
+
+def with_stream_serial(device: str, section: S, stream: str) -> S:
+    """A device section whose serial number, if it has none, says which stream stands for the device.
+
+    Raises
+    ------
+    ConfigError
+        No stream is named.
+    """
+    if not stream.strip():
+        raise ConfigError(
+            f"devices.{device}.options.stream: ''  names no stream that could stand for the device; enter it"
+        )
+    return section if section.serial.strip() else section.model_copy(update={"serial": f"stream {stream}"})

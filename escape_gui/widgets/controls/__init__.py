@@ -1,0 +1,1 @@
+"""Buttons, forms, indicators and readouts."""

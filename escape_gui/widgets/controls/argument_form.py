@@ -1,0 +1,164 @@
+"""The form of a procedure's arguments, made of what the server says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from PySide6.QtCore import QSize, Qt, Signal
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QComboBox,
+    QFormLayout,
+    QFrame,
+    QHBoxLayout,
+    QLabel,
+    QLineEdit,
+    QScrollArea,
+    QSizePolicy,
+    QVBoxLayout,
+    QWidget,
+)
+
+from escape_gui.theme import Theme
+from escape_gui.views import procedure_form as form_text
+from escape_hw.remote.state import Arguments, ProcedureParameter
+
+
+class ArgumentForm(QWidget):
+    """One row for each argument; what may be left out stands empty.
+
+    Parameters
+    ----------
+    theme
+        Colours and fonts.
+    """
+
+    #: Anything was edited.
+    edited = Signal()
+
+    def __init__(self, theme: Theme) -> None:
+        super().__init__()
+        self._theme = theme
+        self._parameters: tuple[ProcedureParameter, ...] = ()
+        self.fields: dict[str, QWidget] = {}
+        self._matrices: tuple[str, ...] = ()
+        self._area = QScrollArea()
+        self._area.setWidgetResizable(True)
+        self._area.setFrameShape(QFrame.Shape.NoFrame)
+        self._area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self._area)
+        # What follows stands right below the last argument; on a small screen the form scrolls.
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
+
+    def sizeHint(self) -> QSize:
+        """As high as its arguments."""
+        parameter_hint, page = super().sizeHint(), self._area.widget()
+        return parameter_hint if page is None else QSize(parameter_hint.width(), page.sizeHint().height())
+
+    def show_parameters(self, parameters: Sequence[ProcedureParameter], matrices: tuple[str, ...]) -> None:
+        """Make the form; arguments stand at their defaults."""
+        self._parameters, self._matrices = tuple(parameters), matrices
+        self.fields = {}
+        page = QWidget()
+        form = QFormLayout(page)
+        form.setContentsMargins(0, 0, 8, 0)
+        form.setVerticalSpacing(4)
+        form.setHorizontalSpacing(8)
+        form.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
+        for one in self._parameters:
+            field = self._make_field(one)
+            field.setToolTip(form_text.parameter_hint(one))
+            field.setAccessibleName(form_text.label(one))
+            field.setAccessibleDescription(form_text.parameter_hint(one))
+            self.fields[one.name] = field
+            row = QHBoxLayout()
+            row.setSpacing(8)
+            row.addWidget(field, 1)
+            if one.unit:
+                unit = QLabel(one.unit)
+                unit.setObjectName("caption")
+                row.addWidget(unit)
+            name = QLabel(form_text.label(one))
+            name.setToolTip(form_text.parameter_hint(one))
+            name.setBuddy(field)
+            form.addRow(name, row)
+        self._area.setWidget(page)
+        self.updateGeometry()
+
+    def set_matrix_choices(self, matrices: tuple[str, ...]) -> None:
+        """Other matrices to choose from; a choice that is still there stays."""
+        if matrices == self._matrices:
+            return
+        self._matrices = matrices
+        for one in self._parameters:
+            field = self.fields[one.name]
+            if one.kind == "matrix" and isinstance(field, QComboBox):
+                now, first = field.currentText(), field.count() == 1
+                field.blockSignals(True)
+                field.clear()
+                field.addItems([form_text.NO_CHOICE, *matrices])
+                # A procedure that is about a matrix takes the newest unless told otherwise.
+                wanted = now if now in matrices and not first else self._default_matrix(one)
+                field.setCurrentText(wanted)
+                field.blockSignals(False)
+        self.edited.emit()
+
+    def _default_matrix(self, parameter: ProcedureParameter) -> str:
+        return self._matrices[0] if parameter.name == "im" and self._matrices else form_text.NO_CHOICE
+
+    def _make_field(self, one: ProcedureParameter) -> QWidget:
+        if one.kind == "bool":
+            check = QCheckBox()
+            check.setChecked(bool(one.default))
+            check.toggled.connect(self.edited)
+            return check
+        if one.kind in ("choice", "matrix"):
+            box = QComboBox()
+            box.addItems(
+                list(one.choices) if one.kind == "choice" else [form_text.NO_CHOICE, *self._matrices]
+            )
+            box.setCurrentText(
+                form_text.format_value(one.default) if one.kind == "choice" else self._default_matrix(one)
+            )
+            box.currentIndexChanged.connect(self.edited)
+            return box
+        line = QLineEdit(form_text.format_value(one.default))
+        if one.default is None:
+            line.setPlaceholderText("none")
+        line.textEdited.connect(self.edited)
+        return line
+
+    def set_value(self, name: str, text: str) -> None:
+        """Put a value into a field, as somebody would who types it."""
+        field = self.fields[name]
+        if isinstance(field, QLineEdit):
+            field.setText(text)
+        elif isinstance(field, QComboBox):
+            field.setCurrentText(text)
+        elif isinstance(field, QCheckBox):
+            field.setChecked(text == "True")
+        self.edited.emit()
+
+    def arguments(self) -> Arguments:
+        """What stands in the form; arguments at their defaults are left out.
+
+        Raises
+        ------
+        ValueError
+            A field holds what cannot be meant; says which and what would do.
+        """
+        values: Arguments = {}
+        for one in self._parameters:
+            field = self.fields[one.name]
+            if isinstance(field, QCheckBox):
+                values[one.name] = field.isChecked()
+            else:
+                text = field.currentText() if isinstance(field, QComboBox) else _text(field)
+                values[one.name] = form_text.parse_value(one, text)
+        return form_text.non_default_arguments(self._parameters, values)
+
+
+def _text(field: QWidget) -> str:
+    return field.text() if isinstance(field, QLineEdit) else ""

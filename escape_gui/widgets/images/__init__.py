@@ -1,0 +1,1 @@
+"""Images, maps and colour scales."""

@@ -1,0 +1,81 @@
+"""Colour maps as tables, and the slim scale that stands beside a picture."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pyqtgraph as pg
+from numpy.typing import NDArray
+from PySide6.QtWidgets import QVBoxLayout, QWidget
+
+from escape_gui.theme import Theme
+from escape_gui.widgets.plots.plot import reparent_menu
+
+#: Safe for colour-blind eyes: signed values keep their sign, sizes their order, in every simulation.
+DIVERGING, SEQUENTIAL = "CET-D1A", "cividis"
+
+
+@lru_cache(maxsize=8)
+def lookup_table(name: str) -> NDArray[np.uint8]:
+    """A colour map for indices ``(256, 4)``: 0 is transparent, 1 to 255 are the map from end to end."""
+    colours = np.zeros((256, 4), np.uint8)
+    colours[1:] = pg.colormap.get(name).getLookupTable(0.0, 1.0, 255, alpha=True)
+    return colours
+
+
+class ColourScale(QWidget):
+    """A vertical colour scale with numbers and a unit.
+
+    Parameters
+    ----------
+    theme
+        Colours and fonts.
+    name
+        The colour map.
+    """
+
+    def __init__(self, theme: Theme, name: str) -> None:
+        super().__init__()
+        self._theme = theme
+        self._plot = pg.PlotWidget()
+        reparent_menu(self._plot.getPlotItem())
+        self._plot.setMouseEnabled(x=False, y=False)
+        self._plot.hideButtons()
+        self._plot.showAxis("right")
+        for side in ("left", "bottom"):
+            self._plot.hideAxis(side)
+        self._image = pg.ImageItem(np.arange(1, 256, dtype=np.uint8)[:, None], axisOrder="row-major")
+        self._image.setLevels((0, 255))
+        self._plot.addItem(self._image)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self._plot)
+        self._label = ""
+        self.set_colour_map(name)
+        theme.changed.connect(self.apply_theme)
+        self.apply_theme()
+
+    def set_colour_map(self, name: str) -> None:
+        """Take another colour map."""
+        self._image.setLookupTable(lookup_table(name))
+
+    def set_range(self, low: float, high: float, label: str) -> None:
+        """Say what the ends mean."""
+        self._image.setRect(0, low, 1, high - low)
+        self._plot.setRange(xRange=(0, 1), yRange=(low, high), padding=0.025)
+        self._label = label
+        self.apply_theme()
+
+    def apply_theme(self) -> None:
+        """Follow the palette."""
+        text = self._theme.colour("text")
+        self._plot.setBackground(self._theme.colour("panel"))
+        axis = self._plot.getAxis("right")
+        axis.setPen(self._theme.colour("line"))
+        axis.setTextPen(text)
+        axis.setTickFont(self._theme.font(0.9))
+        axis.setLabel(
+            self._label, color=text.name(), **{"font-size": f"{self._theme.font(0.9).pointSizeF()}pt"}
+        )
+        self.setFixedWidth(self._theme.pixels(64))

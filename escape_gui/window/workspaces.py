@@ -1,0 +1,168 @@
+"""Which panels stand where: one arrangement for each kind of work."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QDockWidget, QMainWindow, QTabBar
+
+#: Between docks, as the style sheet says.
+SEPARATOR_PX = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Panels in one place, behind each other as tabs, the first in front.
+
+    Parameters
+    ----------
+    names
+        Panels' names.
+    share
+        Height relative to the other cells of the column.
+    """
+
+    names: tuple[str, ...]
+    share: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Cells on top of each other; ``share`` is the width relative to the other columns."""
+
+    cells: tuple[Cell, ...]
+    share: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Workspace:
+    """An arrangement with a name."""
+
+    name: str
+    title: str
+    purpose: str
+    columns: tuple[Column, ...]
+
+    @property
+    def panels(self) -> tuple[str, ...]:
+        """Names of all its panels."""
+        return tuple(name for column in self.columns for cell in column.cells for name in cell.names)
+
+
+WORKSPACES: tuple[Workspace, ...] = (
+    Workspace(
+        "align",
+        "Align",
+        "Devices, light on the sensor, shape of the mirror",
+        (
+            Column((Cell(("devices",), 1.5), Cell(("log",), 1.0)), 1.0),
+            Column((Cell(("camera",)),), 1.5),
+            Column((Cell(("mirror",), 1.0), Cell(("psf",), 1.2)), 1.0),
+        ),
+    ),
+    Workspace(
+        "calibrate",
+        "Calibrate",
+        "Interaction matrix, registration, optical gains",
+        (
+            # The form with its plan and its result takes a whole column of a small screen.
+            Column((Cell(("procedure",)),), 0.95),
+            # Mosaic and the chosen mode in all matrices are seen together.
+            Column((Cell(("modes",)),), 1.3),
+            Column((Cell(("sprint",), 1.3), Cell(("gains", "camera", "devices", "log"), 1.0)), 1.15),
+        ),
+    ),
+    Workspace(
+        "operate",
+        "Operate",
+        "Closed loop, Strehl, latency",
+        (
+            Column((Cell(("loop",), 1.2), Cell(("devices", "procedure"), 1.0)), 0.9),
+            Column((Cell(("performance",), 1.4), Cell(("log", "latency"), 0.8)), 1.5),
+            Column((Cell(("camera",), 1.0), Cell(("psf", "mirror"), 1.15)), 1.1),
+        ),
+    ),
+)
+
+
+def workspace(name: str) -> Workspace:
+    """A workspace by name; the last one when there is none of that name."""
+    return next((one for one in WORKSPACES if one.name == name), WORKSPACES[-1])
+
+
+def arrange_docks(window: QMainWindow, docks: dict[str, QDockWidget], plan: Workspace) -> None:
+    """Put the docks of a workspace into their places and hide the others."""
+    for dock in docks.values():
+        dock.setFloating(False)
+        window.removeDockWidget(dock)
+    columns = [
+        (column, cells)
+        for column in plan.columns
+        if (cells := [cell for cell in column.cells if any(name in docks for name in cell.names)])
+    ]
+    column_docks = [_front_dock(docks, cells[0]) for _, cells in columns]
+    for k, head in enumerate(column_docks):
+        if k == 0:
+            window.addDockWidget(Qt.DockWidgetArea.LeftDockWidgetArea, head)
+        else:
+            window.splitDockWidget(column_docks[k - 1], head, Qt.Orientation.Horizontal)
+    for _, cells in columns:
+        _stack_cells(window, docks, cells)
+    for name in plan.panels:
+        if name in docks:
+            docks[name].show()
+    for _, cells in columns:
+        for cell in cells:
+            _front_dock(docks, cell).raise_()
+    if columns:
+        _resize_docks(window, docks, columns, column_docks)
+    for name in docks.keys() - set(plan.panels):
+        # Where the View menu will show it.
+        window.addDockWidget(Qt.DockWidgetArea.RightDockWidgetArea, docks[name])
+        docks[name].hide()
+
+
+def hide_orphan_tab_bars(window: QMainWindow, docks: dict[str, QDockWidget]) -> None:
+    """Hide the tab bars of the arrangement before, which Qt leaves where they were."""
+    groups = [
+        {one.windowTitle() for one in (dock, *window.tabifiedDockWidgets(dock)) if not one.isHidden()}
+        for dock in docks.values()
+    ]
+    for bar in window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly):
+        if {bar.tabText(k) for k in range(bar.count())} not in groups:
+            bar.hide()
+
+
+def _front_dock(docks: dict[str, QDockWidget], cell: Cell) -> QDockWidget:
+    return next(docks[name] for name in cell.names if name in docks)
+
+
+def _stack_cells(window: QMainWindow, docks: dict[str, QDockWidget], cells: list[Cell]) -> None:
+    above = _front_dock(docks, cells[0])
+    for cell in cells:
+        front = _front_dock(docks, cell)
+        if front is not above:
+            window.splitDockWidget(above, front, Qt.Orientation.Vertical)
+        for name in cell.names:
+            if name in docks and docks[name] is not front:
+                window.tabifyDockWidget(front, docks[name])
+        above = front
+
+
+def _resize_docks(
+    window: QMainWindow,
+    docks: dict[str, QDockWidget],
+    columns: list[tuple[Column, list[Cell]]],
+    column_docks: list[QDockWidget],
+) -> None:
+    # Docks that together want more than the window has make it larger.
+    between = (len(columns) - 1) * SEPARATOR_PX
+    width = (window.width() - between) / sum(column.share for column, _ in columns)
+    window.resizeDocks(
+        column_docks, [round(column.share * width) for column, _ in columns], Qt.Orientation.Horizontal
+    )
+    for _, cells in columns:
+        height = window.height() / sum(cell.share for cell in cells)
+        fronts = [_front_dock(docks, cell) for cell in cells]
+        window.resizeDocks(fronts, [round(cell.share * height) for cell in cells], Qt.Orientation.Vertical)

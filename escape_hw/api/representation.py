@@ -1,0 +1,134 @@
+"""Short text and HTML representations of results for the prompt, logs and notebooks; no plotting library needed."""
+
+from __future__ import annotations
+
+import base64
+import struct
+import zlib
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import fields, is_dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+#: Characters of a text, and values of a series, that are shown as they are.
+_MAX_TEXT, _MAX_ITEMS = 60, 6
+
+
+def short_repr(one: Any) -> str:
+    """A dataclass in one line: short values as they are, arrays by kind and shape, long ones by length.
+
+    For classes that hold arrays: ``__repr__ = short_repr``.
+    """
+    parts = (
+        f"{field.name}={describe_value(getattr(one, field.name))}" for field in fields(one) if field.repr
+    )
+    return f"{type(one).__name__}({', '.join(parts)})"
+
+
+def describe_value(value: object) -> str:
+    """A value in a few words."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, str):
+        return repr(value) if len(value) <= _MAX_TEXT else f"{len(value)} characters"
+    if is_dataclass(value) and not isinstance(value, type):
+        text = repr(value)
+        return text if len(text) <= _MAX_TEXT else f"{type(value).__name__}(...)"
+    if isinstance(value, Mapping | Sequence | Set):
+        text = repr(value) if len(value) <= _MAX_ITEMS else ""
+        return text if 0 < len(text) <= _MAX_TEXT else f"{type(value).__name__} of {len(value)}"
+    return repr(value)
+
+
+#: Blue, white and red of a symmetric map, safe for colour-blind eyes (the ends of Moreland's cool-warm).
+_COLOUR_STOPS = np.array([[59, 76, 192], [242, 242, 242], [180, 4, 38]], float)
+
+
+def image_html(values: ArrayLike, width: int = 240) -> str:
+    """A signed array as an ``<img>`` element; zero is white, NaN grey.
+
+    Parameters
+    ----------
+    values
+        ``(rows, columns)``; thinned out where it is larger than the picture.
+    width
+        Width on the page in pixels.
+    """
+    image = np.atleast_2d(np.asarray(values, float))
+    image = image[:: max(1, image.shape[0] // width), :: max(1, image.shape[1] // width)]
+    known = np.isfinite(image)
+    top = float(np.percentile(np.abs(image[known]), 99)) if known.any() else 0.0
+    share = np.clip(np.where(known, image, 0.0) / (top or 1.0), -1, 1) + 1
+    low = np.minimum(share.astype(int), 1)
+    colours = _COLOUR_STOPS[low] + (_COLOUR_STOPS[low + 1] - _COLOUR_STOPS[low]) * (share - low)[..., None]
+    colours[~known] = 160
+    data = base64.b64encode(_png(colours.astype(np.uint8))).decode()
+    # A tall matrix is pressed into a square: it is to be seen at one glance.
+    height = min(round(width * image.shape[0] / image.shape[1]), width)
+    return (
+        f'<img src="data:image/png;base64,{data}" width="{width}" height="{height}" '
+        'style="image-rendering:pixelated"/>'
+    )
+
+
+def line_html(values: ArrayLike, width: int = 240, height: int = 48) -> str:
+    """Values in a row as an ``<svg>`` line, its range filling the height."""
+    y = np.asarray(values, float).ravel()
+    y = y[np.isfinite(y)]
+    if y.size < 2:
+        return ""
+    low, high = float(y.min()), float(y.max())
+    x = np.linspace(1, width - 1, y.size)
+    at = height - 1 - (height - 2) * (y - low) / ((high - low) or 1.0)
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, at, strict=True))
+    return (
+        f'<svg width="{width}" height="{height}" role="img"><polyline points="{points}" fill="none" '
+        'stroke="#0072b2" stroke-width="1.2"/></svg>'
+    )
+
+
+def table_html(
+    rows: Mapping[str, object] | Sequence[Sequence[object]], title: str = "", left_html: str = ""
+) -> str:
+    """Rows of plain text as a table, with a heading, beside a picture.
+
+    Parameters
+    ----------
+    rows
+        Names and values, or rows of cells.
+    title
+        Heading.
+    beside
+        HTML to the left.
+    """
+    cells = [(key, value) for key, value in rows.items()] if isinstance(rows, Mapping) else rows
+    body = "".join(
+        "<tr>" + "".join(f"<td style='text-align:left'>{escape(str(cell))}</td>" for cell in row) + "</tr>"
+        for row in cells
+    )
+    head = f"<b>{escape(title)}</b>" if title else ""
+    return (
+        f"<div style='display:flex;gap:12px;align-items:flex-start'>{left_html}"
+        f"<div>{head}<table>{body}</table></div></div>"
+    )
+
+
+def _png(pixels: NDArray[np.uint8]) -> bytes:
+    """A picture ``(rows, columns, 3)`` as PNG (ISO/IEC 15948)."""
+    rows, columns = pixels.shape[:2]
+    lines = np.concatenate([np.zeros((rows, 1), np.uint8), pixels.reshape(rows, -1)], axis=1)
+    parts = (
+        (b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 2, 0, 0, 0)),
+        (b"IDAT", zlib.compress(lines.tobytes(), 9)),
+        (b"IEND", b""),
+    )
+    chunks = b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + chunks

@@ -1,0 +1,151 @@
+"""Keeping the state of a calibration while it runs, and going on with a kept one."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.bench import Bench
+from escape_hw.errors import IncompatibleProduct
+from escape_hw.io.fits.run_state import RunState, load_state, save_state
+
+#: Differences that a refusal names.
+_MAX_LISTED = 5
+
+
+class Checkpoint:
+    """Where a run keeps its state, and the state it goes on from.
+
+    Parameters
+    ----------
+    path
+        File to keep the state in.
+    resume
+        File with the state to go on from; ``None`` for a run from the beginning.
+    request
+        Plain values kept beside the state for whoever goes on with it: how the run was asked for.
+    """
+
+    def __init__(
+        self, path: Path, resume: Path | None = None, request: Mapping[str, Any] | None = None
+    ) -> None:
+        self.path, self._resume_path, self._request = path, resume, dict(request or {})
+        self._next_save = self._period_s = math.inf
+        self._identity: Mapping[str, Any] = {}
+        self._bench: Bench | None = None
+
+    def begin(
+        self, bench: Bench, method: str, m2c: NDArray[np.float64], settings: Mapping[str, Any]
+    ) -> RunState | None:
+        """Say what the run is; the state to go on from, if there is one.
+
+        The random stream of the procedures continues where it was.
+
+        Parameters
+        ----------
+        bench
+            An open bench.
+        method
+            Name of the method.
+        m2c
+            The basis ``(n_act, n_modes)``.
+        settings
+            What else must be the same, plain values.
+
+        Raises
+        ------
+        IncompatibleProduct
+            The kept state is of another system, method, basis, configuration or setting; says which.
+        ProductError
+            It cannot be read.
+        """
+        self._bench, self._period_s = bench, bench.config.calibration.checkpoint_s
+        self._next_save = time.monotonic() + self._period_s
+        self._identity = {
+            "system": bench.config.system.name,
+            "simulated": bench.simulated,
+            "method": method,
+            "basis": fingerprint(np.round(m2c, 9)),
+            "settings": dict(settings),
+            "configuration": bench.config.to_toml(),
+        }
+        if self._resume_path is None:
+            return None
+        state = load_state(self._resume_path)
+        _require_same_run(self._resume_path, state.identity, self._identity)
+        bench.rng.bit_generator.state = state.values["rng"]
+        return state
+
+    def due(self) -> bool:
+        """Whether it is time for another state; cheap enough for every frame."""
+        return time.monotonic() >= self._next_save
+
+    def save(
+        self, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], grid: SensorGeometry | None
+    ) -> None:
+        """Keep a state.
+
+        Raises
+        ------
+        StorageError
+            It cannot be written; the one before it stays.
+        """
+        if self._bench is None:
+            raise RuntimeError("a checkpoint was saved before its run began")
+        values = {**values, "request": self._request, "rng": self._bench.rng.bit_generator.state}
+        state = RunState(self._identity, values, arrays, grid)
+        save_state(self.path, state, self._bench.config.system.name, self._bench.simulated)
+        self._next_save = time.monotonic() + self._period_s
+
+    def done(self) -> None:
+        """The run has its result: nobody needs the state any more."""
+        self.path.unlink(missing_ok=True)
+
+
+def fingerprint(array: NDArray[Any]) -> str:
+    """A short text that tells whether two arrays are equal."""
+    # Adding zero makes negative zeros positive, which compare equal and look different.
+    return hashlib.sha256(np.ascontiguousarray(array + 0.0).tobytes()).hexdigest()[:16]
+
+
+def _require_same_run(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise :class:`IncompatibleProduct` unless a kept state is of the same run."""
+    names = {"simulated": "mode (simulated or hardware)"}
+    for key in ("system", "simulated", "method", "settings"):
+        if saved.get(key) != now[key]:
+            raise IncompatibleProduct(
+                f"{path}: its {names.get(key, key)} is {saved.get(key)!r}, this run's is {now[key]!r}; "
+                "resume it as it was begun, or begin anew"
+            )
+    changed = sorted(_changed_keys(str(saved.get("configuration", "")), now["configuration"]))
+    if changed:
+        more = f" and {len(changed) - _MAX_LISTED} more" if len(changed) > _MAX_LISTED else ""
+        raise IncompatibleProduct(
+            f"{path}: its configuration differs from this run's in {', '.join(changed[:_MAX_LISTED])}{more}; "
+            "resume it with the configuration it was begun with"
+        )
+    if saved.get("basis") != now["basis"]:
+        raise IncompatibleProduct(f"{path}: its modal basis is not this system's; begin anew")
+
+
+def _changed_keys(one: str, other: str) -> set[str]:
+    """Keys whose values differ between two configurations as TOML text."""
+    a, b = dict(_flatten_keys(tomllib.loads(one))), dict(_flatten_keys(tomllib.loads(other)))
+    return {key for key in a.keys() | b.keys() if a.get(key) != b.get(key)}
+
+
+def _flatten_keys(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flatten_keys(value, f"{path}{key}.")
+        else:
+            yield path + key, value

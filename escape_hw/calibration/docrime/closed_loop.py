@@ -1,0 +1,294 @@
+"""DO-CRIME in closed loop: pokes beside the integrator, which are the instruments of its commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.procedure import Procedure, Progress, Reporter
+from escape_hw.api.results import CalibrationResult
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquisition.checkpoint import Checkpoint, fingerprint
+from escape_hw.calibration.acquisition.frames import next_frame, validate_frame_count
+from escape_hw.calibration.acquisition.pokes import PokeSequence, RandomPokes, select_random_pokes
+from escape_hw.calibration.acquisition.preview import MatrixPreview
+from escape_hw.calibration.acquisition.sensor_setup import (
+    build_slope_function,
+    compute_random_amplitudes,
+    prepare_sensor,
+)
+from escape_hw.calibration.acquisition.stopping import RunMonitor, StoppingCriterion, Target
+from escape_hw.calibration.docrime.estimator import DocrimeEstimator
+from escape_hw.calibration.docrime.estimator_thread import EstimatorThread
+from escape_hw.calibration.docrime.open_loop import (
+    MAX_CORRELATED_SLOPES,
+    DocrimeRun,
+    build_snr_criterion,
+    build_solution_matrix,
+    collect_solution_notes,
+    require_enough_frames,
+)
+from escape_hw.calibration.loop.performance import (
+    build_integrator,
+    collect_loop_notes,
+    select_settled_residual,
+)
+from escape_hw.calibration.loop.runner import SETTLING_S, LoopRecord, RunningLoop, require_not_diverged
+from escape_hw.errors import Aborted, ConfigError, TooFewFrames
+from escape_hw.io.fits.run_state import RunState
+
+#: Frames after which a running loop asks whether the estimate will do.
+_CHECK_INTERVAL = 500
+
+
+class ClosedLoopAcquisition:
+    """A loop that runs while pokes are injected and estimated beside it.
+
+    Parameters
+    ----------
+    bench
+        An open bench, its sensor prepared.
+    matrix, grid
+        What closes the loop.
+    estimator
+        Takes slopes, commands and pokes.
+    looks
+        What is done with the estimate on the way.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        matrix: InteractionMatrix,
+        grid: SensorGeometry,
+        estimator: DocrimeEstimator,
+        monitor: RunMonitor,
+    ) -> None:
+        self._bench, self._grid, self._monitor, self._estimator = bench, grid, monitor, estimator
+        control = build_integrator(bench, matrix, grid)
+        self._loop = RunningLoop(bench, matrix.m2c, build_slope_function(bench, grid), control)
+        self._criterion_met = self._aborted = False
+        self._preview = MatrixPreview(matrix.n_modes, lambda: grid)
+        self._preview_arrays: Mapping[str, NDArray[np.float32]] = {}
+        self._estimator_thread = EstimatorThread(estimator, blocking=bench.simulated, on_block=self._on_block)
+
+    @property
+    def record(self) -> LoopRecord:
+        """What the loop gathered."""
+        return self._loop.record
+
+    @property
+    def skipped(self) -> int:
+        """Frames that the estimate lost because its sums were behind."""
+        return self._estimator_thread.skipped
+
+    @property
+    def grid(self) -> SensorGeometry:
+        """The geometry with the motion of the closed loop, which a model of the sensor has to match."""
+        return self._estimator_thread.slope_statistics.annotate_geometry(self._grid, closed=True)
+
+    def restore(self, state: RunState) -> None:
+        """Go on from what a run that was broken off has kept."""
+        self._estimator.restore(state.values, state.arrays)
+        self._estimator_thread.slope_statistics.restore(state.arrays["motion"])
+
+    def poke(self, frames: int, pokes: PokeSequence, stage: str) -> Procedure[bool]:
+        """Close the loop, poke until the estimator has so many frames, open it; the mirror ends flat.
+
+        Returns
+        -------
+        bool
+            Whether the operator stopped it early.
+
+        Raises
+        ------
+        CalibrationError
+            The loop diverged, or the sensor went dark.
+        """
+        bench, loop = self._bench, self._loop
+        partial, settling_frames = False, int(SETTLING_S * bench.wfs.settings.frame_rate_hz)
+        bench.dm.flatten()
+        # One frame first: what the camera lost while nobody read it is not a loss of the loop.
+        next_frame(bench)
+        try:
+            with self._estimator_thread as estimator_thread:
+                try:
+                    yield from loop.run(settling_frames, report=Reporter("closing the loop", settling_frames))
+                    done, report = self._estimator.frames_received, Reporter(stage, frames)
+                    while done < frames and not self._criterion_met and not loop.record.diverged:
+                        n_frames = min(_CHECK_INTERVAL, frames - done)
+                        yield from self._with_preview(
+                            loop.run(n_frames, inject=pokes, observe=(estimator_thread,), report=report)
+                        )
+                        done += n_frames
+                        estimator_thread.wait_until_summed()
+                except Aborted:
+                    # At once: the sums may have a while to go.
+                    bench.dm.flatten()
+                    partial = self._aborted = True
+                estimator_thread.finish()
+        finally:
+            bench.dm.flatten()
+        require_not_diverged(self._loop.record)
+        if partial:
+            self._save_and_check(final=True)
+        return partial
+
+    def _with_preview(self, steps: Procedure[LoopRecord]) -> Iterator[Progress]:
+        """Progress of the loop with the newest picture of the matrix."""
+        for step in steps:
+            preview_arrays, self._preview_arrays = self._preview_arrays, {}
+            yield replace(step, arrays={**step.arrays, **preview_arrays}) if preview_arrays else step
+
+    def _on_block(self, estimator: DocrimeEstimator) -> None:
+        """Show, keep and judge the estimate, as far as it is due; in the estimator's thread."""
+        if self._preview.due():
+            self._preview_arrays = self._preview(estimator.preview)
+        if not self._criterion_met and not self._aborted and self._monitor.due(estimator.frames_received):
+            self._criterion_met = self._save_and_check()
+
+    def _save_and_check(self, *, final: bool = False) -> bool:
+        """Whether the estimate will do; its progress is nobody's. False if the run is stopped meanwhile."""
+        arrays = {"motion": self._estimator_thread.slope_statistics.state()}
+        frames_received = self._estimator.frames_received
+        procedure = self._monitor.check(self._estimator, self.grid, frames_received, {}, arrays, final=final)
+        while True:
+            try:
+                next(procedure)
+            except StopIteration as done:
+                return bool(done.value)
+            if self._aborted:
+                procedure.close()
+                return False
+
+
+def docrime_closed_run(
+    bench: Bench,
+    closed_loop: CalibrationResult,
+    *,
+    frames: int | None = None,
+    poke: float | None = None,
+    correlations: bool = True,
+    pattern: type[PokeSequence] = RandomPokes,
+    checkpoint: Checkpoint | None = None,
+    criterion: StoppingCriterion | None = None,
+) -> Procedure[DocrimeRun]:
+    """As :func:`docrime_closed_loop`, with the solution beside the matrix; see ``docrime_run``."""
+    c, m2c, grid = bench.config.calibration, closed_loop.matrix.m2c, closed_loop.grid
+    n_frames = c.frames if frames is None else validate_frame_count(frames)
+    poke = c.poke if poke is None else poke
+    pattern = select_random_pokes(c.pokes) if pattern is RandomPokes else pattern
+    if c.whiten_order == 0:
+        raise ConfigError("calibration.whiten_order is 0; in closed loop the turbulence must be whitened")
+    amplitude = compute_random_amplitudes(bench, m2c, poke)
+    require_enough_frames(c, n_frames, m2c.shape[1])
+    estimator = DocrimeEstimator(
+        grid.n_slopes, m2c.shape[1], order=c.whiten_order, lags=c.lags, closed=True,
+        correlations=correlations and grid.n_slopes <= MAX_CORRELATED_SLOPES,
+    )  # fmt: skip
+    method = _method_name(pattern)
+    settings = {
+        "poke": poke,
+        "correlations": correlations,
+        "closed with": fingerprint(closed_loop.matrix.data),
+    }
+    state = None if checkpoint is None else checkpoint.begin(bench, method, m2c, settings)
+    prepare_sensor(bench)
+    loop = ClosedLoopAcquisition(
+        bench, closed_loop.matrix, grid, estimator, RunMonitor(checkpoint, criterion)
+    )
+    if state is not None:
+        loop.restore(state)
+    stage = f"{pattern.title} in closed loop"
+    partial = yield from loop.poke(n_frames, pattern(amplitude, bench.rng), stage)
+    try:
+        solution = estimator.solve()
+    except TooFewFrames:
+        if partial:
+            raise Aborted(f"aborted after {estimator.frames_received} frames, too few for a matrix") from None
+        raise
+    residual = select_settled_residual(loop.record, bench.wfs.settings.frame_rate_hz)
+    matrix = build_solution_matrix(
+        bench, grid, m2c, solution, method, poke=float(poke), shortened=loop.record.shortened,
+        skipped=loop.skipped, loop_gain=bench.config.loop.gain,
+        loop_residual_nm=float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
+    )  # fmt: skip
+    seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
+    result = CalibrationResult(
+        matrix, loop.grid, solution.frames, solution.lost_frames, seconds, solution.response,
+        partial=partial, notes=(*collect_solution_notes(solution, matrix), *_collect_loop_notes(bench, loop)),
+    )  # fmt: skip
+    return DocrimeRun(result, solution)
+
+
+def docrime_closed_loop(
+    bench: Bench,
+    closed_loop: CalibrationResult,
+    *,
+    frames: int | None = None,
+    poke: float | None = None,
+    pattern: type[PokeSequence] = RandomPokes,
+    until: Target | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> Procedure[CalibrationResult]:
+    """Measure the interaction matrix while the loop is closed, by pokes beside the integrator.
+
+    Unbiased for any controller, at pokes of a few thousandths of the stroke: see
+    ``docs/theory/docrime.md``.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    closing
+        A calibration whose matrix closes the loop, with the configured gain, leak and dropped modes; the
+        measured matrix is on its grid and in its modes.
+    frames, poke, pattern, until, keep
+        As for :func:`~escape_hw.calibration.docrime.open_loop.docrime`.
+
+    Returns
+    -------
+    CalibrationResult
+        On the grid of ``closed_loop``, with the motion that the loop left. Stopped early, ``partial`` is true.
+
+    Raises
+    ------
+    ConfigError, TooFewFrames, ProductError
+        As for :func:`~escape_hw.calibration.docrime.open_loop.docrime`; nothing moved.
+    IncompatibleProduct
+        The matrix belongs to another mirror, grid or camera region; nothing moved.
+    CalibrationError
+        The loop diverged, the sensor went dark, or it does not respond to the pokes.
+    Aborted
+        Stopped before a matrix could be solved.
+    """
+    criterion = build_snr_criterion(bench, closed_loop.matrix.m2c, until, _method_name(pattern))
+    run = yield from docrime_closed_run(
+        bench,
+        closed_loop,
+        frames=frames,
+        poke=poke,
+        correlations=False,
+        pattern=pattern,
+        checkpoint=checkpoint,
+        criterion=criterion,
+    )
+    return run.result
+
+
+def _method_name(pattern: type[PokeSequence]) -> str:
+    return f"{pattern.method}-closed"
+
+
+def _collect_loop_notes(bench: Bench, loop: ClosedLoopAcquisition) -> list[str]:
+    """What to know of the loop that a matrix was measured in."""
+    notes = collect_loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)
+    if loop.skipped:
+        notes.append(f"{loop.skipped} frames were lost to the estimate: its sums were behind the loop")
+    return notes

@@ -1,0 +1,373 @@
+"""Fit of the first frames (temporal response, whitening filter), significance tests, and the solution of the accumulated sums."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from escape_hw.api.representation import short_repr
+from escape_hw.api.results import TemporalResponse
+from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
+from escape_hw.calibration.docrime.regression import InstrumentalVariableSums, RegressionSums
+from escape_hw.calibration.docrime.response import (
+    RESPONSE_SLOPES,
+    FilteredTelemetry,
+    ResponseEstimate,
+    ResponseTracker,
+    filter_telemetry,
+    find_usable_rows,
+    fit_response,
+    require_no_late_response,
+)
+from escape_hw.calibration.docrime.whitening import apply_filter, fit_prediction_error_filter
+from escape_hw.errors import CalibrationError
+
+#: Standard deviations by which the pokes must explain more of the slopes than chance would.
+_MIN_SIGNIFICANCE = 5.0
+#: What the colour of the noise adds to that: one filter for all slopes leaves some of each slope's own,
+#: and where nothing responds the response comes out broad, so that it counts. Up to 1.3 on the twins.
+_COLOURED_NOISE_FACTOR = 1.5
+
+
+def require_response(
+    gram: NDArray[np.floating], matrix: NDArray[np.floating], covariance: NDArray[np.floating], lags: int
+) -> None:
+    """Refuse a matrix that chance alone explains.
+
+    Without a response the pokes explain as much power as the noise has, with the scatter that as
+    many degrees of dof as modes times independent slopes leave; looking for the temporal
+    response that explains most adds what the largest eigenvalue of a Wishart matrix exceeds the
+    mean by (Marchenko & Pastur 1967).
+
+    Parameters
+    ----------
+    gram
+        Sum of pokes times pokes ``(n_modes, n_modes)``.
+    matrix
+        The least-squares matrix ``(n_slopes, n_modes)``.
+    covariance
+        Of the noise of one frame's slopes ``(n_slopes, n_slopes)``.
+    lags
+        Lags among which the response was looked for.
+
+    Raises
+    ------
+    CalibrationError
+        The sensor does not respond to the mirror, as far as these frames tell.
+    """
+    noise = float(np.trace(covariance))
+    if not noise > 0:
+        return
+    n_modes = matrix.shape[1]
+    ratio = float(np.vdot(matrix @ gram, matrix)) / (n_modes * noise)
+    dof = n_modes * noise**2 / float(np.square(covariance).sum())
+    chance_ratio = (
+        _COLOURED_NOISE_FACTOR * (1 + np.sqrt(lags / dof)) ** 2 * (1 + _MIN_SIGNIFICANCE * np.sqrt(2 / dof))
+    )
+    if ratio < chance_ratio:
+        raise CalibrationError(
+            f"the wavefront sensor does not respond to the mirror: the pokes explain {ratio:.2f} times the "
+            f"power of the noise, chance alone up to {chance_ratio:.2f}; check that there is light and that the "
+            "mirror is in the beam and powered, or use larger pokes or more frames"
+        )
+
+
+def variance_inflation(
+    noise: NDArray[np.floating], filtered_commands: NDArray[np.floating], at: NDArray[np.intp], lags: int
+) -> float:
+    """Factor on the variance of a regression whose noise is not white.
+
+    A poke that shows in several frames meets nearly the same turbulence in all of them:
+    ``1 + 2 sum over k > 0 of rho_noise(k) rho_poke(k)``, with the autocorrelations of the noise and
+    of the poke as the sensor sees it.
+
+    Parameters
+    ----------
+    noise
+        Slopes less what the pokes explain ``(n, n_slopes)``.
+    seen
+        Pokes through the temporal response ``(n, n_modes)``.
+    at
+        Time of each row in frames ``(n,)``, rising.
+    lags
+        Frames over which a poke shows.
+    """
+    centred = noise - noise.mean(axis=0)
+    factor = 1.0
+    for lag in range(1, lags):
+        now = np.flatnonzero(np.isin(at - lag, at))
+        past = np.searchsorted(at, at[now] - lag)
+        factor += 2 * _correlation(centred, now, past) * _correlation(filtered_commands, now, past)
+    return max(factor, 0.0)
+
+
+def _correlation(values: NDArray[np.floating], now: NDArray[np.intp], past: NDArray[np.intp]) -> float:
+    a, b = values[now], values[past]
+    size = float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
+    return float(np.vdot(a, b)) / size if size > 0 else 0.0
+
+
+#: Degrees of freedom without which no standard error is worth stating.
+MIN_DEGREES_OF_FREEDOM = 20
+#: Slopes that the filter, common to all, is found from.
+_FILTER_SLOPES = 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InitialFit:
+    """What the first frames say.
+
+    Parameters
+    ----------
+    whitener
+        Filter over time ``(order + 1,)``.
+    response
+        The temporal response.
+    spread
+        Factor on the variance of an estimate whose noise is not white.
+    """
+
+    whitener: NDArray[np.float64]
+    response: ResponseEstimate
+    variance_inflation: float
+
+
+def create_sums(n_slopes: int, n_modes: int, closed: bool, *, correlations: bool) -> RegressionSums:
+    """Sums for open or closed loop."""
+    if closed:
+        return InstrumentalVariableSums.zeros(n_slopes, 2 * n_modes, correlations=correlations)
+    return RegressionSums.zeros(n_slopes, n_modes, correlations=correlations)
+
+
+def fit_first_frames(data: AlignedTelemetry, order: int, lags: int) -> InitialFit | None:
+    """Temporal response and filter from the first frames: by frame differences, then by the filter.
+
+    Parameters
+    ----------
+    data
+        The frames so far.
+    order
+        Past frames that predict the turbulence; 0 finds the response alone.
+    lags
+        Frames over which the temporal response is estimated.
+
+    Returns
+    -------
+    FirstFit or None
+        ``None``: too few frames.
+
+    Raises
+    ------
+    CalibrationError
+        The pokes do not span the modes, the response goes on after its last lag, or (plain estimator)
+        the mirror does not respond.
+    """
+    if find_usable_rows(data, max(order, 1), lags).size < data.n_modes + lags + MIN_DEGREES_OF_FREEDOM:
+        return None
+    require_excitation(data.pokes.T @ data.pokes)
+    # Differences tell the response well even where the plain estimator is asked for.
+    difference, sampled = (
+        np.array([1.0, -1.0]),
+        data.select_slopes(_FILTER_SLOPES if order else RESPONSE_SLOPES),
+    )
+    response = fit_response(sampled, difference, lags)
+    if not order:
+        return InitialFit(
+            np.ones(1), response, _estimate_plain_inflation(sampled, difference, response, lags)
+        )
+    residuals, usable = _compute_residuals(sampled, difference, response, lags)
+    whitener = fit_prediction_error_filter(residuals, usable, order)
+    require_no_late_response(data, whitener, lags)
+    return InitialFit(whitener, fit_response(data, whitener, lags), 1.0)
+
+
+def _regress(
+    block: FilteredTelemetry, response: ResponseEstimate
+) -> tuple[NDArray[np.float32], RegressionSums, NDArray[np.float64]]:
+    """Commands as the slopes saw them (pokes beside them in closed loop), sums and matrix of a block."""
+    excitation = block.excitation(response.weights)
+    sums = create_sums(block.n_slopes, block.n_modes, block.closed, correlations=False)
+    sums = sums.add(block.slopes, excitation).subtract_means()
+    return excitation, sums, sums.solve()
+
+
+def _estimate_plain_inflation(
+    sampled: AlignedTelemetry, difference: NDArray[np.float64], response: ResponseEstimate, lags: int
+) -> float:
+    """Factor on the plain estimator's variance; the differences must show that there is a response."""
+    block = filter_telemetry(sampled, difference, lags)
+    filtered_commands, sums, matrix = _regress(block, response)
+    noise, now = block.slopes - filtered_commands @ matrix.T.astype(np.float32), block.now
+    covariance = noise.T @ noise / (len(noise) - sampled.n_modes - lags)
+    require_response(
+        sums.gram, matrix, covariance * variance_inflation(noise, filtered_commands, now, lags), lags
+    )
+    residuals, usable = _compute_residuals(sampled, difference, response, lags)
+    at = np.flatnonzero(usable)
+    return variance_inflation(
+        residuals[at], apply_filter(sampled.rows, response.weights, at, sampled.n_slopes), at, lags
+    )
+
+
+def _compute_residuals(
+    data: AlignedTelemetry, whitener: NDArray[np.float64], response: ResponseEstimate, lags: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Slopes less what the commands explain ``(n_times, n_slopes)``, and the rows where that is known."""
+    *_, matrix = _regress(filter_telemetry(data, whitener, lags), response)
+    at = data.find_complete_rows(0, lags)
+    residuals = np.zeros_like(data.slopes)
+    filtered_commands = apply_filter(data.rows, response.weights, at, data.n_slopes)[:, : data.n_modes]
+    residuals[at] = data.slopes[at] - filtered_commands @ matrix.T.astype(np.float32)
+    usable = np.zeros_like(data.present)
+    usable[at] = True
+    return residuals, usable
+
+
+def require_excitation(gram: NDArray[np.floating]) -> None:
+    """Raise :class:`CalibrationError` unless pokes with these sums of squares span the modes."""
+    # Factor and estimated condition: a twentieth of the time of the eigenvalues.
+    size = np.abs(gram).sum(axis=0).max()
+    cholesky, failed = lapack.dpotrf(gram)
+    if failed or lapack.dpocon(cholesky, size)[0] <= 1e-7:
+        raise CalibrationError(
+            "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
+        )
+
+
+def estimate_preview(
+    sums: RegressionSums, scale: NDArray[np.float64], lags: int, variance_inflation: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Matrix and standard errors ``(n_slopes, n_modes)`` without tests, correlations or a change of the sums.
+
+    Parameters
+    ----------
+    sums
+        Of a run that goes on.
+    scale
+        Factors on the columns ``(n_modes,)``.
+    lags, spread
+        Frames of the temporal response, and factor on the variance.
+
+    Returns
+    -------
+    tuple or None
+        ``None``: too few frames, or pokes that do not span the modes yet.
+    """
+    if sums.count < scale.size + lags + MIN_DEGREES_OF_FREEDOM:
+        return None
+    power = sums.power if sums.power.ndim == 1 else np.diag(sums.power).copy()
+    centred_sums = replace(sums, power=power).subtract_means()
+    try:
+        matrix, unit = centred_sums.solve(), centred_sums.inverse_diagonal()
+    except np.linalg.LinAlgError:
+        return None
+    variance = np.maximum(
+        centred_sums.residual_power(matrix) / max(centred_sums.degrees_of_freedom() - lags, 1.0), 0.0
+    )
+    sigma = np.outer(np.sqrt(variance * variance_inflation), np.sqrt(np.maximum(unit, 0.0)) * np.abs(scale))
+    return matrix * scale, sigma
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DocrimeSolution:
+    """A solved DO-CRIME run.
+
+    Parameters
+    ----------
+    matrix, sigma
+        ``(n_slopes, n_modes)``: slopes per unit mode, and standard errors of single elements beside a
+        gain that they share.
+    covariance
+        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; ``None`` where
+        correlations were not asked for.
+    gram
+        Sum over frames of filtered pokes times filtered pokes ``(n_modes, n_modes)``; in closed loop
+        what stands in its place: the inverse of the covariance of a row of the matrix, per variance of
+        its slope's noise.
+    variance
+        Variance of each slope's filtered noise, with what its correlation over time adds ``(n_slopes,)``.
+    whitener
+        The filter used, ``[1]`` for the plain estimator.
+    gain_sigma
+        Relative standard error of the gain that all elements share: an error of the temporal response,
+        which is scaled to sum 1, scales the whole matrix.
+    response_covariance
+        Of the response's weights ``(lags, lags)``.
+    """
+
+    matrix: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    response: TemporalResponse
+    covariance: NDArray[np.float64] | None
+    gram: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    whitener: NDArray[np.float64]
+    frames: int
+    lost_frames: int
+    gain_sigma: float
+    response_covariance: NDArray[np.float64]
+    __repr__ = short_repr
+
+
+def solve_sums(
+    raw_sums: RegressionSums,
+    tracker: ResponseTracker,
+    whitener: NDArray[np.float64],
+    variance_inflation: float,
+    *,
+    lags: int,
+    frames: int,
+    lost_frames: int,
+) -> DocrimeSolution:
+    """The matrix, its standard errors and the temporal response that sums hold.
+
+    Parameters
+    ----------
+    whole
+        Sums over all filtered frames, of slopes and of what the pokes made of them; not changed.
+    tracker
+        Follows the temporal response over the same frames.
+    whitener
+        The filter ``(order + 1,)``; one weight is none, and then nothing tells whether the mirror responds.
+    spread
+        Factor on the variance of an estimate whose noise is not white.
+    lags
+        Frames over which the temporal response was estimated.
+    frames, lost_frames
+        As the solution tells them.
+
+    Raises
+    ------
+    CalibrationError
+        The mirror does not respond, or the pokes do not span the modes.
+    """
+    sums = raw_sums.subtract_means()
+    information = sums.information()
+    require_excitation(information)
+    matrix = sums.solve()
+    dof = sums.degrees_of_freedom() - lags
+    if whitener.size > 1:
+        rows, power = sums.sample(matrix)
+        require_response(information, rows, power / dof, lags)
+    residual = sums.residual_power(matrix) / dof
+    covariance = residual if residual.ndim == 2 else None
+    variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * variance_inflation
+    sigma = np.outer(np.sqrt(variance), np.sqrt(sums.inverse_diagonal()))
+    response = tracker.response()
+    scale = tracker.scale(response)
+    return DocrimeSolution(
+        matrix * scale,
+        sigma * np.abs(scale),
+        response.response,
+        covariance,
+        information / np.multiply.outer(scale, scale),
+        variance,
+        whitener,
+        frames,
+        lost_frames,
+        tracker.gain_sigma(response),
+        response.covariance,
+    )

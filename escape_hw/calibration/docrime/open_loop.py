@@ -1,0 +1,274 @@
+"""DO-CRIME in open loop: random pokes on every mode, under turbulence (paper; Lai et al. 2020)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.procedure import Procedure
+from escape_hw.api.representation import short_repr
+from escape_hw.api.results import CalibrationResult
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquisition.checkpoint import Checkpoint
+from escape_hw.calibration.acquisition.frames import build_interaction_matrix, validate_frame_count
+from escape_hw.calibration.acquisition.pokes import PokeSequence, RandomPokes, select_random_pokes
+from escape_hw.calibration.acquisition.sensor_setup import (
+    SETUP_FRAMES,
+    build_modal_basis,
+    compute_random_amplitudes,
+)
+from escape_hw.calibration.acquisition.stopping import (
+    RunMonitor,
+    StoppingCriterion,
+    Target,
+    reject_accuracy_target,
+)
+from escape_hw.calibration.docrime.acquisition import AcquisitionRecord, OpenLoopAcquisition
+from escape_hw.calibration.docrime.estimator import DocrimeEstimator
+from escape_hw.calibration.docrime.fit import DocrimeSolution
+from escape_hw.config.system import CalibrationSection
+from escape_hw.errors import Aborted, TooFewFrames
+
+#: Slopes up to which the correlation of their noise is followed.
+MAX_CORRELATED_SLOPES = 3000
+#: Share of the response in its last frame beyond which one may doubt that it ends there.
+_TAIL_FRACTION = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DocrimeRun:
+    """A DO-CRIME run: the calibration, and the solution it came from.
+
+    ``record`` holds, when it was asked for, the frame indices ``(n,)``, slopes ``(n, n_slopes)`` and
+    pokes ``(n, n_modes)``.
+    """
+
+    result: CalibrationResult
+    solution: DocrimeSolution
+    record: AcquisitionRecord | None = None
+    __repr__ = short_repr
+
+
+def docrime_run(
+    bench: Bench,
+    *,
+    frames: int | None = None,
+    poke: float | None = None,
+    whiten: bool = True,
+    grid: SensorGeometry | None = None,
+    record: bool = False,
+    correlations: bool = True,
+    pattern: type[PokeSequence] = RandomPokes,
+    checkpoint: Checkpoint | None = None,
+    criterion: StoppingCriterion | None = None,
+) -> Procedure[DocrimeRun]:
+    """As :func:`docrime`, with the solution beside the matrix, and with the telemetry if asked for.
+
+    The solution knows how the noise of the slopes is correlated unless ``correlations`` is false, or
+    there are more than :data:`MAX_CORRELATED_SLOPES` slopes. ``pattern`` makes the pokes, ``criterion`` says
+    when a solution will do.
+    """
+    c = bench.config.calibration
+    n_frames = c.frames if frames is None else validate_frame_count(frames)
+    poke = c.poke if poke is None else poke
+    pattern = select_random_pokes(c.pokes) if pattern is RandomPokes else pattern
+    m2c = build_modal_basis(bench)
+    amplitude = compute_random_amplitudes(bench, m2c, poke)
+    require_enough_frames(c, n_frames, m2c.shape[1], whiten)
+    order, lags = c.whiten_order if whiten else 0, c.lags
+
+    def estimator(n_slopes: int) -> DocrimeEstimator:
+        # Their number squared: with as many slopes as a pyramid has, gigabytes.
+        with_correlations = correlations and n_slopes <= MAX_CORRELATED_SLOPES
+        return DocrimeEstimator(
+            n_slopes, m2c.shape[1], order=order, lags=lags, correlations=with_correlations
+        )
+
+    acquisition = OpenLoopAcquisition(
+        bench,
+        m2c,
+        grid,
+        min(SETUP_FRAMES, n_frames),
+        estimator,
+        store_samples=record,
+        monitor=RunMonitor(checkpoint, criterion),
+    )
+    settings = {"poke": poke, "whiten": whiten, "correlations": correlations}
+    state = None if checkpoint is None else checkpoint.begin(bench, pattern.method, m2c, settings)
+    if state is not None:
+        acquisition.restore(state)
+    partial = yield from acquisition.poke(n_frames, pattern(amplitude, bench.rng), pattern.title)
+    acquisition.process_pending()
+    if acquisition.estimator is None or acquisition.grid is None or acquisition.slope_statistics is None:
+        raise Aborted("aborted before the first frames")
+    try:
+        solution = acquisition.estimator.solve()
+    except TooFewFrames:
+        if partial:
+            raise Aborted(f"aborted after {acquisition.n_received} frames, too few for a matrix") from None
+        raise
+    method = pattern.method + ("-whitened" if whiten and issubclass(pattern, RandomPokes) else "")
+    matrix = build_solution_matrix(
+        bench, acquisition.grid, m2c, solution, method, poke=float(poke), shortened=acquisition.shortened
+    )
+    return DocrimeRun(_result(acquisition, matrix, solution, partial), solution, acquisition.record())
+
+
+def build_solution_matrix(
+    bench: Bench,
+    grid: SensorGeometry,
+    m2c: NDArray[np.float64],
+    solution: DocrimeSolution,
+    method: str,
+    **metrics: float | int | str,
+) -> InteractionMatrix:
+    """The matrix of a solution with its provenance and metrics."""
+    return build_interaction_matrix(
+        bench, grid, m2c, solution.matrix, solution.sigma, method,
+        frames=solution.frames, lost_frames=solution.lost_frames, delay_frames=solution.response.delay,
+        whitening_order=solution.whitener.size - 1, gain_sigma=solution.gain_sigma, **metrics,
+    )  # fmt: skip
+
+
+def collect_solution_notes(solution: DocrimeSolution, matrix: InteractionMatrix) -> list[str]:
+    """What to know of a solution before using it."""
+    notes = []
+    if float(np.median(matrix.snr())) < 1:
+        notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
+    tail, error = solution.response.weights[-1], solution.response.sigma[-1]
+    if abs(tail) > max(_TAIL_FRACTION, 4 * error):
+        notes.append(
+            f"{tail:.0%} of the response come only {solution.response.weights.size - 1} frames after a "
+            "command, so some may come later still, which scales the matrix; raise calibration.lags"
+        )
+    return notes
+
+
+def build_snr_criterion(
+    bench: Bench, m2c: NDArray[np.float64], until: Target | None, method: str
+) -> StoppingCriterion | None:
+    """Judges a solution by the signal-to-noise ratio asked for; ``None`` when none is.
+
+    Raises
+    ------
+    ConfigError
+        A registration's accuracy is asked for, too: a matrix alone has none.
+    """
+    reject_accuracy_target(until)
+    if until is None:
+        return None
+
+    def criterion(solution: DocrimeSolution, grid: SensorGeometry) -> Procedure[bool]:
+        yield from ()
+        return until.is_snr_reached(build_solution_matrix(bench, grid, m2c, solution, method))
+
+    return criterion
+
+
+def _result(
+    acquisition: OpenLoopAcquisition, matrix: InteractionMatrix, solution: DocrimeSolution, partial: bool
+) -> CalibrationResult:
+    """The matrix with all that the run taught about the sensor."""
+    seconds = (solution.frames + solution.lost_frames) / acquisition.bench.wfs.settings.frame_rate_hz
+    return CalibrationResult(
+        matrix,
+        acquisition.build_final_geometry(),
+        solution.frames,
+        solution.lost_frames,
+        seconds,
+        solution.response,
+        partial=partial,
+        mean_frame=acquisition.mean_frame,
+        notes=(*collect_solution_notes(solution, matrix), *acquisition.notes()),
+    )
+
+
+def docrime(
+    bench: Bench,
+    *,
+    frames: int | None = None,
+    poke: float | None = None,
+    whiten: bool = True,
+    grid: SensorGeometry | None = None,
+    pattern: type[PokeSequence] = RandomPokes,
+    until: Target | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> Procedure[CalibrationResult]:
+    """Measure the interaction matrix by random pokes, under turbulence or not.
+
+    The sensor's grid is found on the first frames of the run itself, so it costs no sky time.
+
+    Parameters
+    ----------
+    bench
+        An open bench, loop open.
+    frames
+        Frames to take; as configured by default.
+    poke
+        Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
+    whiten
+        Subtract what the past predicts of the turbulence; false gives the paper's plain estimator.
+    grid
+        The sensor's grid, when it is known already.
+    pattern
+        Other pokes than random ones: :class:`~escape_hw.calibration.acquisition.pokes.PushPullPokes` make it
+        a fast push-pull.
+    until
+        Stop before that number of frames when this is reached.
+    keep
+        Where the state is kept meanwhile, and what to go on with.
+
+    Returns
+    -------
+    CalibrationResult
+        With the measured temporal response. Stopped early, ``partial`` is true.
+
+    Raises
+    ------
+    ConfigError
+        A number of frames or a poke that means nothing; nothing moved.
+    TooFewFrames
+        Too few frames for the number of modes; nothing moved.
+    CalibrationError
+        No spots or pupil images, no light, no response, or pokes that do not span the modes.
+    ProductError
+        The state to go on with is damaged or of another run; nothing moved.
+    Aborted
+        Stopped before a matrix could be solved.
+    """
+    criterion = (
+        None if until is None else build_snr_criterion(bench, build_modal_basis(bench), until, pattern.method)
+    )
+    # Nobody asks a matrix how the noise of its slopes is correlated.
+    run = yield from docrime_run(
+        bench, frames=frames, poke=poke, whiten=whiten, grid=grid, correlations=False, pattern=pattern,
+        checkpoint=checkpoint, criterion=criterion,
+    )  # fmt: skip
+    return run.result
+
+
+def minimum_frames(settings: CalibrationSection, n_modes: int, whiten: bool = True) -> int:
+    """Fewest frames that a matrix is worth starting with: twice the unknowns per slope."""
+    return 2 * (n_modes + (settings.whiten_order if whiten else 0) + settings.lags)
+
+
+def require_enough_frames(
+    settings: CalibrationSection, frames: int, n_modes: int, whiten: bool = True
+) -> None:
+    """Raise unless the frames are twice the unknowns per slope.
+
+    Raises
+    ------
+    TooFewFrames
+        Says how many are needed.
+    """
+    needed = minimum_frames(settings, n_modes, whiten)
+    if frames < needed:
+        raise TooFewFrames(
+            f"{frames} frames cannot constrain {n_modes} modes; ask for at least {needed} frames, "
+            "or for fewer modes (basis.n_modes)"
+        )

@@ -1,0 +1,120 @@
+"""Matrices of modes and derivatives of any synthetic model: its own where it has them, else differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import Registration
+from escape_hw.api.results import PEDESTAL
+from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
+
+#: Half steps of the central differences: the registration in its units, then the relative width.
+_DIFFERENCE_STEPS = np.array([2.0, 2.0, 0.05, 0.2, 0.2, 0.02])
+
+
+def modal_matrix(
+    model: SyntheticModel, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+) -> NDArray[np.float64]:
+    """Slopes per unit of each mode ``(n_slopes, n_modes)``.
+
+    Parameters
+    ----------
+    model
+        Any synthetic model.
+    registration
+        Registration of the mirror.
+    m2c
+        Mode-to-command matrix ``(n_act, n_modes)``.
+    width
+        Scale of the influence functions' width relative to nominal.
+    """
+    if isinstance(model, DifferentiableModel):
+        return model.modal_matrix(registration, m2c, width)
+    return np.asarray(model.zonal_matrix(registration, width) @ m2c)
+
+
+def modal_jacobian(
+    model: SyntheticModel, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes per unit of each mode, and their derivatives.
+
+    Parameters
+    ----------
+    model, registration, m2c, width
+        As for :func:`modal_matrix`.
+
+    Returns
+    -------
+    matrix : ndarray, ``(n_slopes, n_modes)``
+    derivatives : ndarray, ``(6, n_slopes, n_modes)``
+        By the five parameters of the registration, in their units, and by the width.
+    """
+    if isinstance(model, DifferentiableModel):
+        return model.modal_jacobian(registration, m2c, width)
+    return _central_differences(lambda r, w: np.asarray(model.zonal_matrix(r, w) @ m2c), registration, width)
+
+
+def zonal_jacobian(
+    model: SyntheticModel, registration: Registration, width: float = 1.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes per unit command ``(n_slopes, n_act)`` and their derivatives ``(6, n_slopes, n_act)``.
+
+    Parameters
+    ----------
+    model, registration, width
+        As for :func:`modal_matrix`.
+    """
+    if isinstance(model, DifferentiableModel):
+        return model.zonal_jacobian(registration, width)
+    return _central_differences(model.zonal_matrix, registration, width)
+
+
+def pedestal_jacobian(
+    model: SyntheticModel,
+    registration: Registration,
+    width: float = 1.0,
+    m2c: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes of the broad pedestal that influence functions may stand on, and their derivatives.
+
+    Parameters
+    ----------
+    model, registration
+        As for :func:`modal_matrix`.
+    width
+        Scale of the influence functions' own width; that of the pedestal is a multiple of it.
+    m2c
+        Modes ``(n_act, n_modes)``; single actuators by default.
+
+    Returns
+    -------
+    matrix : ndarray, ``(n_slopes, n_modes)``
+    derivatives : ndarray, ``(6, n_slopes, n_modes)``
+        By the five parameters of the registration, in their units, and by ``width``.
+    """
+    wide = PEDESTAL * width
+    if m2c is None:
+        broad, derivatives = zonal_jacobian(model, registration, wide)
+    else:
+        broad, derivatives = modal_jacobian(model, registration, m2c, wide)
+    return broad, np.concatenate([derivatives[:5], PEDESTAL * derivatives[5:]])
+
+
+def _central_differences(
+    build_matrix: Callable[[Registration, float], NDArray[np.float64]],
+    registration: Registration,
+    width: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    centre = np.append(registration.to_array(), width)
+    steps = _DIFFERENCE_STEPS * np.append(np.ones(5), width)
+
+    def evaluate(point: NDArray[np.float64]) -> NDArray[np.float64]:
+        return build_matrix(Registration.from_array(point[:5]), float(point[5]))
+
+    derivatives = [
+        (evaluate(centre + step) - evaluate(centre - step)) / (2 * step.sum()) for step in np.diag(steps)
+    ]
+    return build_matrix(registration, width), np.stack(derivatives)

@@ -1,0 +1,1 @@
+"""Optical gains of the modes: comparison of two matrices, estimation from pokes in a running loop, smoothing over the modes, and the bootstrap that closes the loop with a matrix of unknown scale. The closed loop itself is in loop."""

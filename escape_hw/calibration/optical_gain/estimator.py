@@ -1,0 +1,356 @@
+"""Optical gains from the telemetry of a running loop with pokes: the streaming estimator, and the loop that measures with it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.api.results import CalibrationResult
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquisition.frames import next_frame
+from escape_hw.calibration.acquisition.pokes import RandomPokes
+from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, prepare_sensor
+from escape_hw.calibration.acquisition.stopping import CHECK_GROWTH
+from escape_hw.calibration.docrime.estimator import DocrimeEstimator
+from escape_hw.calibration.docrime.response import ResponseEstimate
+from escape_hw.calibration.loop.performance import build_integrator
+from escape_hw.calibration.loop.runner import LoopRecord, RunningLoop
+from escape_hw.calibration.optical_gain.matrix_comparison import projector, scale_matrix, slope_weights
+from escape_hw.errors import CalibrationError, IncompatibleProduct, TooFewFrames
+from escape_hw.pipeline.control.integrator import LeakyIntegrator
+from escape_hw.pipeline.control.reconstructor import reconstructor
+
+#: Frames per mode that the noise of the projected slopes is found on.
+_NOISE_FRAMES_PER_MODE = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpticalGainEstimate:
+    """Gains as measured.
+
+    Parameters
+    ----------
+    value, sigma
+        ``(n_references, n_modes)``, relative to each reference.
+    response
+        Response of the sensor to a step of the mirror, what was known before included.
+    common_sigma
+        Relative standard error that all gains share, from that of the response.
+    frames, lost_frames
+        That they came from.
+    """
+
+    value: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    response: ResponseEstimate
+    common_sigma: float
+    frames: int
+    lost_frames: int
+
+    def mean(self) -> tuple[float, float]:
+        """Weighted mean over the modes of the first reference's gains, and its standard error."""
+        weights = self.sigma[0] ** -2.0
+        value = float(np.average(self.value[0], weights=weights))
+        return value, float(np.hypot(weights.sum() ** -0.5, value * self.common_sigma))
+
+
+class OpticalGainEstimator:
+    """Watches a loop and tells the optical gains of its modes; costs no more than a reconstructor.
+
+    The slopes are projected on the reference's columns first
+    (:func:`~escape_hw.calibration.optical_gain.matrix_comparison.projector`), and what is left, a signal for each mode, goes
+    through the estimator of closed-loop DO-CRIME: the matrix that it finds is one between modes, with
+    the gains on its diagonal, and its errors know how slopes err together. The signals are turned so
+    that their noise is equal and independent, because the temporal response, which all modes share, is
+    found by weighing all of them alike. An observer of :class:`~escape_hw.calibration.loop.runner.RunningLoop`.
+
+    Parameters
+    ----------
+    references
+        Matrices that gains are wanted relative to, of the same slopes and modes.
+    weights
+        Of the slopes ``(n_slopes,)``.
+    order, lags, known
+        As for :class:`~escape_hw.calibration.docrime.estimator.DocrimeEstimator`.
+    """
+
+    def __init__(
+        self,
+        references: Sequence[InteractionMatrix],
+        weights: NDArray[np.float64],
+        *,
+        order: int = 6,
+        lags: int = 5,
+        known_response: ResponseEstimate | None = None,
+    ) -> None:
+        rows = np.concatenate([projector(reference, weights) for reference in references])
+        self._rows = np.ascontiguousarray(rows, np.float32)
+        self._n_modes, self._order, self._lags, self._known_response = (
+            references[0].n_modes,
+            order,
+            lags,
+            known_response,
+        )
+        self._signals = np.zeros(len(rows), np.float32)
+        self._pending_frames: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] = []
+        self._estimator: DocrimeEstimator | None = None
+        self._signal_whitening = np.eye(len(rows))
+
+    def __call__(
+        self,
+        index: int,
+        slopes: NDArray[np.float32],
+        command: NDArray[np.float64],
+        poke: NDArray[np.float64],
+    ) -> None:
+        """Take one frame, the modal command that answered it and the poke in that command."""
+        signals = np.dot(self._rows, slopes, out=self._signals)
+        if self._estimator is not None:
+            self._estimator.partial_fit(index, signals, command, poke)
+            return
+        self._pending_frames.append((index, signals.copy(), np.concatenate([command, poke])))
+        if len(self._pending_frames) >= _NOISE_FRAMES_PER_MODE * self._n_modes:
+            self._start_estimator()
+
+    def solve(self) -> OpticalGainEstimate:
+        """The gains so far.
+
+        Raises
+        ------
+        TooFewFrames
+            Fewer complete frames than modes plus a margin.
+        CalibrationError
+            The sensor does not respond to the pokes.
+        """
+        n, modes = self._n_modes, np.arange(self._n_modes)
+        if self._estimator is None:
+            raise TooFewFrames(
+                f"{len(self._pending_frames)} frames tell nothing of {n} modes; {3 * n} at least are needed"
+            )
+        solution = self._estimator.solve()
+        if solution.covariance is None:
+            raise RuntimeError("the estimator was not asked for correlations")
+        inverse_whitening = np.linalg.inv(self._signal_whitening)
+        matrix = (inverse_whitening @ solution.matrix).reshape(-1, n, n)
+        # An element's variance is the noise of its signal times what the pokes of its mode leave.
+        inverse_poke_power = np.square(solution.sigma[0]) / solution.variance[0]
+        spread = solution.variance / np.diag(solution.covariance)
+        noise = np.einsum(
+            "ij,jk,ik->i",
+            inverse_whitening,
+            solution.covariance * np.sqrt(np.outer(spread, spread)),
+            inverse_whitening,
+        )
+        return OpticalGainEstimate(
+            matrix[:, modes, modes],
+            np.sqrt(np.maximum(noise, 0).reshape(-1, n) * inverse_poke_power),
+            ResponseEstimate(solution.response.weights, solution.response_covariance),
+            solution.gain_sigma,
+            solution.frames,
+            solution.lost_frames,
+        )
+
+    def _start_estimator(self) -> None:
+        """Find how the signals' noise is correlated, on the first frames, and go on with it turned."""
+        n, size = self._n_modes, len(self._rows)
+        index = np.array([one[0] for one in self._pending_frames])
+        signals = np.stack([one[1] for one in self._pending_frames])
+        steps = np.diff(signals, axis=0)[np.diff(index) == 1].astype(np.float64)
+        for start in range(0, size, n):
+            # Each reference by itself: the same slopes stand behind all of them.
+            block = slice(start, start + n)
+            noise = np.atleast_2d(np.cov(steps[:, block].T))
+            noise[np.diag_indices(n)] += 1e-3 * np.trace(noise) / n
+            self._signal_whitening[block, block] = np.linalg.inv(np.linalg.cholesky(noise))
+        self._rows = np.ascontiguousarray(self._signal_whitening @ self._rows, np.float32)
+        self._estimator = DocrimeEstimator(
+            size, n, order=self._order, lags=self._lags, closed=True, known_response=self._known_response
+        )
+        commands_and_pokes = np.stack([one[2] for one in self._pending_frames])
+        self._estimator.extend(
+            index, (signals @ self._signal_whitening.T).astype(np.float32), commands_and_pokes
+        )
+        self._pending_frames = []
+
+
+#: Frames after a change of gain or reconstructor that count for nothing.
+SETTLING_FRAMES = 60
+#: Frames between two looks at a running loop.
+_SEGMENT_FRAMES = 500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopSegment:
+    """What a stretch of the loop told: gains (``None``: no answer to the pokes), residual in nm."""
+
+    gains: OpticalGainEstimate | None
+    residual_nm: float
+    frames: int
+    diverged: bool
+    record: LoopRecord
+    reason: str = ""
+
+
+class GainMeasurementLoop:
+    """A loop whose pokes measure the optical gains of its matrix, and whose matrix can be scaled.
+
+    Mirror and sensor answer in the same time from one measurement to the next, whatever the gains do: each
+    goes on with the temporal response that those before it found, from larger pokes as a rule. Whoever
+    makes one calls :meth:`open_loop` in a ``finally``.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    calibration
+        The matrix that closes the loop, with its geometry.
+    beside
+        Other matrices of the same geometry and modes whose gains are wanted, too.
+    science
+        Whether to gather the frames of the science camera.
+
+    Raises
+    ------
+    ConfigError, IncompatibleProduct, CalibrationError
+        The matrix cannot close this loop; nothing moved.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        calibration: CalibrationResult,
+        beside: Mapping[str, InteractionMatrix],
+        *,
+        science: bool = False,
+    ) -> None:
+        self.bench, self.reference = bench, calibration.matrix
+        for name, matrix in beside.items():
+            _require_same_modes(self.reference, name, matrix)
+        self._references = [self.reference, *beside.values()]
+        self._weights = slope_weights(calibration.measured or self.reference)
+        self.control: LeakyIntegrator = build_integrator(bench, self.reference, calibration.grid)
+        self._dropped = bench.config.loop.dropped_modes
+        self._stroke = np.sqrt(np.mean(np.square(self.reference.m2c), axis=0))
+        self._known_response: ResponseEstimate | None = None
+        # Refused here, before anything moves, if a mode is noise.
+        self._estimator = self._new_estimator()
+        prepare_sensor(bench)
+        slopes_of = build_slope_function(bench, calibration.grid)
+        self._loop = RunningLoop(bench, self.reference.m2c, slopes_of, self.control, science=science)
+        self._science = bench.science if science else None
+        self.frames = 0
+
+    def start(self) -> None:
+        """Flatten the mirror and read the first frame; what was lost before is no loss of the loop."""
+        self.bench.dm.flatten()
+        next_frame(self.bench)
+        if self._science is not None:
+            self._science.stop()
+
+    def open_loop(self) -> None:
+        """Open the loop: the mirror flat, the controller without memory."""
+        self.bench.dm.flatten()
+        self.control.reset()
+        if self._science is not None:
+            self._science.stop()
+
+    def scale(self, gains: NDArray[np.float64]) -> None:
+        """Go on with the matrix scaled by gains ``(n_modes,)``, without a bump.
+
+        Raises
+        ------
+        CalibrationError
+            The scaled matrix cannot be inverted.
+        """
+        matrix = scale_matrix(self.reference, gains)
+        self.control.set_reconstructor(
+            reconstructor(matrix.data, scale=self._stroke, dropped_modes=self._dropped)
+        )
+
+    def measure(
+        self,
+        frames: int,
+        amplitude: NDArray[np.float64],
+        stage: str,
+        *,
+        max_frames: int | None = None,
+        is_sufficient: Callable[[OpticalGainEstimate], bool] = lambda gains: True,
+    ) -> Procedure[LoopSegment]:
+        """Poke and measure the gains, the loop staying closed.
+
+        Parameters
+        ----------
+        frames
+            Fewest frames.
+        amplitude
+            Of each mode's pokes ``(n_modes,)``.
+        stage
+            Name of the stage in progress reports.
+        most
+            Frames to go on to until ``is_sufficient``; as ``frames`` by default.
+        enough
+            Asked now and then.
+        """
+        max_frames = frames if max_frames is None else max(max_frames, frames)
+        pokes, loop, estimator = RandomPokes(amplitude, self.bench.rng), self._loop, self._new_estimator()
+        self._estimator = estimator
+        report = Reporter(stage, max_frames)
+        loop.record = LoopRecord()
+        yield from loop.run(SETTLING_FRAMES, inject=pokes, report=report)
+        n_settling, done, next_check = len(loop.record.residual), 0, frames
+        gains, reason = None, ""
+        while done < max_frames and not loop.record.diverged:
+            step = min(_SEGMENT_FRAMES, next_check - done)
+            yield from loop.run(step, inject=pokes, observe=(estimator,), report=report)
+            done += step
+            if done < next_check or loop.record.diverged:
+                continue
+            next_check = min(max_frames, int(next_check * CHECK_GROWTH) + 1)
+            gains, reason = _try_solve(estimator)
+            if gains is not None and is_sufficient(gains):
+                break
+        self.frames += loop.record.frames
+        if gains is not None and not loop.record.diverged:
+            self._known_response = gains.response
+        residual = np.array(loop.record.residual[n_settling:])
+        rms = float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan
+        return LoopSegment(gains, rms, done, loop.record.diverged, loop.record, reason)
+
+    def solve_latest(self) -> OpticalGainEstimate | None:
+        """What the last measurement found, also when it was aborted; ``None`` if it was too short."""
+        return _try_solve(self._estimator)[0]
+
+    def _new_estimator(self) -> OpticalGainEstimator:
+        c = self.bench.config.calibration
+        return OpticalGainEstimator(
+            self._references,
+            self._weights,
+            order=c.whiten_order,
+            lags=c.lags,
+            known_response=self._known_response,
+        )
+
+
+def _require_same_modes(reference: InteractionMatrix, name: str, matrix: InteractionMatrix) -> None:
+    """Raise :class:`IncompatibleProduct` unless a matrix has the reference's slopes and modes."""
+    if not np.array_equal(matrix.valid, reference.valid):
+        raise IncompatibleProduct(
+            f"{name} was measured on other sub-apertures than the matrix that closes the loop, so its gains "
+            "cannot be told; measure it on the same geometry (grid= of the calibration)"
+        )
+    if matrix.m2c.shape != reference.m2c.shape or not np.allclose(matrix.m2c, reference.m2c):
+        raise IncompatibleProduct(f"{name} is of other modes than the matrix that closes the loop")
+
+
+def _try_solve(estimator: OpticalGainEstimator) -> tuple[OpticalGainEstimate | None, str]:
+    """The gains, or why there are none."""
+    try:
+        return estimator.solve(), ""
+    except (TooFewFrames, CalibrationError) as error:
+        return None, str(error)

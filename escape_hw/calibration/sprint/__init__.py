@@ -1,0 +1,1 @@
+"""SPRINT: registration and gain of mirror and sensor from an interaction matrix or from telemetry, its uncertainty, and the pseudo-synthetic matrix that follows. The estimation of interaction matrices is in docrime and push_pull; following a registration in a running loop is in tracking."""

@@ -1,0 +1,319 @@
+"""Registration-only least-squares solvers of SPRINT: damped Gauss-Newton for one gain and five parameters (paper, Eq. argmin_simple), the same in batches of a few modes, and with one gain per mode (Eq. argmin_full)."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import Registration
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix
+from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
+
+#: Largest move in one iteration, in the units of the parameters: the model is only locally linear.
+MAX_STEP = np.array([120.0, 120.0, 4.0, 8.0, 8.0])
+#: A step below this, or below a fiftieth of the standard error, ends the descent.
+NEGLIGIBLE_STEP = np.array([5e-3, 5e-3, 2e-4, 2e-3, 2e-3])
+#: A step below this share of the largest leaves the derivatives as they were.
+_REUSE_JACOBIAN_BELOW = 0.1
+#: Levenberg's damping after a step that made things worse, and where to give up.
+_FIRST_DAMPING, _MAX_DAMPING = 1e-2, 1e4
+
+
+@dataclass(slots=True, eq=False)
+class LeastSquaresFit:
+    """Gain and registration at some point of the descent.
+
+    Parameters
+    ----------
+    alpha
+        The registration ``(5,)``.
+    gain
+        The gain that fits best there.
+    unit
+        The model's matrix at gain 1 ``(n_slopes, n_modes)``, in standard errors.
+    derivatives
+        Its derivatives by the registration ``(5, n_slopes, n_modes)``, at this place or near it.
+    residual
+        What is left ``(n_slopes, n_modes)``, in standard errors.
+    step
+        The last step ``(5,)``; zero at the start.
+    settled
+        Whether the next step would be too small to matter.
+    """
+
+    alpha: NDArray[np.float64]
+    gain: float
+    model_matrix: NDArray[np.float64]
+    derivatives: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    step: NDArray[np.float64]
+    steps_converged: bool = False
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared residual."""
+        return float(np.square(self.residual).sum())
+
+    def information(self) -> NDArray[np.float64]:
+        """Information on gain and registration ``(6, 6)``."""
+        flat = self.projected_jacobian().reshape(6, -1)
+        return np.asarray(flat @ flat.T)
+
+    def projected_jacobian(self) -> NDArray[np.float64]:
+        """Derivatives by gain and registration ``(6, n_slopes, n_modes)``."""
+        return np.concatenate([self.model_matrix[None], self.gain * self.derivatives])
+
+
+class LeastSquaresProblem:
+    """A weighted matrix and the model that is to explain it.
+
+    Parameters
+    ----------
+    weighted
+        The measured matrix.
+    model
+        The synthetic model.
+    learning_rate
+        Share of each step that is taken, in (0, 1] (paper: gamma).
+    frozen
+        Whether the derivatives stay those of the start, as in the first publications: an iteration then
+        costs a matrix instead of a matrix and its derivatives, and there are more of them.
+    """
+
+    def __init__(
+        self,
+        weighted: WeightedMatrix,
+        model: SyntheticModel,
+        learning_rate: float = 1.0,
+        frozen: bool = False,
+    ) -> None:
+        self.weighted, self._model, self._learning_rate = weighted, model, learning_rate
+        self._relinearise_above = np.inf if frozen else _REUSE_JACOBIAN_BELOW
+        self._modes = weighted.modes
+
+    def matrix(self, alpha: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The model's matrix at gain 1, in standard errors."""
+        registration = Registration.from_array(alpha)
+        return self.weighted.weigh(modal_matrix(self._model, registration, self._modes))
+
+    def linearise(self, alpha: NDArray[np.float64], step: NDArray[np.float64]) -> LeastSquaresFit:
+        """Model, derivatives and gain about a registration."""
+        parts = modal_jacobian(self._model, Registration.from_array(alpha), self._modes)
+        model_matrix, derivatives = (self.weighted.weigh(part) for part in parts)
+        return self._fit(alpha, model_matrix, derivatives[:5], step)
+
+    def explained_fraction(self, alpha: NDArray[np.float64]) -> float:
+        """Share of the squared elements that the model explains at its best gain."""
+        model_matrix = self.matrix(alpha)
+        return self.weighted.explained_fraction(
+            self.weighted.data - self._best_gain(model_matrix) * model_matrix
+        )
+
+    def descend(
+        self, start: NDArray[np.float64], iterations: int
+    ) -> Generator[LeastSquaresFit, None, LeastSquaresFit]:
+        """Yield every accepted step from a start, the start included; return the last."""
+        fit, damping = self.linearise(start, np.zeros(5)), 0.0
+        yield fit
+        for _ in range(iterations):
+            step = self.step(fit, damping)
+            if step is None or (fit.steps_converged and damping == 0):
+                break
+            longest = float(np.max(np.abs(step) / MAX_STEP))
+            step = step * self._learning_rate / max(longest, 1.0)
+            trial = self._fit(fit.alpha + step, self.matrix(fit.alpha + step), fit.derivatives, step)
+            if trial.cost < fit.cost:
+                damping = damping / 10 if damping > 1e-6 else 0.0
+                fit = trial if longest < self._relinearise_above else self.linearise(trial.alpha, step)
+                yield fit
+                continue
+            damping = max(10 * damping, _FIRST_DAMPING)
+            if fit.steps_converged or damping > _MAX_DAMPING:
+                break
+        return fit
+
+    def step(self, fit: LeastSquaresFit, damping: float) -> NDArray[np.float64] | None:
+        """Damped Gauss-Newton step of the registration; also tells the fit whether it has settled."""
+        information = fit.information()
+        right = fit.projected_jacobian().reshape(6, -1) @ fit.residual.ravel()
+        try:
+            step = np.linalg.solve(information + damping * np.diag(np.diag(information)), right)[1:]
+            spread = np.sqrt(np.abs(np.diag(np.linalg.inv(information))))[1:]
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(step).all():
+            return None
+        spread *= self.weighted.noise(fit.residual)
+        fit.steps_converged = bool((np.abs(step) < np.maximum(NEGLIGIBLE_STEP, 0.02 * spread)).all())
+        return np.asarray(step)
+
+    def _best_gain(self, model_matrix: NDArray[np.float64]) -> float:
+        return float(
+            np.vdot(model_matrix, self.weighted.data)
+            / max(float(np.vdot(model_matrix, model_matrix)), 1e-300)
+        )
+
+    def _fit(
+        self,
+        alpha: NDArray[np.float64],
+        model_matrix: NDArray[np.float64],
+        derivatives: NDArray[np.float64],
+        step: NDArray[np.float64],
+    ) -> LeastSquaresFit:
+        gain = self._best_gain(model_matrix)
+        return LeastSquaresFit(
+            alpha, gain, model_matrix, derivatives, self.weighted.data - gain * model_matrix, step
+        )
+
+
+#: Modes of a batch (paper: about five).
+BATCH_SIZE = 5
+
+
+class BatchProblem:
+    """A weighted matrix that is looked at a few modes at a time.
+
+    Parameters
+    ----------
+    weighted
+        The measured matrix.
+    model
+        The synthetic model.
+    learning_rate
+        Share of each step that is taken (paper: gamma). At 1 every batch forgets what those before it
+        found, and the answer is that of the last; the less, the more batches it averages over.
+    """
+
+    def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, learning_rate: float) -> None:
+        self._learning_rate = learning_rate
+        starts = range(0, weighted.data.shape[1], BATCH_SIZE)
+        self._batches = [
+            LeastSquaresProblem(weighted.columns(slice(k, k + BATCH_SIZE)), model) for k in starts
+        ]
+        self._all_modes = LeastSquaresProblem(weighted, model)
+
+    def descend(
+        self, start: NDArray[np.float64], iterations: int
+    ) -> Generator[LeastSquaresFit, None, tuple[LeastSquaresFit, NDArray[np.float64]]]:
+        """Yield the fit of every batch before its step.
+
+        Returns
+        -------
+        fit : LightFit
+            On all modes, where the last batch led to; settled when a whole round led nowhere new.
+        scatter : ndarray, ``(5, 5)``
+            Covariance of the answer by the scatter of the batches' own answers in the last round: the
+            stationary variance of a walk that moves by ``gamma`` times what is missing, ``gamma /
+            (2 - gamma)`` of theirs.
+        """
+        alpha, steps_converged = start, False
+        batch_solutions = np.zeros((len(self._batches), 5))
+        for _ in range(iterations):
+            round_start = alpha
+            for number, problem in enumerate(self._batches):
+                fit = problem.linearise(alpha, np.zeros(5))
+                full_step = problem.step(fit, 0.0)
+                if full_step is None:
+                    batch_solutions[number] = alpha
+                    continue
+                batch_solutions[number] = alpha + full_step
+                step = self._learning_rate * full_step / max(1.0, float(np.max(np.abs(full_step) / MAX_STEP)))
+                fit.step = step
+                yield fit
+                alpha = alpha + step
+            spread = np.sqrt(np.diag(self._batch_covariance(batch_solutions)))
+            if (np.abs(alpha - round_start) < np.maximum(NEGLIGIBLE_STEP, 0.02 * spread)).all():
+                steps_converged = True
+                break
+        last = self._all_modes.linearise(alpha, np.zeros(5))
+        last.steps_converged = steps_converged
+        return last, self._batch_covariance(batch_solutions)
+
+    def _batch_covariance(self, batch_solutions: NDArray[np.float64]) -> NDArray[np.float64]:
+        if len(batch_solutions) < 2:
+            return np.zeros((5, 5))
+        return np.asarray(np.cov(batch_solutions.T) * self._learning_rate / (2 - self._learning_rate))
+
+
+class DiagonalProblem:
+    """A weighted matrix whose modes have gains of their own.
+
+    Parameters
+    ----------
+    weighted
+        The measured matrix.
+    model
+        The synthetic model.
+    learning_rate
+        Share of each step of the registration that is taken.
+    """
+
+    def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, learning_rate: float) -> None:
+        self.weighted, self._model, self._learning_rate = weighted, model, learning_rate
+        self._modes = weighted.modes
+
+    def descend(
+        self, start: NDArray[np.float64], iterations: int
+    ) -> Generator[LeastSquaresFit, None, LeastSquaresFit]:
+        """Yield every state from a start on; return the last.
+
+        Its gain is the mean gain, and its derivatives are those that no mode's gain can imitate, so
+        that information and errors count the gains as unknown.
+        """
+        alpha, step = start, np.zeros(5)
+        for _ in range(iterations + 1):
+            registration = Registration.from_array(alpha)
+            parts = modal_jacobian(self._model, registration, self._modes)
+            model_matrix, derivatives = (self.weighted.weigh(part) for part in parts)
+            power = np.maximum(np.square(model_matrix).sum(axis=0), 1e-300)
+            gains = (model_matrix * self.weighted.data).sum(axis=0) / power
+            registration_jacobian = gains * derivatives[:5]
+            residual = self.weighted.data - gains * model_matrix
+            fit = _build_fit(alpha, gains, model_matrix, registration_jacobian, power, residual, step)
+            full_step = _solve_step(registration_jacobian, residual)
+            if full_step is None:
+                return fit
+            spread = np.sqrt(np.abs(np.diag(np.linalg.pinv(fit.information()))))[1:]
+            spread *= self.weighted.noise(residual)
+            fit.steps_converged = bool((np.abs(full_step) < np.maximum(NEGLIGIBLE_STEP, 0.02 * spread)).all())
+            yield fit
+            if fit.steps_converged:
+                break
+            step = self._learning_rate * full_step / max(1.0, float(np.max(np.abs(full_step) / MAX_STEP)))
+            alpha = alpha + step
+        return fit
+
+
+def _solve_step(
+    derivatives: NDArray[np.float64], residual: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """The step that these derivatives ``(5, ...)`` ask for; ``None`` where they tell nothing."""
+    flat = derivatives.reshape(5, -1)
+    try:
+        step = np.linalg.solve(flat @ flat.T, flat @ residual.ravel())
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(step) if np.isfinite(step).all() else None
+
+
+def _build_fit(
+    alpha: NDArray[np.float64],
+    gains: NDArray[np.float64],
+    model_matrix: NDArray[np.float64],
+    registration_jacobian: NDArray[np.float64],
+    power: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    step: NDArray[np.float64],
+) -> LeastSquaresFit:
+    """As a fit with one gain, the mean of all by what they explain."""
+    mean = float(np.average(gains, weights=power))
+    projected = (
+        registration_jacobian
+        - model_matrix * ((registration_jacobian * model_matrix).sum(axis=1) / power)[:, None]
+    )
+    scale = mean if mean else 1.0
+    return LeastSquaresFit(alpha, mean, model_matrix, projected / scale, residual, step)

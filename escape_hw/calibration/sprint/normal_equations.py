@@ -1,0 +1,266 @@
+"""What a synthetic model does not know: random effects that SPRINT fits beside the registration.
+
+Each effect has a prior of zero mean (its scatter among instruments of a kind), so that the data
+decide how much of it there is, and the registration's error bars include it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Priors:
+    """Prior scatter of the model's unknowns, relative (rms).
+
+    Parameters
+    ----------
+    actuator_gain
+        Gains of single actuators.
+    actuator_width
+        Widths of single influence functions.
+    slope_gain
+        Gains of single slopes: uneven light, spot size and alignment with the pixels.
+    sampling
+        Where within its lenslet a slope samples the wavefront, in % of a sub-aperture; common to the
+        x slopes of a column and to the y slopes of a row, which fall on the pixels alike.
+    width, shape
+        Common width of the influence functions, and the share of a broad pedestal in them.
+    mean_width
+        Width to expect beyond nominal: zero, unless an earlier fit has told it.
+    extras
+        Mean and scatter of each extra unknown, in its own prior scatters; zero and one, where none are
+        given because no earlier fit has told them.
+    shared
+        Variance of the noise in what an actuator moves, over that of as many slopes with noise of their own:
+        the fit takes noise for independent, so priors of the actuators' gains count by so much more.
+    """
+
+    actuator_gain: float = 0.1
+    actuator_width: float = 0.05
+    slope_gain: float = 0.1
+    width: float = 0.2
+    shape: float = 0.2
+    sampling: float = 0.5
+    mean_width: float = 0.0
+    extras: tuple[tuple[float, float], ...] = ()
+    noise_inflation: float = 1.0
+
+
+@dataclass(slots=True, eq=False)
+class NormalEquations:
+    """Gauss-Newton system of one linearisation, in units of the data's standard errors.
+
+    The unknowns are, in order: the common parameters (gain, five of the registration, width, shape,
+    shares of the model's variants), sampling positions, trends of the slope gains, actuator gains,
+    actuator widths, slope gains.
+    A slope's gain touches no other slope, so its block is diagonal and is eliminated first.
+
+    Parameters
+    ----------
+    inner
+        Normal matrix of all unknowns but the slope gains ``(n_inner, n_inner)``.
+    across
+        Its coupling with the slope gains ``(n_slopes, n_inner)``.
+    diagonal
+        The slope gains' own part ``(n_slopes,)``.
+    whole
+        ``inner`` with the slope gains eliminated.
+    right
+        Right-hand side of the whole system.
+    common, sampled, slopes_gain, slopes_width, modes, model, residual, lines, trends
+        As handed to :func:`normal_equations`.
+    """
+
+    inner: NDArray[np.float64]
+    coupling: NDArray[np.float64]
+    diagonal: NDArray[np.float64]
+    schur_complement: NDArray[np.float64]
+    right_hand_side: NDArray[np.float64]
+    common: NDArray[np.float64]
+    sampling_derivative: NDArray[np.float64]
+    gain_derivative: NDArray[np.float64]
+    width_derivative: NDArray[np.float64]
+    modes: NDArray[np.float64]
+    model: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    lines: NDArray[np.intp]
+    trends: NDArray[np.float64]
+
+    @property
+    def n_common(self) -> int:
+        """Number of common parameters."""
+        return len(self.common)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The whole normal matrix, written out."""
+        return np.block([[self.inner, self.coupling.T], [self.coupling, np.diag(self.diagonal)]])
+
+    def solve(self) -> NDArray[np.float64]:
+        """The Gauss-Newton step, in the order of the unknowns."""
+        n = len(self.inner)
+        scaled = self.right_hand_side[n:] / self.diagonal
+        first = np.linalg.solve(self.schur_complement, self.right_hand_side[:n] - self.coupling.T @ scaled)
+        return np.concatenate([first, scaled - self.coupling @ first / self.diagonal])
+
+    def information(self) -> NDArray[np.float64]:
+        """Information on the common parameters ``(n_common, n_common)``, random effects integrated out."""
+        k, schur_complement = self.n_common, self.schur_complement
+        return np.asarray(
+            schur_complement[:k, :k]
+            - schur_complement[:k, k:] @ np.linalg.solve(schur_complement[k:, k:], schur_complement[k:, :k])
+        )
+
+    def noise(self, precision: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Covariance that the data's noise alone gives the common parameters ``(n_common, n_common)``.
+
+        The inverse of :meth:`information` holds besides what the priors leave open, which is the same
+        in every repetition.
+
+        Parameters
+        ----------
+        precision
+            Prior precision of every unknown, as handed to :func:`normal_equations`.
+        """
+        k, n = self.n_common, len(self.inner)
+        inverse_columns = np.linalg.inv(self.schur_complement)[:, :k]
+        by_slope = self.coupling @ inverse_columns / self.diagonal[:, None]
+        prior_part = inverse_columns.T @ (precision[:n, None] * inverse_columns) + by_slope.T @ (
+            precision[n:, None] * by_slope
+        )
+        return np.asarray(inverse_columns[:k] - prior_part)
+
+    def posterior_variance(self) -> NDArray[np.float64]:
+        """Variance of every unknown given the data and the priors ``(n,)``, in the order of the unknowns."""
+        inverse = np.linalg.inv(self.schur_complement)
+        coupled = self.coupling / self.diagonal[:, None]
+        of_slopes = 1 / self.diagonal + np.einsum("sp,sp->s", coupled @ inverse, coupled)
+        return np.concatenate([np.diag(inverse), of_slopes])
+
+    def projected_jacobian(self) -> NDArray[np.float64]:
+        """Derivatives by the common parameters, less what the random effects can imitate.
+
+        Returns
+        -------
+        ndarray, ``(n_common, n_slopes, n_modes)``
+        """
+        k, n_act, n_trends = self.n_common, len(self.modes), self.trends.shape[1]
+        schur_complement = self.schur_complement
+        inner = np.linalg.solve(schur_complement[k:, k:], schur_complement[k:, :k])
+        by_slope = (self.coupling[:, :k] - self.coupling[:, k:] @ inner) / self.diagonal[:, None]
+        n_lines = len(inner) - n_trends - 2 * n_act
+        ends = np.cumsum([n_lines, n_trends, n_act])
+        out = np.empty_like(self.common)
+        for p in range(k):
+            by_line, by_trend, by_gain, by_width = np.split(inner[:, p], ends)
+            acting = (self.gain_derivative * by_gain + self.width_derivative * by_width) @ self.modes
+            out[p] = self.common[p] - acting - (by_slope[:, p] + self.trends @ by_trend)[:, None] * self.model
+            if n_lines:
+                out[p] -= by_line[self.lines, None] * self.sampling_derivative
+        return out
+
+    def estimate_noise_inflation(self) -> float:
+        """See :attr:`Priors.noise_inflation`; told by what is left, the model's misfit included, and at least 1.
+
+        The noise of neighbouring slopes is alike where the air is, so it does not average out over the slopes
+        that one actuator moves. Columns have independent noise, so they tell how little it does.
+        """
+        observed = float(np.square(self.gain_derivative.T @ self.residual).sum())
+        independent = float(np.square(self.gain_derivative).sum()) * self.residual.shape[1]
+        return float(max(observed / max(independent, 1e-300), 1.0))
+
+
+def normal_equations(
+    common: NDArray[np.float64],
+    gain_derivative: NDArray[np.float64],
+    width_derivative: NDArray[np.float64],
+    modes: NDArray[np.float64],
+    model: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    precision: NDArray[np.float64],
+    offset: NDArray[np.float64],
+    sampling_derivative: NDArray[np.float64] | None = None,
+    lines: NDArray[np.intp] | None = None,
+    trends: NDArray[np.float64] | None = None,
+) -> NormalEquations:
+    """Assemble the system; no array of the size of all derivatives is ever formed.
+
+    Parameters
+    ----------
+    common
+        Weighted derivatives by the common parameters ``(n_common, n_slopes, n_modes)``.
+    slopes_gain, slopes_width
+        Weighted zonal matrices ``(n_slopes, n_act)``: derivative by an actuator's gain or width is the
+        outer product of its column and its row of ``modes``.
+    modes
+        Weighted mode-to-command matrix ``(n_act, n_modes)``.
+    model, residual
+        Weighted model and residual ``(n_slopes, n_modes)``.
+    precision
+        Prior precision of every unknown.
+    offset
+        Present value of every unknown minus its prior mean.
+    sampled, lines
+        Weighted derivatives of each slope by where it samples ``(n_slopes, n_modes)``, and the number
+        of the line of sub-apertures ``(n_slopes,)`` that it shares the unknown with; none by default.
+    trends
+        What trends add to the gain of each slope ``(n_slopes, n_trends)``; none by default.
+    """
+    if trends is None:
+        trends = np.zeros((len(model), 0))
+    if sampling_derivative is None or lines is None:
+        sampling_derivative, lines = np.zeros_like(model), np.zeros(len(model), np.intp)
+        member = np.zeros((len(model), 0))
+    else:
+        member = (lines[:, None] == np.arange(lines.max() + 1)).astype(float)
+    k, n_modes = common.shape[0], model.shape[1]
+    flat, zonal = common.reshape(k, -1), (gain_derivative, width_derivative)
+    overlap = modes @ modes.T
+    acting = np.block([[(a.T @ b) * overlap for b in zonal] for a in zonal])
+    onto_modes = (common.reshape(-1, n_modes) @ modes.T).reshape(k, len(model), -1)
+    common_acting = np.concatenate([(onto_modes * z).sum(axis=1) for z in zonal], axis=1)
+    common_line = np.einsum("psm,sm->ps", common, sampling_derivative) @ member
+    sampled_modes = sampling_derivative @ modes.T
+    line_acting = member.T @ np.concatenate([sampled_modes * z for z in zonal], axis=1)
+    line = np.diag(np.square(sampling_derivative).sum(axis=1) @ member)
+    model_modes, residual_modes = model @ modes.T, residual @ modes.T
+    by_common = np.einsum("sm,psm->sp", model, common)
+    by_line = member * (model * sampling_derivative).sum(axis=1)[:, None]
+    by_acting = np.concatenate([model_modes * z for z in zonal], axis=1)
+    power, score = np.square(model).sum(axis=1), np.einsum("sm,sm->s", model, residual)
+    # A trend is a sum of slope gains, and so are its products with everything else.
+    by_trend = trends * power[:, None]
+    coupling = np.concatenate([by_common, by_line, by_trend, by_acting], axis=1)
+    trend = trends.T @ coupling
+    common_trend, line_trend, trend_trend, trend_acting = np.split(
+        trend, np.cumsum([k, member.shape[1], trends.shape[1]]), axis=1
+    )
+    inner = np.block(
+        [
+            [flat @ flat.T, common_line, common_trend.T, common_acting],
+            [common_line.T, line, line_trend.T, line_acting],
+            [common_trend, line_trend, trend_trend, trend_acting],
+            [common_acting.T, line_acting.T, trend_acting.T, acting],
+        ]
+    )
+    right_hand_side = np.concatenate(
+        [
+            flat @ residual.ravel(),
+            (residual * sampling_derivative).sum(axis=1) @ member,
+            score @ trends,
+            *(np.einsum("sa,sa->a", z, residual_modes) for z in zonal),
+            score,
+        ]
+    )
+    n = len(inner)
+    inner[np.diag_indices(n)] += precision[:n]
+    diagonal = power + precision[n:]
+    schur_complement = inner - coupling.T @ (coupling / diagonal[:, None])
+    return NormalEquations(
+        inner, coupling, diagonal, schur_complement, right_hand_side - precision * offset,
+        common, sampling_derivative, gain_derivative, width_derivative, modes, model, residual, lines, trends,
+    )  # fmt: skip

@@ -1,0 +1,252 @@
+"""The ways in which SPRINT solves its problem, each behind the same few words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.procedure import Procedure, Progress, Reporter
+from escape_hw.api.registration import TO_STREAM_UNITS, Registration
+from escape_hw.api.results import ActuatorCorrections, SprintIteration
+from escape_hw.api.synthetic_model import HasSlopeWeights, SyntheticModel
+from escape_hw.calibration.sprint.coarse_search import low_mode_problem, search_registration
+from escape_hw.calibration.sprint.covariance import LinearisedProblem
+from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
+from escape_hw.calibration.sprint.least_squares import (
+    NEGLIGIBLE_STEP,
+    BatchProblem,
+    DiagonalProblem,
+    LeastSquaresFit,
+    LeastSquaresProblem,
+)
+from escape_hw.calibration.sprint.mixed_effects import MixedEffectsProblem, MixedEffectsState, PriorEstimate
+from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors
+from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
+from escape_hw.config.system import Solver
+
+T = TypeVar("T")
+
+#: Largest move in one iteration: the model is only locally linear.
+MAX_STEP = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
+#: A step is halved, so many times at most, as long as it makes squares grow by more than this factor.
+_MAX_HALVINGS, _COST_TOLERANCE = 6, 1.02
+#: Steps that go to and fro are shortened down to this share, beyond which it is hopeless.
+_MIN_RATE_FRACTION = 0.125
+#: Solvers that take the columns for modes, and so need a matrix.
+MATRIX_ONLY_SOLVERS: tuple[Solver, ...] = ("batches", "diagonal")
+
+
+@dataclass(slots=True, eq=False)
+class SolverContext:
+    """What is the same for every solver of one matrix, and the steps that were taken.
+
+    Parameters
+    ----------
+    matrix, model, columns
+        The measured matrix, the model, and which columns to fit.
+    solver, learning_rate, max_iterations, priors
+        As for :func:`~escape_hw.calibration.sprint.fit.sprint`.
+    extras
+        What to fit beside the registration.
+    """
+
+    matrix: InteractionMatrix
+    model: SyntheticModel
+    columns: NDArray[np.intp]
+    solver: Solver
+    learning_rate: float
+    max_iterations: int
+    priors: Priors
+    extras: tuple[ExtraParameterModel, ...] = ()
+    history: list[SprintIteration] = field(default_factory=list)
+    report: Reporter = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.report = Reporter("SPRINT", self.max_iterations, "iteration")
+
+    def progress(self, sigma: NDArray[np.float64] | None = None) -> Progress:
+        """The iterations so far; with the standard errors of the last ``(5,)`` once they are known."""
+        rows = np.array([step.registration.to_array() for step in self.history]).reshape(-1, 5)
+        errors = np.full(5, np.nan) if sigma is None else sigma
+        arrays = {
+            "registration": (rows * TO_STREAM_UNITS).astype(np.float32),
+            "registration_sigma": (errors * TO_STREAM_UNITS).astype(np.float32),
+            "step_norm": np.array([step.step_norm for step in self.history], np.float32),
+        }
+        return self.report.now(arrays)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SprintSolution:
+    """Where a descent ended, alike for every solver.
+
+    ``zonal_matrix`` gives the matrix that was found ``(n_slopes, n_act)``, ``estimate_priors`` what the data say about the
+    scatter of the random effects, and ``actuator_corrections`` those of the mirror, where there are any; each is
+    worked out when asked for. ``added_covariance`` is what is to be added to the covariance of the registration
+    ``(5, 5)``; ``extras`` is what was fitted beside it; ``remaining_step`` is the whole step from where it
+    ended ``(5,)``.
+    """
+
+    system: LinearisedProblem
+    alpha: NDArray[np.float64]
+    gain: float
+    width: float
+    steps_converged: bool
+    zonal_matrix: Callable[[], NDArray[np.float64]]
+    added_covariance: NDArray[np.float64] | None = None
+    estimate_priors: Callable[[], PriorEstimate] | None = None
+    extras: tuple[FittedExtraParameter, ...] = ()
+    actuator_corrections: Callable[[], ActuatorCorrections] | None = None
+    remaining_step: NDArray[np.float64] | None = None
+
+
+def solve(
+    context: SolverContext, weighted: WeightedMatrix, start: NDArray[np.float64], coarse_search: bool
+) -> Procedure[SprintSolution]:
+    """Solve for a weighted matrix.
+
+    Parameters
+    ----------
+    descent
+        Matrix, model and how to solve; the steps are kept there.
+    weighted
+        The columns, weighted.
+    start
+        Registration to start from ``(5,)``.
+    reach
+        Whether to come from afar first.
+    """
+    model, rate, max_iterations = context.model, context.learning_rate, context.max_iterations
+    if context.solver in MATRIX_ONLY_SOLVERS:
+        low = low_mode_problem(context.matrix, model, context.columns, rate) if coarse_search else None
+        if low is not None:
+            start = (yield from _record_steps(low.descend(start, max_iterations), context)).alpha
+        if context.solver == "diagonal":
+            return _solution_from_least_squares(
+                (
+                    yield from _record_steps(
+                        DiagonalProblem(weighted, model, rate).descend(start, max_iterations), context
+                    )
+                ),
+                model,
+            )
+        steps = BatchProblem(weighted, model, rate).descend(start, max_iterations)
+        fit, added_covariance = yield from _record_steps(steps, context)
+        return _solution_from_least_squares(fit, model, added_covariance)
+    frozen = context.solver == "frozen"
+    if coarse_search:
+        search = search_registration(
+            context.matrix, model, context.columns, start, max_iterations, rate, frozen
+        )
+        least_squares_fit = yield from _record_steps(search, context)
+        start = least_squares_fit.alpha
+    # From afar all slopes count, those that the model is none of, too.
+    if context.solver != "effects" and (not coarse_search or isinstance(model, HasSlopeWeights)):
+        least_squares_fit = yield from _record_steps(
+            LeastSquaresProblem(weighted, model, rate, frozen).descend(start, max_iterations), context
+        )
+    if context.solver != "effects":
+        return _solution_from_least_squares(least_squares_fit, model)
+    problem = MixedEffectsProblem(weighted, model, context.priors, extras=context.extras)
+    return (yield from _fit_mixed_effects(problem, Registration.from_array(start), context))
+
+
+def _solution_from_least_squares(
+    fit: LeastSquaresFit, model: SyntheticModel, added_covariance: NDArray[np.float64] | None = None
+) -> SprintSolution:
+    def zonal_matrix() -> NDArray[np.float64]:
+        return np.asarray(fit.gain * model.zonal_matrix(Registration.from_array(fit.alpha)))
+
+    return SprintSolution(fit, fit.alpha, fit.gain, 1.0, fit.steps_converged, zonal_matrix, added_covariance)
+
+
+def _record_steps(steps: Generator[LeastSquaresFit, None, T], context: SolverContext) -> Procedure[T]:
+    """Hand on the progress of a descent and keep its steps."""
+    while True:
+        try:
+            fit = next(steps)
+        except StopIteration as done:
+            last: T = done.value
+            return last
+        norm = float(np.linalg.norm(fit.step / MAX_STEP))
+        context.history.append(_iteration_record(fit.alpha, fit.gain, fit.residual, norm))
+        if context.report.step():
+            yield context.progress()
+
+
+def _fit_mixed_effects(
+    problem: MixedEffectsProblem, start: Registration, context: SolverContext
+) -> Procedure[SprintSolution]:
+    """Gauss-Newton on registration and random effects together."""
+    state, steps_converged = problem.start(start), False
+    system = problem.linearise(state)
+    rate, previous_step = context.learning_rate, np.zeros(5)
+    for _ in range(context.max_iterations):
+        if context.report.step():
+            yield context.progress()
+        step = system.solve()
+        remaining_step = step[1:6]
+        if not np.isfinite(step).all():
+            break
+        spread = np.sqrt(np.abs(np.diag(np.linalg.inv(system.information()))))[1:6]
+        spread *= problem.weighted.noise(system.residual)
+        relative = np.abs(step[1:6]) / np.maximum(NEGLIGIBLE_STEP, 0.02 * spread)
+        norm = float(np.linalg.norm(step[1:6] / MAX_STEP))
+        context.history.append(_iteration_record(state.alpha, state.gain, system.residual, norm))
+        if relative.max() < 1.0:
+            steps_converged = True
+            break
+        if step[1:6] / MAX_STEP @ previous_step < -0.5 * (previous_step @ previous_step):
+            # To and fro: what the model is not linear in sends each step back by as much as the last.
+            rate /= 2
+            if rate < _MIN_RATE_FRACTION * context.learning_rate:
+                break
+        previous_step = step[1:6] / MAX_STEP
+        damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / MAX_STEP)))
+        step = step * damping * rate
+        state, system = _take_step(problem, state, system, step)
+    else:
+        # The last step was a share of what was wanted then; this is what is wanted now.
+        remaining_step = system.solve()[1:6]
+    return SprintSolution(
+        system, state.alpha, state.gain, 1 + state.width, steps_converged,
+        lambda: problem.zonal_matrix(state), estimate_priors=lambda: problem.estimate_priors(state, system),
+        extras=problem.extra_parameter_values(state), actuator_corrections=lambda: problem.actuator_corrections(state, system),
+        remaining_step=remaining_step,
+    )  # fmt: skip
+
+
+def _take_step(
+    problem: MixedEffectsProblem, state: MixedEffectsState, system: NormalEquations, step: NDArray[np.float64]
+) -> tuple[MixedEffectsState, NormalEquations]:
+    """The state after a step, or after a part of it where the whole would make things clearly worse.
+
+    Gain and shares multiply: on a pyramid that is far from its model at rest a whole step may end where
+    the model is another one.
+    """
+    largest_cost = _COST_TOLERANCE * _cost(problem, state, system)
+    for _ in range(_MAX_HALVINGS):
+        trial_state = problem.move(state, step)
+        trial_system = problem.linearise(trial_state)
+        if _cost(problem, trial_state, trial_system) <= largest_cost:
+            break
+        step = step / 2
+    return trial_state, trial_system
+
+
+def _cost(problem: MixedEffectsProblem, state: MixedEffectsState, system: NormalEquations) -> float:
+    """Squares of what is left and of the distances from the priors, in standard errors."""
+    offset = problem.offset(state)
+    return float(np.vdot(system.residual, system.residual) + offset @ (problem.precision * offset))
+
+
+def _iteration_record(
+    alpha: NDArray[np.float64], gain: float, residual: NDArray[np.float64], norm: float
+) -> SprintIteration:
+    chi2 = float(np.mean(np.square(residual)))
+    return SprintIteration(Registration.from_array(alpha), gain, norm, chi2)

@@ -1,0 +1,230 @@
+"""The pseudo-synthetic interaction matrix: the synthetic model at an estimated registration, with the fitted actuator corrections and propagated standard errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.api.registration import Registration
+from escape_hw.api.results import PEDESTAL, CalibrationResult, RegistrationEstimate
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquisition.frames import build_interaction_matrix
+from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix, pedestal_jacobian
+from escape_hw.calibration.sprint.extra_parameters import build_fitted_extra_parameters
+
+
+def compute_fitted_matrix(
+    model: SyntheticModel,
+    registration: Registration,
+    estimate: RegistrationEstimate,
+    m2c: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Slopes per unit of each mode ``(n_slopes, n_modes)`` of the mirror that was found, at unit gain.
+
+    Departures belong to actuators, so any basis will do, not only the one that was measured.
+
+    Parameters
+    ----------
+    model
+        The synthetic model.
+    here
+        Where the mirror sits.
+    estimate
+        What SPRINT found of it, extra unknowns included; without departures, the drawing's mirror at the
+        estimated width.
+    m2c
+        Modes ``(n_act, n_modes)``.
+    """
+    scaled_modes = _apply_actuator_gains(estimate, m2c)
+    return _add_corrections(
+        modal_matrix(model, registration, scaled_modes, estimate.width.value),
+        model,
+        registration,
+        estimate,
+        scaled_modes,
+    )
+
+
+def compute_fitted_jacobian(
+    model: SyntheticModel, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The matrix at the estimated registration, its derivatives, and what unequal actuators leave open.
+
+    Parameters
+    ----------
+    model, estimate, m2c
+        As for :func:`compute_fitted_matrix`.
+
+    Returns
+    -------
+    matrix : ndarray, ``(n_slopes, n_modes)``
+    derivatives : ndarray, ``(6, n_slopes, n_modes)``
+        By the five parameters of the registration and by the width.
+    variance : ndarray, ``(n_slopes, n_modes)``
+        Of the matrix, from the errors of the actuators' gains; 0 without departures.
+    """
+    registration, corrections, width = (
+        estimate.registration,
+        estimate.actuator_corrections,
+        estimate.width.value,
+    )
+    scaled_modes = _apply_actuator_gains(estimate, m2c)
+    unit, derivatives = modal_jacobian(model, registration, scaled_modes, width)
+    actuator_variance = np.zeros_like(unit)
+    if corrections is not None:
+        scaled_value, single = corrections.pedestal, model.zonal_matrix(registration, width)
+        derivatives = derivatives + scaled_value * (
+            pedestal_jacobian(model, registration, width, scaled_modes)[1] - derivatives
+        )
+        single = single + scaled_value * (model.zonal_matrix(registration, width * PEDESTAL) - single)
+        actuator_variance = np.square(single) @ np.square(corrections.gain_sigma[:, None] * m2c)
+    return _add_corrections(unit, model, registration, estimate, scaled_modes), derivatives, actuator_variance
+
+
+def _apply_actuator_gains(estimate: RegistrationEstimate, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Modes as actuators of unequal gains make them ``(n_act, n_modes)``."""
+    corrections = estimate.actuator_corrections
+    return m2c if corrections is None else (1 + corrections.gain)[:, None] * m2c
+
+
+def _add_corrections(
+    unit: NDArray[np.float64],
+    model: SyntheticModel,
+    registration: Registration,
+    estimate: RegistrationEstimate,
+    scaled_modes: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """A matrix with what extra unknowns add to it, and unequal widths and the pedestal to first order."""
+    corrections, width = estimate.actuator_corrections, estimate.width.value
+    for one in build_fitted_extra_parameters(model, estimate.extras):
+        scaled_value = estimate.extras[one.name].value / one.prior_sigma
+        unit = unit + scaled_value * (one.matrix_change(registration, width, scaled_value) @ scaled_modes)
+    if corrections is None:
+        return unit
+    scaled_value, wider = corrections.pedestal, corrections.width[:, None] * scaled_modes
+    pedestal_change = modal_matrix(model, registration, scaled_modes, width * PEDESTAL) - modal_matrix(
+        model, registration, scaled_modes, width
+    )
+    own = modal_jacobian(model, registration, wider, width)[1][5]
+    width_change = own + scaled_value * (pedestal_jacobian(model, registration, width, wider)[1][5] - own)
+    return np.asarray(unit + scaled_value * pedestal_change + width * width_change)
+
+
+def compute_pseudo_synthetic_matrix(
+    model: SyntheticModel, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The model's matrix at an estimated registration, and its standard errors.
+
+    Parameters
+    ----------
+    model
+        The synthetic model.
+    estimate
+        Result of SPRINT; what it found of single actuators is in the matrix.
+    m2c
+        Modal basis ``(n_act, n_modes)``.
+
+    Returns
+    -------
+    matrix, sigma : ndarray, ``(n_slopes, n_modes)``
+        The errors are those of registration, gain and the actuators' gains, propagated to first order.
+    """
+    gain = estimate.gain.value
+    unit, derivatives, actuator_variance = compute_fitted_jacobian(model, estimate, m2c)
+    jacobian = gain * derivatives[:5]
+    variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
+    variance += np.square(unit * estimate.gain.sigma) + gain**2 * actuator_variance
+    return gain * unit, np.sqrt(np.maximum(variance, 0))
+
+
+def synthesise_calibration(
+    bench: Bench, grid: SensorGeometry, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+) -> CalibrationResult:
+    """A calibration made of a registration alone, with nothing moved.
+
+    Parameters
+    ----------
+    bench
+        Gives the model.
+    grid
+        The sensor's grid.
+    estimate
+        The registration.
+    m2c
+        Modal basis ``(n_act, n_modes)``.
+    """
+    data, sigma = compute_pseudo_synthetic_matrix(bench.model(grid), estimate, m2c)
+    matrix = build_interaction_matrix(bench, grid, m2c, data, sigma, "escape", gain=estimate.gain.value)
+    return CalibrationResult(matrix, grid, 0, 0, 0.0, registration=estimate)
+
+
+def synthesise_from_measurement(
+    measured: CalibrationResult, model: SyntheticModel, estimate: RegistrationEstimate
+) -> CalibrationResult:
+    """The pseudo-synthetic matrix behind a measured one, with no bench at hand.
+
+    Parameters
+    ----------
+    measured
+        The calibration whose matrix was fitted.
+    model
+        The synthetic model on the geometry of that calibration.
+    estimate
+        The registration that fits it.
+    """
+    data, sigma = compute_pseudo_synthetic_matrix(model, estimate, measured.matrix.m2c)
+    matrix = replace(
+        measured.matrix, data=data.astype(np.float32), sigma=sigma.astype(np.float32), method="escape",
+        metrics={"gain": estimate.gain.value},
+    )  # fmt: skip
+    return replace(measured, matrix=matrix, measured=None, registration=estimate)
+
+
+def static_light_matrix(bench: Bench, calibration: CalibrationResult) -> InteractionMatrix | None:
+    """A pyramid's pseudo-synthetic matrix for light that hardly moves, as a closed loop leaves it.
+
+    Under the turbulence of the open loop, where its matrix was fitted, a pyramid's answer has another shape.
+    Lenslets answer alike, and their model is the better for the motion, which averages over the pixels.
+    Nothing moves.
+
+    Parameters
+    ----------
+    bench
+        Gives the model.
+    calibration
+        With the registration.
+
+    Returns
+    -------
+    InteractionMatrix or None
+        Of the same modes; ``None`` for a matrix that is not pseudo-synthetic, or not a pyramid's.
+    """
+    estimate, pupils = calibration.registration, calibration.grid
+    if estimate is None or calibration.matrix.method != "escape" or not isinstance(pupils, PyramidPupils):
+        return None
+    return synthesise_from_measurement(
+        calibration, bench.model(pupils.with_slope_statistics(0.0)), estimate
+    ).matrix
+
+
+def simulated(bench: Bench, grid: SensorGeometry, m2c: NDArray[np.float64]) -> CalibrationResult:
+    """What the model says of a mirror that stands where the design has it; nothing moves, nothing is fitted.
+
+    Parameters
+    ----------
+    bench
+        Gives the model.
+    grid
+        The sensor's grid.
+    m2c
+        Modal basis ``(n_act, n_modes)``.
+    """
+    data = modal_matrix(bench.model(grid), Registration(), m2c)
+    matrix = build_interaction_matrix(bench, grid, m2c, data, np.zeros_like(data), "simulated")
+    return CalibrationResult(matrix, grid, 0, 0, 0.0)

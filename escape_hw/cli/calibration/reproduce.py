@@ -1,0 +1,291 @@
+"""``escape reproduce``: the paper's tables and figures on the twins, with a report."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.context import CommandContext, command_context
+
+app = typer.Typer(help="The paper's tables and figures on the twins, with a report.", no_args_is_help=True)
+_SYSTEM = "razor-shwfs"
+_SystemOption = Annotated[str, typer.Option("--system", help="System to run on.")]
+
+
+@app.command("shwfs")
+def shwfs(
+    system: _SystemOption = _SYSTEM,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")] = 10_000,
+    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 30_000,
+    plants: Annotated[
+        int, typer.Option("--plants", min=0, help="Random plants for the curve of error against frames.")
+    ] = 4,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Calibrate with and without a source, close the loop with every matrix, compare."""
+    with command_context("reproduce shwfs", json=json, quiet=quiet) as context:
+        counts = {"frames": frames, "loop_frames": loop_frames, "realisations": plants}
+        result, document = _run_case(
+            context, "shwfs", counts, options.SystemSelection.of(system, set, seed, mode), out
+        )
+        _show_comparison(context, result, document)
+
+
+@app.command("pywfs")
+def pywfs(
+    system: Annotated[str, typer.Option("--system", help="System to run on.")] = "razor-pywfs",
+    frames: Annotated[
+        int, typer.Option("--frames", min=1, help="Frames of the open-loop DO-CRIME.")
+    ] = 100_000,
+    closed_frames: Annotated[
+        int, typer.Option("--closed-frames", min=1, help="Frames of each round in closed loop, at most.")
+    ] = 20_000,
+    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 20_000,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Matrices, optical gains and loops with and without them, on the pyramid bench."""
+    with command_context("reproduce pywfs", json=json, quiet=quiet) as context:
+        counts = {"frames": frames, "closed_frames": closed_frames, "loop_frames": loop_frames}
+        result, document = _run_case(
+            context, "pywfs", counts, options.SystemSelection.of(system, set, seed, mode), out
+        )
+        _show_comparison(context, result, document)
+
+
+@app.command("maps")
+def maps(
+    system: Annotated[str, typer.Option("--system", help="System to run on.")] = "maps-nir",
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")] = 60_000,
+    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 10_000,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """A matrix measured on the sky beside its simulation, and the loop on ESCAPE's, with a dirty mirror."""
+    with command_context("reproduce maps", json=json, quiet=quiet) as context:
+        counts = {"frames": frames, "loop_frames": loop_frames}
+        result, document = _run_case(
+            context, "maps", counts, options.SystemSelection.of(system, set, seed, mode), out
+        )
+        _show_comparison(context, result, document)
+
+
+@app.command("table1")
+def table1(
+    system: _SystemOption = _SYSTEM,
+    short: Annotated[int, typer.Option("--short", min=1, help="Frames of the SHORT run.")] = 10_000,
+    long: Annotated[int, typer.Option("--long", min=1, help="Frames of the LONG run.")] = 100_000,
+    out: options.Out = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Registration from 20 seconds and from 3 minutes of data (paper, Table 1)."""
+    with command_context("reproduce table1", json=json, quiet=quiet) as context:
+        counts = {"short": short, "long": long}
+        result, document = _run_case(
+            context, "table1", counts, options.SystemSelection.of(system, set, seed, mode), out
+        )
+        _show_registration(context, result.calibrations, document)
+        _show_criteria(context, document)
+
+
+@app.command("all")
+def reproduce_all(
+    out: Annotated[Path, typer.Option("--out", help="Folder; each part gets a folder of its own in it.")],
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="A part (table1, shwfs, pywfs, maps); repeatable.")
+    ] = None,
+    share: Annotated[
+        float,
+        typer.Option("--share", min=0.001, max=1.0, help="Share of the frames: 0.1 to see that it works."),
+    ] = 1.0,
+    sweeps: Annotated[
+        list[Path] | None,
+        typer.Option("--sweep", metavar="RUN", help="A finished sweep to show beside; repeatable."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Take the parts that are finished in --out as they are.")
+    ] = False,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Every table and figure one after the other, and a page that leads to their reports."""
+    with command_context("reproduce all", json=json, quiet=quiet) as context:
+        from escape_hw.cli.formatting import format_criteria
+        from escape_hw.config.loader import load_system
+        from escape_hw.io import documents
+        from escape_hw.paper.cases import (
+            check_share,
+            find_sweeps,
+            load_finished,
+            request_fields,
+            select_cases,
+        )
+        from escape_hw.paper.results import write_index, write_results
+
+        parts: dict[str, Any] = {}
+        sweep_folders = find_sweeps(sweeps or [])
+        done = {
+            case.kind: load_finished(
+                out / case.kind, case.kind, request_fields(case.scaled_frames(share), set, seed)
+            )
+            if resume
+            else None
+            for case in select_cases(only)
+        }
+        remaining = [case for case in select_cases(only) if done[case.kind] is None]
+        choices = {case.kind: options.SystemSelection.of(case.system, set, seed, None) for case in remaining}
+        check_share(
+            [(case, load_system(case.system, overrides=set or [], seed=seed)) for case in remaining], share
+        )
+        try:
+            for case in select_cases(only):
+                context.notify(f"{case.kind}: {case.title}")
+                saved_part = done[case.kind]
+                if saved_part is None:
+                    counts = case.scaled_frames(share)
+                    _, saved_part = _run_case(context, case.kind, counts, choices[case.kind], out / case.kind)
+                else:
+                    context.notify(f"{case.kind}: finished {saved_part['finished_utc']}, not run again")
+                parts[case.kind] = saved_part
+                context.show(*format_criteria(parts[case.kind]["criteria"]))
+        finally:
+            if parts:
+                context.show(f"index: {write_index(out, parts)}")
+                folders = {kind: Path(part["folder"]) for kind, part in parts.items()}
+                context.show(f"results: {write_results(out, {**folders, **sweep_folders})}")
+        met = all(check["met"] for part in parts.values() for check in part["criteria"])
+        simulated = any(part["simulated"] for part in parts.values())
+        header_fields = documents.header_fields("reproduce all", None, simulated, seed)
+        context.result(
+            {**header_fields, "parts": parts, "index": str(out.absolute() / "index.html")}, met=met
+        )
+
+
+@app.command("sky-time")
+def sky_time(
+    system: _SystemOption = _SYSTEM,
+    plants: Annotated[int, typer.Option("--plants", min=2, help="Random plants.")] = 20,
+    frames: Annotated[
+        list[int] | None, typer.Option("--frames", min=1, help="Frames to take the errors at; repeatable.")
+    ] = None,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Parallel processes.")] = 2,
+    set: options.Set = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Error of the registration against frames, by estimator, with the Cramer-Rao bound."""
+    with command_context("reproduce sky-time", json=json, quiet=quiet) as context:
+        from escape_hw.io import documents
+        from escape_hw.paper import sky_time as campaign
+
+        config = context.load_config(options.SystemSelection.of(system, set, None, "sim"))
+        counts = sorted(frames or campaign.FRAMES)
+        procedure = campaign.sky_time(
+            system, plants=plants, frames=counts, overrides=set or [], workers=workers
+        )
+        curves, stop = context.run_keeping_partial(procedure)
+        header_fields = documents.header_fields(
+            "reproduce sky-time", config.system.name, True, config.system.seed
+        )
+        context.show(_curves_table(campaign.table_rows(curves)))
+        least = ", ".join(f"{name}: {n or 'none of these'}" for name, n in curves["fewest_frames"].items())
+        context.show(f"fewest frames that meet the goal in every parameter: {least}")
+        if "note" in curves:
+            context.notify(curves["note"])
+        met = "note" not in curves and curves["fewest_frames"]["telemetry"] is not None
+        context.result({**header_fields, **curves}, met=met)
+        if stop is not None:
+            raise stop
+
+
+def _curves_table(rows: Any) -> Any:
+    from rich.table import Table
+
+    from escape_hw.api.registration import PARAMETERS, UNITS
+
+    table = Table("estimator", "frames", *(f"{p} [{UNITS[p]}]" for p in PARAMETERS), title="rms error (chi2)")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _run_case(
+    context: CommandContext,
+    kind: str,
+    counts: dict[str, int],
+    selection: options.SystemSelection,
+    out: Path | None,
+) -> tuple[Any, dict[str, Any]]:
+    """Open, run, close, keep; what an aborted run has measured is kept before it says so.
+
+    What the user sets goes after what the case plants in the twin.
+    """
+    from escape_hw.paper.cases import CASES, request_fields
+
+    case = CASES[kind]
+    asked = request_fields(counts, selection.set, selection.seed)
+    selection = replace(selection, set=(*case.overrides, *selection.set))
+    config = context.load_config(selection)
+    with context.run_folder(config, f"reproduce-{kind}", out) as folder:
+        with context.bench(selection) as bench:
+            from escape_hw.runtime.session.record import BenchRecord
+
+            record = replace(BenchRecord.from_bench(bench), asked=asked)
+            result, stop = context.run_keeping_partial(case.procedure(bench, **counts))
+        with context.protect_saving(stop):
+            document = case.save(folder, record, result, context.wall_seconds)
+        context.result(document, met=all(entry["met"] for entry in document["criteria"]))
+        if stop is not None:
+            raise stop
+    return result, document
+
+
+def _show_comparison(context: CommandContext, result: Any, document: dict[str, Any]) -> None:
+    from escape_hw.cli.formatting import rich_table, status_line
+    from escape_hw.report.tables import strehl_table
+
+    context.show(status_line(document["simulated"], False))
+    if "ESCAPE" in result.calibrations:
+        _show_registration(context, {"": result.calibrations["ESCAPE"]}, document)
+    context.show(rich_table(strehl_table(result.loops)))
+    context.show(*result.notes)
+    _show_criteria(context, document)
+
+
+def _show_registration(context: CommandContext, columns: dict[str, Any], document: dict[str, Any]) -> None:
+    from escape_hw.api.registration import Registration
+    from escape_hw.cli.formatting import rich_table
+    from escape_hw.report.tables import registration_table
+
+    found = {label: item.registration for label, item in columns.items() if item.registration is not None}
+    planted = Registration(**document["planted"]) if document["planted"] else None
+    context.show(rich_table(registration_table(found, planted)))
+
+
+def _show_criteria(context: CommandContext, document: dict[str, Any]) -> None:
+    from escape_hw.cli.formatting import format_criteria
+
+    context.show(*format_criteria(document["criteria"]), f"report: {document['products']['report']}")

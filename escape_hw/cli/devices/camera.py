@@ -1,0 +1,217 @@
+"""``escape camera``: hands on a camera, without any calibration."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.devices.device_tools import (
+    announce_change,
+    build_single_device,
+    open_device,
+    report_device_result,
+)
+
+if TYPE_CHECKING:
+    from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
+    from escape_hw.config.devices import CameraConfig
+    from escape_hw.config.system import SystemConfig
+
+app = typer.Typer(
+    help="Take frames from a camera, watch it or set it, on twin and metal.", no_args_is_help=True
+)
+Which = Annotated[
+    Literal["wfs", "science"], typer.Option("--camera", help="The wavefront sensor's or the science camera.")
+]
+
+
+@app.command("snap")
+def snap(
+    system: options.System,
+    camera: Which = "wfs",
+    frames: Annotated[int, typer.Option("--frames", min=1, max=100000, help="How many.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="FITS file (default: nothing is written).")
+    ] = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Take frames with the settings of the configuration."""
+    with command_context("camera snap", json=json, quiet=quiet) as context:
+        import numpy as np
+
+        from escape_hw.errors import ConfigError
+        from escape_hw.runtime.host.device_tools import grab_frames
+
+        config, section, device = _camera(
+            context, options.SystemSelection.of(system, set, seed, mode), camera
+        )
+        if out is not None and out.exists():
+            raise ConfigError(f"{out}: exists already; choose another name or remove it first")
+        with open_device(context, device):
+            settings, changed = _apply_configuration(context, config, camera, device)
+            frame_list = context.run(grab_frames(device, frames, section.timeout_s))
+            info, status = device.info, device.status()
+        if out is not None:
+            _save(out, frame_list, info, settings, config)
+        cube = np.stack([frame.data for frame in frame_list])
+        counts = {"min": int(cube.min()), "max": int(cube.max()), "mean": float(cube.mean())}
+        saturated = max(frame.n_saturated for frame in frame_list)
+        context.show(
+            f"{info.model} {info.serial}: {len(frame_list)} frames of {cube.shape[2]} x {cube.shape[1]} pixels, "
+            f"{status.lost} lost, counts {counts['min']} to {counts['max']}, mean {counts['mean']:.1f}, "
+            f"{saturated} saturated",
+            *([f"written: {out}"] if out is not None else []),
+        )
+        report_device_result(
+            context, "camera snap", config, info.simulated, changed, camera=camera, frames=len(frame_list),
+            shape=cube.shape[1:], counts=counts, saturated=saturated, lost=status.lost,
+            first_index=frame_list[0].index, settings=asdict(settings), file=out,
+        )  # fmt: skip
+
+
+@app.command("stream")
+def stream(
+    system: options.System,
+    camera: Which = "wfs",
+    seconds: Annotated[float, typer.Option("--seconds", min=0.01, max=86400, help="How long.")] = 1.0,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Watch a camera run: rate, lost frames, counts. Exit code 1 when frames were lost."""
+    with command_context("camera stream", json=json, quiet=quiet) as context:
+        from escape_hw.runtime.host.device_tools import monitor_camera as watch
+
+        config, section, device = _camera(
+            context, options.SystemSelection.of(system, set, seed, mode), camera
+        )
+        with open_device(context, device):
+            settings, changed = _apply_configuration(context, config, camera, device)
+            statistics = context.run(watch(device, seconds, section.timeout_s))
+            info = device.info
+        context.show(
+            f"{info.model} {info.serial}: {statistics.frames} frames at {statistics.rate_hz:.2f} Hz "
+            f"(asked {settings.frame_rate_hz:.2f}), {statistics.status.lost} lost, "
+            f"{statistics.status.timeouts} time-outs",
+            f"counts {statistics.lowest} to {statistics.highest}, mean {statistics.mean:.1f}, {statistics.saturated} saturated",
+        )
+        report_device_result(
+            context, "camera stream", config, info.simulated, changed,
+            camera=camera, settings=asdict(settings), **asdict(statistics),
+        )  # fmt: skip
+        context.code = context.code or int(statistics.status.lost > 0)
+
+
+@app.command("settings")
+def settings(
+    system: options.System,
+    camera: Which = "wfs",
+    exposure: Annotated[float | None, typer.Option("--exposure", help="Exposure time, seconds.")] = None,
+    rate: Annotated[float | None, typer.Option("--frame-rate", help="Frames per second, hertz.")] = None,
+    gain: Annotated[float | None, typer.Option("--gain", help="Analogue gain, decibels.")] = None,
+    region: Annotated[
+        str | None, typer.Option("--region", metavar="X,Y,WIDTH,HEIGHT", help="Region read, pixels.")
+    ] = None,
+    check: Annotated[bool, typer.Option("--check", help="Only tell what would be; set nothing.")] = False,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+) -> None:
+    """Check settings, then set them: tells what the camera makes of them, as TOML to paste."""
+    with command_context("camera settings", json=json) as context:
+        config, section, device = _camera(
+            context, options.SystemSelection.of(system, set, seed, mode), camera
+        )
+        requested = _requested_settings(section.settings(), exposure, rate, gain, region)
+        if not check:
+            announce_change(context, config, camera, "exposure, frame rate, gain and region")
+        with open_device(context, device):
+            achievable = device.check(requested)
+            now = achievable if check else device.configure(requested)
+            info = device.info
+        context.show(f"[devices.{camera}]", *_format_toml(now))
+        if now != requested:
+            context.notify(f"asked: {requested}")
+        report_device_result(
+            context, "camera settings", config, info.simulated, not check,
+            camera=camera, asked=asdict(requested), settings=asdict(now), as_asked=now == requested,
+        )  # fmt: skip
+
+
+def _camera(
+    context: CommandContext, selection: options.SystemSelection, key: str
+) -> tuple[SystemConfig, CameraConfig, Camera]:
+    from escape_hw.api.camera import Camera
+
+    config, device = build_single_device(context, selection, key, Camera)  # type: ignore[type-abstract]
+    section: CameraConfig = getattr(config.devices, key)
+    return config, section, device
+
+
+def _apply_configuration(
+    context: CommandContext, config: SystemConfig, key: str, device: Camera
+) -> tuple[CameraSettings, bool]:
+    """Give the open camera the settings of its section; what is in force, and whether that is a change."""
+    before, requested = device.settings, getattr(config.devices, key).settings()
+    if before == requested:
+        return before, False
+    announce_change(context, config, key, "the settings of the configuration")
+    return device.configure(requested), True
+
+
+def _requested_settings(
+    base: CameraSettings, exposure: float | None, rate: float | None, gain: float | None, region: str | None
+) -> CameraSettings:
+    """The configured settings with those asked for.
+
+    Raises
+    ------
+    ConfigError
+        The region is not four whole numbers.
+    """
+    from escape_hw.api.camera import Region
+    from escape_hw.errors import ConfigError
+
+    if region is not None:
+        parts = region.split(",")
+        if len(parts) != 4 or not all(part.strip().isdigit() for part in parts):
+            raise ConfigError(f"--region {region}: write X,Y,WIDTH,HEIGHT in whole pixels")
+        base = replace(base, region=Region(*map(int, parts)))
+    return replace(
+        base,
+        exposure_s=base.exposure_s if exposure is None else exposure,
+        frame_rate_hz=base.frame_rate_hz if rate is None else rate,
+        gain_db=base.gain_db if gain is None else gain,
+    )
+
+
+def _format_toml(settings: CameraSettings) -> list[str]:
+    r = settings.region
+    return [
+        f"region = [{r.x}, {r.y}, {r.width}, {r.height}]",
+        f"exposure_s = {settings.exposure_s:.9g}",
+        f"frame_rate_hz = {settings.frame_rate_hz:.9g}",
+        f"gain_db = {settings.gain_db:.9g}",
+    ]
+
+
+def _save(
+    out: Path, frame_list: list[Frame], info: CameraInfo, settings: CameraSettings, config: SystemConfig
+) -> None:
+    from escape_hw.io.fits.frames import save_frames
+    from escape_hw.io.provenance import Provenance
+
+    origin = Provenance(config.to_toml(), seed=config.system.seed, serials={"camera": info.serial})
+    save_frames(out, frame_list, info, settings, config.system.name, origin)

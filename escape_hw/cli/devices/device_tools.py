@@ -1,0 +1,70 @@
+"""What the commands for single devices share: the device alone, and a word before it changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from escape_hw.cli.context import CommandContext
+from escape_hw.cli.options import SystemSelection
+
+if TYPE_CHECKING:
+    from escape_hw.api.device import Device
+    from escape_hw.config.system import SystemConfig
+
+D = TypeVar("D", bound="Device")
+
+
+def is_on_hardware(config: SystemConfig, key: str) -> bool:
+    """True when this device of the system is a real one."""
+    from escape_hw.bench import resolve_mode
+
+    return resolve_mode(getattr(config.devices, key), config) == "hardware"
+
+
+def announce_change(context: CommandContext, config: SystemConfig, key: str, what: str) -> None:
+    """Say before it happens that a real device is about to change, and how."""
+    if is_on_hardware(config, key):
+        serial = getattr(config.devices, key).serial
+        context.notify(f"this changes hardware, devices.{key} {serial}: {what}")
+
+
+@contextmanager
+def open_device(context: CommandContext, device: D) -> Iterator[D]:
+    """The device, open; closed at the end whatever happens, and no Ctrl-C breaks into that."""
+    context.devices_opened = True
+    try:
+        with device:
+            try:
+                yield device
+            finally:
+                context.interrupts.begin_closing()
+    finally:
+        context.interrupts.end_closing()
+
+
+def report_device_result(
+    context: CommandContext, command: str, config: SystemConfig, simulated: bool, changed: bool, **rest: Any
+) -> None:
+    """The command's document."""
+    from escape_hw.io.documents import header_fields
+
+    start = header_fields(command, config.system.name, simulated, config.system.seed)
+    context.result({**start, "changed": changed, **rest})
+
+
+def build_single_device(
+    context: CommandContext, selection: SystemSelection, key: str, kind: type[D]
+) -> tuple[SystemConfig, D]:
+    """Configuration and one device of a system, not open.
+
+    Raises
+    ------
+    ConfigError
+        Wrong configuration, or no such device.
+    """
+    from escape_hw.bench import build_device
+
+    config = context.load_config(selection)
+    return config, build_device(key, config, kind)

@@ -1,0 +1,88 @@
+"""``escape emulate``: answers on a device's own wire, for its driver to be tried on without the device."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.context import CommandContext, command_context
+
+if TYPE_CHECKING:
+    from escape_hw.api.emulator import Emulator
+
+#: How often new complaints are looked for, in seconds.
+_POLL_S = 0.2
+
+
+def emulate(
+    name: Annotated[str, typer.Argument(help="Device, such as e727; without one: the list.")] = "",
+    host: Annotated[str, typer.Option("--host", help="Network interface to listen on.")] = "127.0.0.1",
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=0, max=65535, help="TCP port (default: the device's; 0: any free)."),
+    ] = None,
+    pty: Annotated[bool, typer.Option("--pty", help="On a pseudo-terminal instead of the network.")] = False,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", metavar="KEY=VALUE", help="Setting of this emulator; repeatable."),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0, help="Stop after so long (default: at Ctrl-C).")
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Stand in for a device on its own wire until Ctrl-C; tells what a client did wrong (exit code 1)."""
+    with command_context("emulate", json=json) as context:
+        from escape_hw.api.emulator import EmulatorRequest
+        from escape_hw.config.registry import EMULATORS, available, emulator_factory
+        from escape_hw.io.documents import header_fields
+
+        document = header_fields("emulate", None, True, None)
+        if not name:
+            context.show(*available(EMULATORS))
+            context.result({**document, "emulators": list(available(EMULATORS))})
+            return
+        request = EmulatorRequest(host, port, pty, dict(map(_parse_option, option or ())))
+        emulator = emulator_factory(name)(request)
+        context.result({**document, "emulator": name, **_serve(context, name, emulator, seconds)})
+        if emulator.complaints:
+            context.code = context.code or 1
+
+
+def _parse_option(text: str) -> tuple[str, str]:
+    """``KEY=VALUE`` as a pair."""
+    from escape_hw.errors import ConfigError
+
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise ConfigError(f"--option {text}: write KEY=VALUE")
+    return key, value
+
+
+def _serve(context: CommandContext, name: str, emulator: Emulator, seconds: float | None) -> dict[str, Any]:
+    """Run an emulator until its time is over or somebody stops it; returns what there is to tell."""
+    deadline = None if seconds is None else time.monotonic() + seconds
+    n_reported = 0
+    address = emulator.start()
+    try:
+        context.notify(f"{name}: {address}")
+        while deadline is None or time.monotonic() < deadline:
+            n_reported = _report_new_complaints(context, name, emulator, n_reported)
+            time.sleep(_POLL_S if deadline is None else min(_POLL_S, max(deadline - time.monotonic(), 0)))
+    except KeyboardInterrupt:
+        context.notify(f"{name}: stopped")
+    finally:
+        emulator.stop()
+    _report_new_complaints(context, name, emulator, n_reported)
+    return {"address": address, "complaints": list(emulator.complaints), **emulator.report()}
+
+
+def _report_new_complaints(context: CommandContext, name: str, emulator: Emulator, n_reported: int) -> int:
+    """Tell the complaints after number ``n_reported``; returns how many are told by now."""
+    complaints = emulator.complaints
+    for complaint in complaints[n_reported:]:
+        context.notify(f"{name}: complaint: {complaint}")
+    return len(complaints)

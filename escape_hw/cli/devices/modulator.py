@@ -1,0 +1,171 @@
+"""``escape modulator``: hands on the tip-tilt modulator, without any calibration."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.devices.device_tools import open_device
+
+if TYPE_CHECKING:
+    from escape_hw.api.modulator import Modulation, ModulatorStatus, TipTiltModulator
+    from escape_hw.config.devices import ModulatorConfig
+    from escape_hw.config.system import SystemConfig
+
+app = typer.Typer(help="Start, stop or ask the tip-tilt modulator, on twin and metal.", no_args_is_help=True)
+
+
+@app.command("start")
+def start(
+    system: options.System,
+    radius: Annotated[
+        float | None,
+        typer.Option("--radius", min=0, help="lambda/D on the pyramid (default: as configured)."),
+    ] = None,
+    frequency: Annotated[
+        float | None, typer.Option("--frequency", help="Turns per second, hertz (default: as configured).")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option("--seconds", min=0, help="Turn for so long, then park (default: leave it turning)."),
+    ] = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+) -> None:
+    """Turn the beam in a circle: MOVES the stage (servos on, auto-zero where needed, centre, circle).
+
+    The stage goes on turning by its own clock when the command has ended; 'escape modulator stop' ends
+    that. A twin ends with the command.
+    """
+    with command_context("modulator start", json=json) as context:
+        from escape_hw.api.modulator import Modulation
+
+        config, section, device = _device(context, options.SystemSelection.of(system, set, seed, mode))
+        radius_lambda_d = _default_radius(config) if radius is None else radius
+        requested = Modulation(radius_lambda_d * section.rad_per_lambda_d, frequency or section.frequency_hz)
+        _announce_motion(context, config, "servos on, auto-zero where needed, centre, then the circle")
+        with open_device(context, device):
+            foreseen = device.check(requested)
+            context.notify(
+                f"asked for {_format_modulation(requested, section)}; it does {_format_modulation(foreseen, section)}"
+            )
+            device.modulate(requested)
+            if seconds is not None:
+                time.sleep(seconds)
+            status = device.status()
+            left = seconds is None and device.release()
+        final_state = "turning; stop it with: escape modulator stop" if left else "parked"
+        context.show(*_format_status(status, section), f"left {final_state}")
+        asked = {"radius_lambda_d": radius_lambda_d, "frequency_hz": requested.frequency_hz}
+        outcome = {"asked": asked, "foreseen": asdict(foreseen), "left": "turning" if left else "parked"}
+        context.result({**_document("start", config, status, section), **outcome, "changed": True})
+
+
+@app.command("stop")
+def stop(
+    system: options.System,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+) -> None:
+    """Stop and park: MOVES the stage to its centre, then switches its servos off."""
+    with command_context("modulator stop", json=json) as context:
+        config, section, device = _device(context, options.SystemSelection.of(system, set, seed, mode))
+        _announce_motion(context, config, "centre, servos off")
+        with open_device(context, device):
+            device.park()
+            status = device.status()
+        context.show(*_format_status(status, section), "left parked")
+        context.result({**_document("stop", config, status, section), "left": "parked", "changed": True})
+
+
+@app.command("status")
+def status(
+    system: options.System,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+) -> None:
+    """Tell what the modulator does; moves and changes nothing."""
+    with command_context("modulator status", json=json) as context:
+        config, section, device = _device(context, options.SystemSelection.of(system, set, seed, mode))
+        context.devices_opened = True
+        now = device.status()
+        context.show(*_format_status(now, section))
+        context.result({**_document("status", config, now, section), "changed": False})
+
+
+def _device(
+    context: CommandContext, selection: options.SystemSelection
+) -> tuple[SystemConfig, ModulatorConfig, TipTiltModulator]:
+    """The system's modulator, not open.
+
+    Raises
+    ------
+    ConfigError
+        The system has none, or its driver is not installed.
+    """
+    from escape_hw.api.modulator import TipTiltModulator
+    from escape_hw.bench import build_device
+    from escape_hw.errors import ConfigError
+
+    config = context.load_config(selection)
+    section = config.devices.modulator
+    if section is None:
+        raise ConfigError(f"system '{config.system.name}' has no modulator, [devices.modulator]")
+    return config, section, build_device("modulator", config, TipTiltModulator)  # type: ignore[type-abstract]
+
+
+def _announce_motion(context: CommandContext, config: SystemConfig, what: str) -> None:
+    """Say what is about to change on hardware."""
+    from escape_hw.bench import resolve_mode
+
+    section = config.devices.modulator
+    if section is not None and resolve_mode(section, config) == "hardware":
+        context.notify(f"this moves the modulator: {what}")
+
+
+def _default_radius(config: SystemConfig) -> float:
+    """Radius of the modulation in lambda/D as the sensor's section has it."""
+    from escape_hw.config.sensor import PyramidSection
+
+    return config.sensor_as(PyramidSection).modulation
+
+
+def _format_modulation(modulation: Modulation, section: ModulatorConfig) -> str:
+    radius_lambda_d = modulation.radius_rad / section.rad_per_lambda_d
+    return f"{radius_lambda_d:.4g} lambda/D ({modulation.radius_rad * 1e6:.4g} urad) at {modulation.frequency_hz:.6g} Hz"
+
+
+def _format_status(status: ModulatorStatus, section: ModulatorConfig) -> list[str]:
+    """A status for people."""
+    now, at = status.modulation, status.position_rad
+    rows = [f"{status.info.model}, serial number {status.info.serial or 'unknown'}"]
+    rows.append("at rest" if now is None else f"turning: {_format_modulation(now, section)}")
+    if at is not None:
+        rows.append(f"now at ({at[0] * 1e6:.4g}, {at[1] * 1e6:.4g}) urad from the centre")
+    return [*rows, *(f"{key}: {value}" for key, value in status.details.items())]
+
+
+def _document(
+    command: str, config: SystemConfig, status: ModulatorStatus, section: ModulatorConfig
+) -> dict[str, Any]:
+    """A status for programs."""
+    from escape_hw.io.documents import header_fields
+
+    document: dict[str, Any] = header_fields(
+        f"modulator {command}", config.system.name, status.info.simulated, config.system.seed
+    )
+    found = asdict(status)
+    if status.modulation is not None:
+        found["modulation"]["radius_lambda_d"] = status.modulation.radius_rad / section.rad_per_lambda_d
+    return {**document, **found}

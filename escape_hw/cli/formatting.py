@@ -1,0 +1,66 @@
+"""Results on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rich import box
+from rich.console import JustifyMethod
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from escape_hw.api.results import CalibrationResult
+from escape_hw.report.tables import Table
+
+
+def status_line(simulated: bool, partial: bool) -> Text:
+    """The line that says whether a result is simulated and whether it was aborted."""
+    text = (
+        Text("SIMULATED", style="bold black on yellow") if simulated else Text("HARDWARE", style="bold green")
+    )
+    if partial:
+        text.append("  ABORTED: partial data", style="bold red")
+    return text
+
+
+def rich_table(content: Table, title: str | None = None) -> RichTable:
+    """A table of text for the terminal."""
+    # No rules between columns: all of it fits a terminal of 80 columns.
+    table = RichTable(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for number, heading in enumerate(content.headings):
+        numbers = content.numeric and number > 0
+        # On a narrow terminal headings and words may wrap, values with their errors may not.
+        widest = max((len(row[number]) for row in content.rows if "±" in row[number]), default=None)
+        justify: JustifyMethod = "right" if numbers else "left"
+        table.add_column(heading, justify=justify, min_width=widest, overflow="fold")
+    for row in content.rows:
+        table.add_row(*(Text(cell) for cell in row))
+    return table
+
+
+def format_calibration(result: CalibrationResult) -> list[str]:
+    """A calibration in a few lines."""
+    matrix = result.matrix
+    snr = (result.measured or matrix).snr()
+    lines = [
+        f"{matrix.method}: {matrix.n_modes} modes, {result.grid.n_valid} {result.grid.elements}, "
+        f"{result.frames} frames ({result.sky_seconds:.3g} s), {result.lost_frames} lost",
+        f"signal-to-noise ratio per mode: least {snr.min():.3g}, median {sorted(snr)[len(snr) // 2]:.3g}",
+    ]
+    if result.response is not None:
+        lines.append(f"delay: {result.response.delay:.2f} frames")
+    return [*lines, *result.notes]
+
+
+def format_criteria(checks: Iterable[Mapping[str, Any]]) -> list[Text]:
+    """Criteria with a tick or a cross."""
+    return [
+        Text(f"{'✓' if entry['met'] else '✗'} {entry['text']}", style="green" if entry["met"] else "bold red")
+        for entry in checks
+    ]
+
+
+def format_products(products: Mapping[str, Any]) -> list[str]:
+    """Where the products lie."""
+    return [f"{name}: {path}" for name, path in products.items()]

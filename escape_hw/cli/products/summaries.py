@@ -1,0 +1,113 @@
+"""What ``escape show`` tells of a file, by the kind of product that it holds."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import RenderableType
+
+from escape_hw.cli.formatting import format_calibration, rich_table
+from escape_hw.errors import ProductError
+from escape_hw.io import documents
+from escape_hw.io.fits.frames import KIND_FRAMES, load_frames
+from escape_hw.io.fits.gains import KIND_GAINS, load_gains
+from escape_hw.io.fits.loop import KIND_PSF, load_loop
+from escape_hw.io.fits.matrix import KIND_MATRIX, load_matrix
+from escape_hw.io.fits.run_state import KIND_STATE, load_state
+from escape_hw.io.fits.telemetry import KIND_TELEMETRY, load_telemetry
+from escape_hw.report.tables import registration_table, rounds_table, strehl_table
+
+#: What the document says of the product, and what the terminal shows of it.
+ProductSummary = tuple[dict[str, Any], list[RenderableType]]
+
+
+def summarise_product(kind: str, file: Path) -> ProductSummary:
+    """Document and lines of a product.
+
+    Raises
+    ------
+    ProductError
+        The file is damaged, or of a kind that nobody here knows.
+    """
+    summarise = _SUMMARIES.get(kind)
+    if summarise is None:
+        raise ProductError(f"{file}: its kind is {kind!r}; known are {', '.join(sorted(_SUMMARIES))}")
+    return summarise(file)
+
+
+def _matrix(file: Path) -> ProductSummary:
+    product = load_matrix(file)
+    document = {**documents.calibration_document(product.result), "metrics": product.matrix.metrics}
+    lines: list[RenderableType] = [*format_calibration(product.result)]
+    if product.registration is not None:
+        lines.append(rich_table(registration_table({"": product.registration})))
+    return document, lines
+
+
+def _gains(file: Path) -> ProductSummary:
+    result = load_gains(file).result
+    return documents.gains_document(result), [rich_table(rounds_table(result))]
+
+
+def _telemetry(file: Path) -> ProductSummary:
+    result = load_telemetry(file).result
+    frames, n_slopes = result.slopes.shape
+    document = {"frames": frames, "n_slopes": n_slopes, "rate_hz": result.rate_hz}
+    return document, [f"{frames} frames of {n_slopes} slopes at {result.rate_hz:.6g} Hz"]
+
+
+def _loop(file: Path) -> ProductSummary:
+    result = load_loop(file).result
+    return documents.loop_document(result), [rich_table(strehl_table({result.method: result}))]
+
+
+def _frames(file: Path) -> ProductSummary:
+    result = load_frames(file).result
+    n, rows, columns = result.data.shape
+    region, seconds = result.settings.region, 1e-9 * float(np.ptp(result.exposed_ns))
+    counts = {
+        "min": int(result.data.min()), "max": int(result.data.max()), "mean": float(result.data.mean()),
+    }  # fmt: skip
+    saturated = int(result.n_saturated.max())
+    document = {
+        "frames": n, "shape": [rows, columns], "camera": result.camera, "serial": result.serial,
+        "settings": asdict(result.settings), "rate_hz": result.rate_hz, "lost_frames": result.lost_frames,
+        "first_index": int(result.index[0]), "first_exposed_ns": int(result.exposed_ns[0]),
+        "seconds": seconds, "counts": counts, "saturated": saturated,
+        "dark_subtracted": False, "flat_divided": False,
+    }  # fmt: skip
+    measured = f", {result.rate_hz:.6g} Hz by their times" if n > 1 else ""
+    return document, [
+        f"{n} frames of {columns} x {rows} pixels from {result.camera} {result.serial}, "
+        f"region at column {region.x}, row {region.y}",
+        f"exposure {result.settings.exposure_s:.6g} s, gain {result.settings.gain_db:g} dB, set to "
+        f"{result.settings.frame_rate_hz:.6g} Hz{measured}",
+        f"frame {result.index[0]} to {result.index[-1]} in {seconds:.6g} s, {result.lost_frames} lost; the "
+        f"first exposure ended at {1e-9 * float(result.exposed_ns[0]):.6f} s of the camera's clock",
+        f"counts {counts['min']} to {counts['max']}, mean {counts['mean']:.1f}, at most {saturated} pixels "
+        "of a frame saturated; as the camera delivered them: no dark subtracted, no flat divided",
+    ]
+
+
+def _state(file: Path) -> ProductSummary:
+    state = load_state(file)
+    method, taken = str(state.identity.get("method")), state.values.get("taken")
+    way = f"escape calibrate --resume {shlex.quote(str(file.absolute().parent))}"
+    frames = "" if taken is None else f" after {taken} frames"
+    document = {"method": method, "frames": taken, "request": state.values.get("request"), "resume": way}
+    return document, [f"a calibration by {method}, broken off{frames}", f"go on with: {way}"]
+
+
+_SUMMARIES: dict[str, Callable[[Path], ProductSummary]] = {
+    KIND_FRAMES: _frames,
+    KIND_GAINS: _gains,
+    KIND_MATRIX: _matrix,
+    KIND_PSF: _loop,
+    KIND_STATE: _state,
+    KIND_TELEMETRY: _telemetry,
+}

@@ -1,0 +1,101 @@
+"""``escape systems`` and ``escape config``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.context import command_context
+
+if TYPE_CHECKING:
+    from escape_hw.config.system import SystemConfig
+
+config_app = typer.Typer(help="Check, start and describe configurations.", no_args_is_help=True)
+
+
+def systems(json: options.Json = False) -> None:
+    """List the systems that come with the package."""
+    with command_context("systems", json=json) as context:
+        from escape_hw.cli.formatting import rich_table
+        from escape_hw.config.bundled import bundled_systems
+        from escape_hw.config.loader import load_system
+        from escape_hw.io.documents import header_fields
+        from escape_hw.report.tables import Table
+
+        rows = [_describe(load_system(name)) for name in bundled_systems()]
+        headings = ("system", "mode", "actuators", "modes", "description")
+        keys = ("name", "mode", "n_act", "n_modes", "description")
+        cells = tuple(tuple(str(row[key]) for key in keys) for row in rows)
+        context.show(rich_table(Table(headings, cells, numeric=False)))
+        context.result({**header_fields("systems", None, None, None), "systems": rows})
+
+
+def _describe(config: SystemConfig) -> dict[str, Any]:
+    return {
+        "name": config.system.name,
+        "description": config.system.description,
+        "mode": config.system.mode,
+        "sensor": config.sensor.kind,
+        "n_act": config.devices.dm.n_act,
+        "n_modes": config.basis.n_modes,
+    }
+
+
+@config_app.command("check")
+def check(
+    file: Annotated[str, typer.Argument(help="TOML file, or the name of a system.")],
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+) -> None:
+    """Check a configuration; tells every mistake at once with file, line, key and allowed range."""
+    with command_context("config check", json=json) as context:
+        from escape_hw.io.documents import header_fields
+
+        config = context.load_config(options.SystemSelection.of(file, set, seed, mode))
+        context.show(f"{file}: sound ({config.system.name}, mode {config.system.mode})")
+        document = header_fields("config check", config.system.name, config.simulated, config.system.seed)
+        context.result({**document, "file": file, "valid": True})
+
+
+@config_app.command("init")
+def init(
+    name: Annotated[str, typer.Argument(help="Name of the new system.")] = "my-system",
+    base: Annotated[str, typer.Option("--base", help="System whose values it starts with.")] = "razor-shwfs",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="File to write (default: standard output).")
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Start a configuration: every key with what it means, its unit and its range."""
+    with command_context("config init", json=json) as context:
+        from escape_hw.config.templates import starter_text
+        from escape_hw.errors import ConfigError
+        from escape_hw.io.documents import header_fields
+        from escape_hw.io.storage import write_atomic
+
+        text = starter_text(name, base)
+        document = header_fields("config init", name, None, None)
+        if out is None:
+            context.show(text.rstrip("\n"))
+            context.result({**document, "toml": text})
+            return
+        if out.exists():
+            raise ConfigError(f"{out}: exists already; choose another name or remove it first")
+        write_atomic(out, text.encode())
+        context.show(f"{out}: written; edit it, then: escape config check {out}")
+        context.result({**document, "file": out})
+
+
+@config_app.command("schema")
+def schema(json: options.Json = False) -> None:
+    """Print the JSON schema of the system files, for editors that check while you type."""
+    # The schema is one JSON document in any case.
+    with command_context("config schema", json=True) as context:
+        from escape_hw.config.templates import json_schema
+
+        context.result(json_schema())

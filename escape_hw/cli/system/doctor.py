@@ -1,0 +1,41 @@
+"""``escape doctor``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.context import command_context
+
+_SYMBOLS = {"ok": "✓", "info": "·", "warning": "!", "error": "✗"}
+
+
+def doctor(
+    system: Annotated[
+        str, typer.Argument(metavar="[SYSTEM]", help="System whose real devices must work (default: none).")
+    ] = "",
+    set: options.Set = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+) -> None:
+    """Look whether this computer can drive real devices; opens none.
+
+    Exit codes of its own: 0 all is well, 1 something is not as it should be, 2 something will not work.
+    """
+    with command_context("doctor", json=json) as context:
+        from escape_hw.io.documents import header_fields
+        from escape_hw.runtime.host.doctor import check_computer, exit_code
+
+        config = context.load_config(options.SystemSelection.of(system, set, None, mode)) if system else None
+        findings = check_computer(config)
+        for finding in findings:
+            context.show(f"{_SYMBOLS[finding.level]} {finding.item}: {finding.text}")
+            if finding.way_out:
+                context.show(f"    → {finding.way_out}")
+        code = exit_code(findings)
+        start = header_fields("doctor", system or None, None if config is None else config.simulated, None)
+        context.result({**start, "verdict": code, "findings": [asdict(finding) for finding in findings]})
+        context.code = code

@@ -1,0 +1,76 @@
+"""``escape serve``: one process that owns a system, for screens, scripts and notebooks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from escape_hw.cli import options
+from escape_hw.cli.context import CommandContext, command_context
+
+if TYPE_CHECKING:
+    from escape_hw.config.system import SystemConfig
+    from escape_hw.remote.address import ServerListing
+
+_LOOPBACK = "127.0.0.1"
+
+
+def serve(
+    system: options.System,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            "--port", min=1, max=65534, help="Listen on TCP as well; events come from the next port."
+        ),
+    ] = None,
+    bind: Annotated[
+        str, typer.Option("--bind", metavar="ADDRESS", help="Address for --port; others need 'escape keys'.")
+    ] = _LOOPBACK,
+    read: Annotated[
+        list[Path] | None,
+        typer.Option("--read", metavar="FOLDER", help="Clients may load products from there; repeatable."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Where runs go (default: your user data).")
+    ] = None,
+    set: options.Set = None,
+    seed: options.Seed = None,
+    mode: options.Mode = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Own the devices of a system, and serve screens, scripts and notebooks until stopped."""
+    with command_context("serve", json=json, quiet=quiet) as context:
+        from escape_hw.errors import ConfigError
+        from escape_hw.io.run_folder import default_runs_folder
+        from escape_hw.server.frontend.server import Server
+
+        if port is None and bind != _LOOPBACK:
+            raise ConfigError(f"--bind {bind} needs a --port; without one nothing listens on the network")
+        config = context.load_config(options.SystemSelection.of(system, set, seed, mode))
+        runs = default_runs_folder() if out is None else out.expanduser().absolute()
+        with Server(config, bind, port) as server:
+            _print_listing(context, config, server.listing)
+            with context.interrupts.procedure() as stop:
+                context.devices_opened = True
+                server.run(stop, runs, tuple(read or ()))
+            context.interrupts.begin_closing()
+        context.notify("serve: stopped, mirror flat")
+
+
+def _print_listing(context: CommandContext, config: SystemConfig, listing: ServerListing) -> None:
+    from dataclasses import asdict
+
+    from escape_hw.io.documents import header_fields
+
+    name = config.system.name
+    document = header_fields("serve", name, config.simulated, config.system.seed)
+    context.result({**document, **asdict(listing)})
+    # Whoever reads the document waits for it, and not for the end.
+    context.print_document()
+    kind = "simulated" if config.simulated else "HARDWARE"
+    where = f", {listing.tcp}" if listing.tcp else ""
+    context.notify(f"serve: {name} ({kind}), process {listing.pid}{where}; Ctrl-C ends it")
+    context.notify(f"serve: look at it with 'escape gui --connect {name}', or escape_hw.connect(\"{name}\")")

@@ -1,0 +1,345 @@
+"""Sections [devices.*]: mirror, cameras, phase screens, modulator and its controller."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from escape_hw.api.camera import CameraSettings, Region
+from escape_hw.api.mirror import DMInfo
+from escape_hw.config import actuator_layouts
+from escape_hw.config.section import RuleViolation, Section, TomlArray, raise_violations
+from escape_hw.safety.limits import MirrorLimits
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+#: Frequency (Hz), amplitude of the axes x and y relative to what was asked, their lags (degrees).
+Correction = TomlArray[
+    tuple[
+        Annotated[float, Field(gt=0)],
+        Annotated[float, Field(gt=0.05, lt=20)],
+        Annotated[float, Field(gt=0.05, lt=20)],
+        Annotated[float, Field(ge=-360, le=360)],
+        Annotated[float, Field(ge=-360, le=360)],
+    ]
+]
+AxisGain = Annotated[float, Field(ge=-10, le=10)]
+
+
+def derive_tilt_scale(document: Any) -> Any:
+    """A document whose modulator knows its tilt per lambda/D, if it tells the size of its beam.
+
+    Reflection doubles the tilt, and a beam of diameter D on the mirror has its lambda/D there:
+    ``rad_per_lambda_d = wavelength / (2 D)``.
+    """
+    try:
+        wavelength_m, modulator = document["system"]["wavelength_m"], document["devices"]["modulator"]
+        if "rad_per_lambda_d" in modulator or not modulator["beam_m"] > 0:
+            return document
+        tilt = wavelength_m / (2 * modulator["beam_m"])
+    except (KeyError, TypeError):
+        # What is missing or of the wrong kind is reported key by key later on.
+        return document
+    devices = {**document["devices"], "modulator": {**modulator, "rad_per_lambda_d": tilt}}
+    return {**document, "devices": devices}
+
+
+class WireConfig(Section):
+    """How the controller is connected; the twin has no wire."""
+
+    kind: Literal["tcp", "serial", "usb", "emulator"] = Field(
+        "tcp", description="'tcp', 'serial', 'usb', or 'emulator' for one within this process"
+    )
+    host: str = Field("192.168.0.10", min_length=1, description="tcp: address of the controller")
+    port: int = Field(50000, ge=1, le=65535, description="tcp: port of the controller")
+    serial_port: str = Field("/dev/pi_e727", min_length=1, description="serial: device file")
+    baud: int = Field(115200, ge=300, le=4_000_000, description="serial: bits per second")
+    usb_vendor: int = Field(0x1A72, ge=0, le=0xFFFF, description="usb: vendor's number")
+    usb_product: int | None = Field(
+        None, ge=0, le=0xFFFF, description="usb: product's number; absent: any of the vendor's"
+    )
+    timeout_s: float = Field(1.0, gt=0, le=60, description="longest wait for an answer, seconds")
+    connect_s: float = Field(3.0, gt=0, le=60, description="longest wait for a connection, seconds")
+
+
+class StageConfig(Section):
+    """The axes of the real stage and the circle they draw; the twin has its own truth."""
+
+    axes: TomlArray[tuple[str, str]] = Field(
+        ("1", "2"), description="names of the axes that move the beam along x and y"
+    )
+    axis_gain: TomlArray[tuple[AxisGain, AxisGain]] = Field(
+        (1.0, 1.0),
+        description="beam's tilt per tilt of each axis, relative to normal incidence; negative: reversed, "
+        "0.707: an axis that the beam meets at 45 degrees",
+    )
+    auto_zero: Literal["needed", "always", "never"] = Field(
+        "needed", description="auto-zero on opening; it sweeps the full range for about a minute"
+    )
+    auto_zero_v: float | None = Field(
+        None, ge=-30, le=135, description="voltage of auto-zero, volts; absent: the controller's own"
+    )
+    auto_zero_s: float = Field(180.0, gt=0, le=3600, description="longest wait for auto-zero, seconds")
+    settle_s: float = Field(5.0, gt=0, le=600, description="longest wait for an axis on target, seconds")
+    min_points: int = Field(
+        20, ge=4, le=1000, description="fewest points of a turn; the clock's 50 us times this is the shortest"
+    )
+    max_points: int = Field(4096, ge=64, le=262144, description="most points of a wave table")
+    correct: Literal["recorder", "table", "none"] = Field(
+        "recorder",
+        description="what makes the circle round: positions recorded at every start, the table of "
+        "'corrections', or nothing",
+    )
+    corrections: TomlArray[tuple[Correction, ...]] = Field(
+        (),
+        description="frequency (hertz), amplitude of x and of y relative to what was asked, lag of x and of "
+        "y (degrees), as 'escape modulator start' reports them",
+    )
+    round_within: float = Field(
+        0.02, gt=0, le=0.5, description="largest error of radius and roundness that counts as corrected"
+    )
+    trigger_line: int = Field(1, ge=0, le=3, description="output that triggers the camera; 0: none")
+    trigger_mode: int = Field(4, ge=0, le=99, description="the controller's number of 'generator trigger'")
+    trigger_point: int = Field(1, ge=1, le=262144, description="point of the turn where the pulse rises")
+
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        violations = []
+        if self.axes[0] == self.axes[1]:
+            violations.append(RuleViolation("axes", list(self.axes), "two different axes are needed"))
+        if any(abs(gain) < 0.1 for gain in self.axis_gain):
+            text = "an axis that moves the beam less than a tenth of normal makes no circle"
+            violations.append(RuleViolation("axis_gain", list(self.axis_gain), text))
+        if self.min_points > self.max_points:
+            violations.append(
+                RuleViolation("min_points", self.min_points, f"max_points is {self.max_points}")
+            )
+        if self.correct == "table" and not self.corrections:
+            text = "needs stage.corrections; 'recorder' measures them"
+            violations.append(RuleViolation("correct", self.correct, text))
+        raise_violations(violations)
+        return self
+
+
+Mode = Literal["sim", "hardware"]
+Pixels = Annotated[int, Field(ge=0, le=16384)]
+Size = Annotated[int, Field(ge=1, le=16384)]
+
+
+class DeviceConfig(Section):
+    """What every device section has: which driver, which twin, which of them."""
+
+    driver: str = Field(
+        "", description="driver of the real device (entry point in escape.devices); empty: there is none"
+    )
+    sim_driver: str = Field("", description="twin of the device (entry point in escape.devices)")
+    mode: Mode | None = Field(
+        None, description="'sim' or 'hardware' for this device alone; absent: as system.mode"
+    )
+    serial: str = Field("", description="serial number, so that the wrong device is never opened")
+    options: dict[str, str | int | float | bool] = Field(
+        default_factory=dict, description="further settings that only this driver understands"
+    )
+
+
+class LimitsConfig(Section):
+    """Limits that the guard enforces on every command; a rule that is absent is off."""
+
+    max_stroke: float = Field(
+        1.0, gt=0, le=1, description="largest magnitude of a command, fraction of full stroke"
+    )
+    max_slew: float | None = Field(
+        None, gt=0, le=2, description="largest change from one command to the next, fraction of full stroke"
+    )
+    max_neighbour: float | None = Field(
+        None,
+        gt=0,
+        le=2,
+        description="largest difference between adjacent actuators, fraction of full stroke",
+    )
+    max_mean: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="largest magnitude of the mean command (piston), fraction of full stroke",
+    )
+    disabled: TomlArray[tuple[Annotated[int, Field(ge=0)], ...]] = Field(
+        (), description="numbers of the actuators that must stay at zero"
+    )
+
+    def to_limits(self) -> MirrorLimits:
+        """The limits as the guard takes them."""
+        return MirrorLimits(self.max_stroke, self.max_slew, self.max_neighbour, self.max_mean, self.disabled)
+
+
+class MirrorConfig(DeviceConfig):
+    """Deformable mirror: nominal geometry and limits."""
+
+    layout: str = Field(
+        pattern=actuator_layouts.PATTERN,
+        description="where the actuators stand: 'circle-N' or 'square-N' on an N x N grid, "
+        "'rings-336' or 'rings-672' on rings",
+    )
+    pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
+    pitches_across_pupil: float = Field(
+        gt=0, le=200, description="actuator pitches across the diameter of the pupil"
+    )
+    coupling: float = Field(
+        ge=0.01, le=0.9, description="nominal influence of an actuator at its neighbour, fraction of its peak"
+    )
+    stroke_m: float = Field(gt=0, le=1e-3, description="metres of surface at the actuator for a command of 1")
+    limits: LimitsConfig = Field(default_factory=LimitsConfig, description="limits of every command")
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        return actuator_layouts.n_actuators(self.layout)
+
+    def actuator_map(self) -> NDArray[np.bool_] | None:
+        """Boolean map ``(N, N)``, true where an actuator stands; ``None`` when there is no grid."""
+        return (
+            actuator_layouts.actuator_map(self.layout) if actuator_layouts.is_on_grid(self.layout) else None
+        )
+
+    def positions(self) -> NDArray[np.float64]:
+        """Actuator positions ``(n_act, 2)`` as (x, y) from the mirror's centre, in pitches."""
+        return actuator_layouts.positions(self.layout)
+
+    def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
+        """Identity and nominal geometry, as a driver or twin of this mirror tells them.
+
+        Parameters
+        ----------
+        model
+            What the device is.
+        simulated
+            It is a twin.
+        serial
+            As the device says; by default as configured.
+        """
+        places = self.positions() * self.pitch_m
+        return DMInfo(
+            model, serial or self.serial, self.n_act, self.actuator_map(), places, self.stroke_m, simulated
+        )
+
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        last = self.n_act - 1
+        bad = [i for i in self.limits.disabled if i > last]
+        raise_violations(
+            RuleViolation("limits.disabled", i, f"the actuators are numbered 0 to {last}") for i in bad
+        )
+        return self
+
+
+class CameraConfig(DeviceConfig):
+    """A camera as it is read out."""
+
+    sensor_px: TomlArray[tuple[Size, Size]] = Field(
+        description="width and height of the whole sensor as read out (after binning), pixels"
+    )
+    region: TomlArray[tuple[Pixels, Pixels, Size, Size]] = Field(
+        description="region read: x, y, width, height, pixels"
+    )
+    bit_depth: int = Field(ge=8, le=16, description="bits per pixel")
+    exposure_s: float = Field(ge=1e-6, le=60, description="exposure time, seconds")
+    frame_rate_hz: float = Field(ge=0.01, le=20000, description="frames per second, hertz")
+    gain_db: float = Field(0.0, ge=0, le=48, description="analogue gain, decibels")
+    timeout_s: float = Field(1.0, gt=0, le=120, description="longest wait for a frame, seconds")
+
+    def settings(self) -> CameraSettings:
+        """The settings as a camera takes them."""
+        return CameraSettings(Region(*self.region), self.exposure_s, self.frame_rate_hz, self.gain_db)
+
+    @model_validator(mode="after")
+    def _camera_rules(self) -> Self:
+        x, y, width, height = self.region
+        columns, rows = self.sensor_px
+        violations = []
+        if x + width > columns or y + height > rows:
+            violations.append(
+                RuleViolation(
+                    "region", list(self.region), f"does not lie on the sensor of {columns} x {rows} pixels"
+                )
+            )
+        if self.exposure_s * self.frame_rate_hz > 1:
+            violations.append(
+                RuleViolation(
+                    "exposure_s",
+                    self.exposure_s,
+                    f"longer than a frame ({1 / self.frame_rate_hz:.4g} s at {self.frame_rate_hz:g} Hz)",
+                )
+            )
+        raise_violations(violations)
+        return self
+
+
+class ScienceConfig(CameraConfig):
+    """The science camera, which sees the point-spread function."""
+
+    psf_px: float = Field(ge=0.5, le=100, description="lambda/D in camera pixels")
+    model_psf: Literal["measured", "design"] = Field(
+        "measured",
+        description="what Strehl ratios refer to: an image 'measured' without turbulence, or the 'design' "
+        "pupil's where the turbulence cannot be taken out",
+    )
+
+
+class ModulatorConfig(DeviceConfig):
+    """The tip-tilt stage that turns the beam on a pyramid."""
+
+    frequency_hz: float = Field(
+        gt=0, le=5000, description="turns per second that are asked for, hertz; the stage's clock rounds them"
+    )
+    beam_m: float | None = Field(
+        None, gt=0, le=10, description="diameter of the beam on the modulator's mirror, metres"
+    )
+    rad_per_lambda_d: float = Field(
+        gt=0,
+        le=0.1,
+        description="mirror tilt that moves the beam by 1 lambda/D on the pyramid, radians; absent: "
+        "wavelength / (2 beam_m)",
+    )
+    max_tilt_rad: float = Field(
+        gt=0, le=0.1, description="largest tilt of the mirror from its centre, radians"
+    )
+    wire: WireConfig = Field(default_factory=WireConfig, description="connection of the real controller")
+    stage: StageConfig = Field(default_factory=StageConfig, description="axes of the real stage")
+
+
+class ScreenConfig(DeviceConfig):
+    """The changer of rotating phase screens: the bench's turbulence."""
+
+    screens_r0_m: TomlArray[tuple[Annotated[float, Field(gt=0, le=10)], ...]] = Field(
+        min_length=1, description="Fried parameter of each screen at the system's wavelength, metres"
+    )
+    screen: int = Field(0, ge=0, description="number of the screen in use, counted from 0")
+    speed_m_s: float = Field(
+        ge=0, le=100, description="speed of the screen across the pupil, metres per second"
+    )
+    outer_scale_m: float = Field(gt=0, le=1000, description="outer scale of the turbulence, metres")
+
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        n = len(self.screens_r0_m)
+        if self.screen >= n:
+            raise_violations(
+                [RuleViolation("screen", self.screen, f"the {n} screens are numbered 0 to {n - 1}")]
+            )
+        return self
+
+
+class DevicesConfig(Section):
+    """The devices of a system."""
+
+    dm: MirrorConfig = Field(description="deformable mirror")
+    wfs: CameraConfig = Field(description="camera of the wavefront sensor")
+    science: ScienceConfig | None = Field(None, description="science camera; absent: there is none")
+    screen: ScreenConfig | None = Field(None, description="phase screens; absent: there are none")
+    modulator: ModulatorConfig | None = Field(
+        None, description="tip-tilt modulator of a pyramid; absent: there is none"
+    )

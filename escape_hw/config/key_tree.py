@@ -1,0 +1,183 @@
+"""What keys the configuration has: walks the models, for messages and for overrides."""
+
+from __future__ import annotations
+
+import difflib
+import types
+import typing
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel, Tag
+from pydantic.fields import FieldInfo
+
+from escape_hw.config.system import SystemConfig
+
+KeyPath = tuple[str | int, ...]
+
+
+def dotted(path: Sequence[str | int]) -> str:
+    """A path as text, ``devices.screen.screens_r0_m[2]``."""
+    text = ""
+    for step in path:
+        text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
+    return text
+
+
+def sections_of(annotation: Any) -> dict[str, type[BaseModel]]:
+    """The models that an annotation stands for: ``Model``, ``Model | None`` or one of several.
+
+    Of several the key is the tag by which a validation tells them apart, else it is empty.
+    """
+    found: dict[str, type[BaseModel]] = {}
+    for option in typing.get_args(annotation) if _is_union(annotation) else (annotation,):
+        marks: list[Any] = []
+        if typing.get_origin(option) is typing.Annotated:
+            option, *marks = typing.get_args(option)
+        if isinstance(option, type) and issubclass(option, BaseModel):
+            found[next((mark.tag for mark in marks if isinstance(mark, Tag)), "")] = option
+    return found
+
+
+def fields_of(section: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The keys of a section by the names that files use."""
+    return {field.alias or name: field for name, field in section.model_fields.items()}
+
+
+def is_free_table(field: FieldInfo) -> bool:
+    """True for a table whose keys are not ours to know (a driver's options)."""
+    return typing.get_origin(field.annotation) is dict
+
+
+@dataclass(frozen=True, slots=True)
+class KeyLocation:
+    """Where a path leads.
+
+    Parameters
+    ----------
+    path
+        The path as files write it, without the tags that a validation puts in.
+    field
+        The field there; ``None`` when the path leads nowhere.
+    known
+        The part of ``path`` that exists; an item of an array or of a free table counts.
+    holders
+        The sections that may hold the first key that does not exist; empty when all do.
+    """
+
+    path: KeyPath
+    field: FieldInfo | None
+    existing: KeyPath
+    candidate_sections: tuple[type[BaseModel], ...]
+
+
+def locate_key(path: Sequence[str | int]) -> KeyLocation:
+    """Follow a path, of a file or of a validation, through the models."""
+    sections: dict[str, type[BaseModel]] = {"": SystemConfig}
+    field: FieldInfo | None = None
+    plain: list[str | int] = []
+    existing = 0
+    missing_in: tuple[type[BaseModel], ...] | None = None
+    for step in path:
+        if missing_in is None and len(sections) > 1 and step in sections:
+            sections = {"": sections[str(step)]}
+            continue
+        plain.append(step)
+        if missing_in is not None:
+            continue
+        inner = next(
+            (fields[str(step)] for fields in map(fields_of, sections.values()) if step in fields), None
+        )
+        if inner is not None:
+            field, sections, existing = inner, sections_of(inner.annotation), existing + 1
+        elif not sections and field is not None and (is_free_table(field) or isinstance(step, int)):
+            missing_in, existing = (), existing + 1
+        else:
+            missing_in, field = tuple(sections.values()), None
+    return KeyLocation(tuple(plain), field, tuple(plain[:existing]), missing_in or ())
+
+
+def kinds_with_key(path: KeyPath) -> list[str]:
+    """The kinds of a section that have the key at the end of a path, when there are several kinds."""
+    field = locate_key(path[:-1]).field
+    variants = {} if field is None else sections_of(field.annotation)
+    return [kind for kind, section in variants.items() if path[-1] in fields_of(section)]
+
+
+@cache
+def all_keys() -> tuple[str, ...]:
+    """Every key of the configuration, sections left out, as dotted text."""
+    return tuple(dict.fromkeys(_leaves(SystemConfig, "")))
+
+
+def _leaves(section: type[BaseModel], prefix: str) -> Iterator[str]:
+    for name, field in fields_of(section).items():
+        inner = sections_of(field.annotation)
+        if not inner:
+            yield prefix + name
+        for one in inner.values():
+            yield from _leaves(one, f"{prefix}{name}.")
+
+
+def closest_match(word: str, choices: Iterable[str]) -> str | None:
+    """The choice that looks most like a word, or ``None`` when none comes close."""
+    found = difflib.get_close_matches(word, list(choices), n=1, cutoff=0.6)
+    return found[0] if found else None
+
+
+def closest_key(path: Sequence[str | int]) -> str | None:
+    """The key somebody probably meant: a neighbour, the same name elsewhere, or a similar path."""
+    place = locate_key(path)
+    path, depth = place.path, len(place.existing)
+    neighbours = [name for holder in place.candidate_sections for name in fields_of(holder)]
+    neighbour = closest_match(str(path[min(depth, len(path) - 1)]), neighbours)
+    if neighbour is not None:
+        return dotted((*place.existing, neighbour, *path[depth + 1 :]))
+    elsewhere = [key for key in all_keys() if key.rpartition(".")[2] == str(path[-1])]
+    # Who forgets a section forgets one; a deeper key only looks nearer when its sections are short.
+    levels = min((key.count(".") for key in elsewhere), default=0)
+    elsewhere = [key for key in elsewhere if key.count(".") == levels]
+    return closest_match(dotted(path), elsewhere or all_keys()) or (elsewhere[0] if elsewhere else None)
+
+
+def range_text(field: FieldInfo, item: int | None = None) -> str:
+    """The allowed range of a number as text, ``0 < x <= 2``; empty when there is none.
+
+    Parameters
+    ----------
+    field
+        The field.
+    item
+        For an array: the number of the item asked about.
+    """
+    low = high = ""
+    for rule in _rules(field, item):
+        if isinstance(rule, Ge):
+            low = f"{rule.ge:g} <= "
+        elif isinstance(rule, Gt):
+            low = f"{rule.gt:g} < "
+        elif isinstance(rule, Le):
+            high = f" <= {rule.le:g}"
+        elif isinstance(rule, Lt):
+            high = f" < {rule.lt:g}"
+    return f"{low}x{high}" if low or high else ""
+
+
+def _rules(field: FieldInfo, item: int | None) -> list[Any]:
+    if item is None:
+        return list(field.metadata)
+    kinds = [kind for kind in typing.get_args(field.annotation) if kind is not Ellipsis]
+    if not kinds:
+        return []
+    kind = kinds[min(item, len(kinds) - 1)]
+    found: list[Any] = []
+    for extra in getattr(kind, "__metadata__", ()):
+        found += extra.metadata if isinstance(extra, FieldInfo) else [extra]
+    return found
+
+
+def _is_union(annotation: Any) -> bool:
+    return isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union

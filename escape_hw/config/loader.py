@@ -1,0 +1,324 @@
+"""Reads a system file, applies overrides (--set) and reports every invalid key in one error."""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from escape_hw.config import key_tree
+from escape_hw.config.bundled import find_system
+from escape_hw.config.key_tree import KeyPath
+from escape_hw.config.section import RULE_ERROR
+from escape_hw.config.system import SystemConfig
+from escape_hw.config.toml_text import format_value, key_lines, line_of
+from escape_hw.errors import ConfigError
+
+#: Longest value that is quoted in a message.
+_MAX_LENGTH = 60
+
+#: What pydantic's kinds of error are called here.
+_MESSAGES = {
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "bool_type": "must be true or false",
+    "string_type": "must be text in quotes",
+    "finite_number": "must be finite",
+    "model_type": "must be a table",
+    "dict_type": "must be a table",
+    "tuple_type": "must be an array",
+    "greater_than": "is out of range",
+    "greater_than_equal": "is out of range",
+    "less_than": "is out of range",
+    "less_than_equal": "is out of range",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigProblem:
+    """One thing that is wrong: which key, its value as text (may be empty), what and what to do."""
+
+    path: KeyPath
+    value: str
+    message: str
+
+    def line(self, where: str) -> str:
+        """The problem on one line, after the place it was found at."""
+        value = f" {self.value}" if self.value else ""
+        return f"{where}  {key_tree.dotted(self.path)}:{value}  {self.message}"
+
+
+def unknown_key_problem(path: Sequence[str | int], value: Any) -> ConfigProblem:
+    """A key that the configuration does not have."""
+    plain = key_tree.locate_key(path).path
+    if key_tree.locate_key(plain).existing == plain:
+        # Another kind of this section has it.
+        others = ", ".join(f"'{kind}'" for kind in key_tree.kinds_with_key(plain))
+        return ConfigProblem(plain, format_short(value), f"is a key of kind = {others} only")
+    suggestion = key_tree.closest_key(path)
+    hint = f" (did you mean '{suggestion}'?)" if suggestion else ""
+    return ConfigProblem(plain, format_short(value), f"unknown key{hint}")
+
+
+def problems_from(error: ValidationError) -> list[ConfigProblem]:
+    """Every problem that a validation found, without repetitions, in the order of the models."""
+    found: dict[tuple[KeyPath, str], ConfigProblem] = {}
+    for detail in error.errors(include_url=False):
+        for problem in _translate(detail):
+            found.setdefault((problem.path, problem.message), problem)
+    return list(found.values())
+
+
+def format_short(value: Any) -> str:
+    """A value as TOML text, shortened when it is long."""
+    try:
+        text = format_value(value)
+    except TypeError:
+        text = str(value)
+    return text if len(text) <= _MAX_LENGTH else text[: _MAX_LENGTH - 3] + "..."
+
+
+def _translate(detail: ErrorDetails) -> list[ConfigProblem]:
+    kind, value = detail["type"], detail["input"]
+    place = key_tree.locate_key(detail["loc"])
+    path, field, existing = place.path, place.field, place.existing
+    if kind == RULE_ERROR:
+        return [
+            ConfigProblem((*path, *breach.key.split(".")), format_short(breach.value), breach.message)
+            for breach in detail["ctx"]["breaches"]
+        ]
+    if kind == "extra_forbidden":
+        return [unknown_key_problem(detail["loc"], value)]
+    if kind == "union_tag_invalid":
+        return [_wrong_kind((*path, "kind"), value, field)]
+    if field is None:
+        return [ConfigProblem(path, format_short(value), _message(detail))]
+    if key_tree.is_free_table(field) and kind != "dict_type":
+        return [ConfigProblem(existing, format_short(value), "must be text, a number, true or false")]
+    item = existing[-1] if isinstance(existing[-1], int) else None
+    allowed = key_tree.range_text(field, item)
+    hints = [f"allowed range {allowed}"] if allowed else []
+    if kind == "missing":
+        if item is not None:
+            return [
+                ConfigProblem(
+                    existing[:-1],
+                    format_short(list(value)),
+                    f"has too few items; expected: {field.description}",
+                )
+            ]
+        hints.insert(0, field.description or "")
+        return [ConfigProblem(path, "", f"is missing ({'; '.join(hints)})")]
+    if kind == "literal_error":
+        return [ConfigProblem(path, format_short(value), _wrong_choice(detail))]
+    if kind == "string_pattern_mismatch":
+        return [ConfigProblem(path, format_short(value), f"is not allowed; expected: {field.description}")]
+    message = _message(detail)
+    return [
+        ConfigProblem(existing, format_short(value), message + (f" ({'; '.join(hints)})" if hints else ""))
+    ]
+
+
+def _message(detail: ErrorDetails) -> str:
+    return _MESSAGES.get(detail["type"], detail["msg"][:1].lower() + detail["msg"][1:])
+
+
+def _wrong_kind(path: KeyPath, table: Any, field: FieldInfo | None) -> ConfigProblem:
+    kinds = [] if field is None else list(key_tree.sections_of(field.annotation))
+    value = table["kind"]
+    suggestion = key_tree.closest_match(str(value), kinds)
+    hint = f" (did you mean '{suggestion}'?)" if suggestion else ""
+    return ConfigProblem(path, format_short(value), f"must be {' or '.join(map(repr, kinds))}{hint}")
+
+
+def _wrong_choice(detail: ErrorDetails) -> str:
+    expected = detail["ctx"]["expected"]
+    choices = [choice.strip("'") for choice in expected.replace(" or ", ", ").split(", ")]
+    suggestion = key_tree.closest_match(str(detail["input"]), choices)
+    return f"must be {expected}" + (f" (did you mean '{suggestion}'?)" if suggestion else "")
+
+
+#: Text that may stand without quotes, since a shell takes them away: words, paths, network addresses.
+_BARE_WORD = re.compile(r"^(?:[A-Za-z_/~.][\w./~ :+-]*|\d{1,3}(?:\.\d{1,3}){3})$")
+
+
+@dataclass(frozen=True, slots=True)
+class Override:
+    """One override: the key's path, its value, and where it came from (``--set``, ``--seed``)."""
+
+    path: tuple[str, ...]
+    value: Any
+    origin: str = "--set"
+
+
+def parse_override(text: str) -> Override:
+    """Read ``key=value``; the value is TOML, and a bare word is text.
+
+    Raises
+    ------
+    ConfigError
+        There is no ``=``, or either side cannot be read.
+    """
+    key, equals, raw = text.partition("=")
+    path = tuple(part.strip() for part in key.split("."))
+    if not equals or not all(path):
+        raise ConfigError(f"--set  {text!r} is not of the form section.key=value")
+    raw = raw.strip()
+    try:
+        document = tomllib.loads(f"value = {raw}")
+    except tomllib.TOMLDecodeError as error:
+        if not _BARE_WORD.match(raw):
+            raise ConfigError(f"--set  {key.strip()}: {raw}  is not a TOML value: {error}") from None
+        return Override(path, raw)
+    if set(document) != {"value"}:
+        raise ConfigError(f"--set  {key.strip()}: {raw!r}  must be one value on one line")
+    return Override(path, document["value"])
+
+
+def apply_overrides(
+    document: dict[str, Any], overrides: Iterable[Override]
+) -> list[tuple[Override, ConfigProblem]]:
+    """Put overrides into a parsed document, in order, and report those that cannot be.
+
+    Keys that the document leaves out may be set as long as the models have them.
+    """
+    problems = []
+    for override in overrides:
+        problem = _apply_override(document, override)
+        if problem is not None:
+            problems.append((override, problem))
+    return problems
+
+
+def _apply_override(document: dict[str, Any], override: Override) -> ConfigProblem | None:
+    if key_tree.locate_key(override.path).existing != override.path:
+        return unknown_key_problem(override.path, override.value)
+    table = document
+    for depth, name in enumerate(override.path[:-1], start=1):
+        inner = table.setdefault(name, {})
+        if not isinstance(inner, dict):
+            return ConfigProblem(override.path[:depth], format_short(inner), "must be a table")
+        table = inner
+    table[override.path[-1]] = override.value
+    return None
+
+
+_ERROR_POSITION = re.compile(
+    r"^(?P<what>.*) \(at (?:line (?P<line>\d+), column \d+|end of document)\)$", re.DOTALL
+)
+
+
+def load_system(
+    system: str | os.PathLike[str],
+    *,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    mode: str | None = None,
+) -> SystemConfig:
+    """Read a system by its name or from a file.
+
+    Parameters
+    ----------
+    system
+        Name of a bundled system, or path of a TOML file.
+    overrides
+        ``section.key=value`` each, applied in order.
+    seed, mode
+        Replace ``system.seed`` and ``system.mode``.
+
+    Raises
+    ------
+    ConfigError
+        One line for each problem: file and line (or ``--set``), key, value, what to do.
+    """
+    text, source = find_system(system)
+    return load_text(text, source, overrides=overrides, seed=seed, mode=mode)
+
+
+def load_text(
+    text: str,
+    source: str = "<text>",
+    *,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    mode: str | None = None,
+) -> SystemConfig:
+    """Read a configuration from TOML text; see :func:`load_system`.
+
+    Parameters
+    ----------
+    text
+        The TOML document.
+    source
+        What to call it in messages.
+    """
+    changes, lines = _parse_changes(overrides, seed, mode)
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError("\n".join([_syntax_line(error, text, source), *lines])) from None
+    return _validate(document, key_lines(text), source, changes, lines)
+
+
+def _validate(
+    document: dict[str, Any],
+    places: dict[KeyPath, int],
+    source: str,
+    changes: list[Override],
+    lines: list[str],
+) -> SystemConfig:
+    rejected = apply_overrides(document, changes)
+    problems: list[ConfigProblem] = []
+    config = None
+    try:
+        config = SystemConfig.model_validate(document)
+    except ValidationError as error:
+        problems = problems_from(error)
+    found = [
+        *(problem.line(_origin_of(problem.path, places, source, changes)) for problem in problems),
+        *lines,
+        *(problem.line(change.origin) for change, problem in rejected),
+    ]
+    if config is None or found:
+        raise ConfigError("\n".join(found))
+    return config
+
+
+def _parse_changes(
+    overrides: Sequence[str], seed: int | None, mode: str | None
+) -> tuple[list[Override], list[str]]:
+    changes, lines = [], []
+    for text in overrides:
+        try:
+            changes.append(parse_override(text))
+        except ConfigError as error:
+            lines.append(str(error))
+    if seed is not None:
+        changes.append(Override(("system", "seed"), seed, "--seed"))
+    if mode is not None:
+        changes.append(Override(("system", "mode"), mode, "--mode"))
+    return changes, lines
+
+
+def _origin_of(path: KeyPath, places: dict[KeyPath, int], source: str, changes: list[Override]) -> str:
+    for change in reversed(changes):
+        if path[: len(change.path)] == change.path:
+            return change.origin
+    line = line_of(places, path)
+    return source if line is None else f"{source}:{line}"
+
+
+def _syntax_line(error: tomllib.TOMLDecodeError, text: str, source: str) -> str:
+    match = _ERROR_POSITION.match(str(error))
+    if match is None:
+        return f"{source}  is not valid TOML: {error}"
+    line = match["line"] or max(1, len(text.splitlines()))
+    return f"{source}:{line}  is not valid TOML: {match['what']}"

@@ -1,0 +1,1 @@
+"""The FITS products, one module per kind (matrix, gains, loop, frames, telemetry, run state), and the checked file format that they share. What a product holds as a Python object is defined in api/."""

@@ -1,0 +1,298 @@
+"""FITS extensions that several products share: sensor geometry, metrics, temporal response, registration."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.results import (
+    ActuatorCorrections,
+    Estimate,
+    RegistrationEstimate,
+    SprintIteration,
+    TemporalResponse,
+)
+from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, require_kind
+from escape_hw.errors import ProductError
+from escape_hw.io.fits import file as fits_file
+
+_PUPILS = "PUPILS"
+
+
+def pack_grid(grid: SensorGeometry) -> list[Any]:
+    """The references with all numbers of the geometry as cards, and the flux map.
+
+    The card SENSOR names the kind; the mask stands in VALID.
+    """
+    pack, _ = _CONVERTERS[grid.kind]
+    references, cards, extra_extensions = pack(grid)
+    cards |= {"COUNTS": float(grid.counts), "BACKGND": float(grid.background), "SENSOR": grid.kind}
+    return [
+        fits_file.image_extension("GRID", np.asarray(references, np.float32), grid.slope_unit, **cards),
+        fits_file.image_extension("FLUX", np.asarray(grid.flux, np.float32)),
+        *extra_extensions,
+    ]
+
+
+def unpack_grid(path: Path, hdus: fits.HDUList) -> SensorGeometry:
+    """Inverse of :func:`pack_grid`, with the mask from VALID.
+
+    Raises
+    ------
+    ProductError
+        Parts are missing, do not fit each other, or belong to a kind of sensor that is not known.
+    """
+    header = fits_file.require_extension(path, hdus, "GRID").header
+    valid = fits_file.read_array(path, hdus, "VALID", np.uint8).astype(bool)
+    references = fits_file.read_array(path, hdus, "GRID", np.float32)
+    if references.shape != (int(valid.sum()), 2):
+        raise ProductError(f"{path}: GRID has shape {references.shape}, VALID marks {int(valid.sum())}")
+    # Products from before there was a second kind do not say theirs.
+    kind = str(header.get("SENSOR", SubApertureGrid.kind))
+    if kind not in _CONVERTERS:
+        raise ProductError(
+            f"{path}: its sensor is of kind '{kind}'; this version knows {', '.join(_CONVERTERS)}"
+        )
+    _, unpack = _CONVERTERS[kind]
+    common = {
+        "valid": valid,
+        "flux": fits_file.read_array(path, hdus, "FLUX", np.float32),
+        "counts": float(header["COUNTS"]),
+        "background": float(header["BACKGND"]),
+    }
+    return unpack(path, hdus, references, common)
+
+
+_GeometryParts = tuple[NDArray[np.float32], dict[str, Any], list[Any]]
+
+
+def _pack_shack_hartmann(geometry: SensorGeometry) -> _GeometryParts:
+    grid = require_kind(geometry, SubApertureGrid)
+    cards = {
+        "PITCH": float(grid.pitch_px),
+        "ORIGINX": float(grid.origin_px[0]),
+        "ORIGINY": float(grid.origin_px[1]),
+        "MOTION": float(grid.motion_px),
+        "AIR": float(grid.turbulence_px),
+    }
+    return grid.references_px, cards, []
+
+
+def _unpack_shack_hartmann(
+    path: Path, hdus: fits.HDUList, references: NDArray[np.float32], common: dict[str, Any]
+) -> SubApertureGrid:
+    header = fits_file.require_extension(path, hdus, "GRID").header
+    return SubApertureGrid(
+        pitch_px=float(header["PITCH"]),
+        origin_px=(float(header["ORIGINX"]), float(header["ORIGINY"])),
+        references_px=references,
+        motion_px=float(header["MOTION"]),
+        # Products of earlier versions have none.
+        turbulence_px=float(header.get("AIR", 0.0)),
+        **common,
+    )
+
+
+def _pack_pyramid(geometry: SensorGeometry) -> _GeometryParts:
+    pupils = require_kind(geometry, PyramidPupils)
+    cards = {
+        "DIAMETER": float(pupils.diameter_px),
+        "MOTION": float(pupils.motion),
+        "CENTRESD": float(pupils.centre_sigma_px),
+        "POKES": float(pupils.pokes),
+        "LOOKS": float(pupils.n_effective),
+        "STEADY": float(pupils.persistent_fraction),
+        "NORMAL": fits_file.header_text(pupils.normalisation),
+        "MODULAT": float(pupils.modulation),
+    }
+    positions = {
+        "X": np.asarray(pupils.centres_px[:, 0], np.float64),
+        "Y": np.asarray(pupils.centres_px[:, 1], np.float64),
+        "CORNERX": np.asarray(pupils.corners_px[:, 0], np.int64),
+        "CORNERY": np.asarray(pupils.corners_px[:, 1], np.int64),
+    }
+    return pupils.references, cards, [fits_file.table_extension(_PUPILS, positions)]
+
+
+def _unpack_pyramid(
+    path: Path, hdus: fits.HDUList, references: NDArray[np.float32], common: dict[str, Any]
+) -> PyramidPupils:
+    header, table = (
+        fits_file.require_extension(path, hdus, "GRID").header,
+        fits_file.require_extension(path, hdus, _PUPILS).data,
+    )
+    if len(table) != 4:
+        raise ProductError(f"{path}: {_PUPILS} has {len(table)} rows; a pyramid makes four images")
+    return PyramidPupils(
+        centres_px=np.stack([table["X"], table["Y"]], axis=1).astype(np.float64),
+        diameter_px=float(header["DIAMETER"]),
+        corners_px=np.stack([table["CORNERX"], table["CORNERY"]], axis=1).astype(np.intp),
+        references=references,
+        motion=float(header["MOTION"]),
+        centre_sigma_px=float(header["CENTRESD"]),
+        # Products written before these were recorded do without.
+        pokes=float(header.get("POKES", 0.0)),
+        n_effective=float(header.get("LOOKS", 0.0)),
+        persistent_fraction=float(header.get("STEADY", 0.0)),
+        normalisation=str(header["NORMAL"]),
+        modulation=float(header["MODULAT"]),
+        **common,
+    )
+
+
+_CONVERTERS: dict[str, tuple[Callable[[SensorGeometry], _GeometryParts], Callable[..., SensorGeometry]]] = {
+    SubApertureGrid.kind: (_pack_shack_hartmann, _unpack_shack_hartmann),
+    PyramidPupils.kind: (_pack_pyramid, _unpack_pyramid),
+}
+
+
+def pack_metrics(metrics: Mapping[str, Any], name: str = "METRICS") -> fits.BinTableHDU:
+    """Scalars by name as a table.
+
+    Numbers stand in the column VALUE, where NaN and infinity are allowed (a header card cannot
+    hold them); whatever is no float is kept exactly as JSON in the column TEXT.
+    """
+    numbers, as_text = [], []
+    for value in metrics.values():
+        if isinstance(value, np.generic | np.ndarray):
+            value = value.tolist()
+        if isinstance(value, float):
+            numbers.append(value)
+            as_text.append("")
+        else:
+            numbers.append(float(value) if isinstance(value, int) else math.nan)
+            as_text.append(json.dumps(value))
+    return fits_file.table_extension(
+        name,
+        {
+            "NAME": np.array([json.dumps(key) for key in metrics], dtype=str),
+            "VALUE": np.array(numbers, float),
+            "TEXT": np.array(as_text, dtype=str),
+        },
+    )
+
+
+def unpack_metrics(path: Path, hdus: fits.HDUList, name: str = "METRICS") -> dict[str, Any]:
+    """Inverse of :func:`pack_metrics`."""
+    data = fits_file.require_extension(path, hdus, name).data
+    try:
+        return {
+            json.loads(row["NAME"]): json.loads(row["TEXT"]) if row["TEXT"] else float(row["VALUE"])
+            for row in data
+        }
+    except (KeyError, ValueError, TypeError) as error:
+        raise ProductError(f"{path}: extension {name} is no table of metrics ({error})") from error
+
+
+def pack_response(response: TemporalResponse) -> fits.BinTableHDU:
+    """The temporal response, one row per frame of delay."""
+    return fits_file.table_extension("RESPONSE", {"WEIGHT": response.weights, "SIGMA": response.sigma})
+
+
+def unpack_response(path: Path, hdus: fits.HDUList) -> TemporalResponse | None:
+    """Inverse of :func:`pack_response`; ``None`` when the product has none."""
+    if "RESPONSE" not in hdus:
+        return None
+    return TemporalResponse(_column(hdus, "RESPONSE", "WEIGHT"), _column(hdus, "RESPONSE", "SIGMA"))
+
+
+def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
+    """Parameters with errors, their covariance, and the iterations that led there."""
+    rows = [*estimate.measured().values(), estimate.gain, estimate.width, *estimate.extras.values()]
+    alpha = fits_file.table_extension(
+        "ALPHA",
+        {
+            "NAME": np.array([*PARAMETERS, "gain", "width", *estimate.extras]),
+            "VALUE": np.array([row.value for row in rows]),
+            "SIGMA": np.array([row.sigma for row in rows]),
+            "UNIT": np.array([fits_file.header_text(row.unit) for row in rows]),
+        },
+        CONVERGE=bool(estimate.converged),
+    )
+    steps = estimate.iterations
+    values = np.array([step.registration.to_array() for step in steps]).reshape(-1, len(PARAMETERS))
+    iterations = fits_file.table_extension(
+        "SPRINT",
+        {
+            **{name.upper(): values[:, i] for i, name in enumerate(PARAMETERS)},
+            "GAIN": np.array([step.gain for step in steps], float),
+            "STEP": np.array([step.step_norm for step in steps], float),
+            "CHI2": np.array([step.chi2 for step in steps], float),
+        },
+    )
+    notes = {
+        "chi2": float(estimate.chi2),
+        "warnings": list(estimate.warnings),
+        "notes": list(estimate.notes),
+    }
+    return [
+        alpha,
+        fits_file.image_extension("COVAR", np.asarray(estimate.covariance, np.float64)),
+        iterations,
+        pack_metrics(notes, "ALPHANOT"),
+        *([] if estimate.actuator_corrections is None else [_pack_actuators(estimate.actuator_corrections)]),
+    ]
+
+
+def _pack_actuators(corrections: ActuatorCorrections) -> fits.BinTableHDU:
+    columns = {"GAIN": corrections.gain, "SIGMA": corrections.gain_sigma, "WIDTH": corrections.width}
+    return fits_file.table_extension("ACTUATOR", columns, PEDESTAL=float(corrections.pedestal))
+
+
+def _unpack_actuators(hdus: fits.HDUList) -> ActuatorCorrections | None:
+    """``None`` where SPRINT did not look, and in products of earlier versions."""
+    if "ACTUATOR" not in hdus:
+        return None
+    gain, sigma, width = (_column(hdus, "ACTUATOR", name) for name in ("GAIN", "SIGMA", "WIDTH"))
+    return ActuatorCorrections(gain, sigma, width, float(hdus["ACTUATOR"].header["PEDESTAL"]))
+
+
+def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate | None:
+    """Inverse of :func:`pack_registration`; ``None`` when the product has none."""
+    if "ALPHA" not in hdus:
+        return None
+    value, sigma = _column(hdus, "ALPHA", "VALUE"), _column(hdus, "ALPHA", "SIGMA")
+    units = [str(unit) for unit in hdus["ALPHA"].data["UNIT"]]
+    names = [str(name) for name in hdus["ALPHA"].data["NAME"]]
+    notes = unpack_metrics(path, hdus, "ALPHANOT")
+    fits_file.require_extension(path, hdus, "SPRINT")
+    columns = [_column(hdus, "SPRINT", name.upper()) for name in PARAMETERS]
+    gain, step, chi2 = (_column(hdus, "SPRINT", name) for name in ("GAIN", "STEP", "CHI2"))
+    n = len(PARAMETERS)
+    return RegistrationEstimate(
+        registration=Registration.from_array(value[:n]),
+        covariance=fits_file.read_array(path, hdus, "COVAR", np.float64),
+        gain=Estimate(float(value[n]), float(sigma[n]), units[n]),
+        width=Estimate(float(value[n + 1]), float(sigma[n + 1]), units[n + 1]),
+        converged=bool(hdus["ALPHA"].header["CONVERGE"]),
+        iterations=tuple(
+            SprintIteration(
+                Registration.from_array([column[i] for column in columns]),
+                float(gain[i]),
+                float(step[i]),
+                float(chi2[i]),
+            )
+            for i in range(gain.size)
+        ),
+        chi2=float(notes["chi2"]),
+        warnings=tuple(str(note) for note in notes["warnings"]),
+        # Products of earlier versions have none.
+        notes=tuple(str(note) for note in notes.get("notes", ())),
+        extras={
+            names[k]: Estimate(float(value[k]), float(sigma[k]), units[k]) for k in range(n + 2, len(names))
+        },
+        actuator_corrections=_unpack_actuators(hdus),
+    )
+
+
+def _column(hdus: fits.HDUList, extension: str, name: str) -> Any:
+    return np.asarray(hdus[extension].data[name], dtype=np.float64)

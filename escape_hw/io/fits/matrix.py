@@ -1,0 +1,258 @@
+"""Interaction matrices and modal bases in FITS files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits as astropy_fits
+from numpy.typing import ArrayLike, NDArray
+
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.results import CalibrationResult, RegistrationEstimate
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.errors import IncompatibleProduct, ProductError
+from escape_hw.io.fits import extensions as fits_geometry
+from escape_hw.io.fits import extensions as fits_parts
+from escape_hw.io.fits import file as fits_file
+from escape_hw.io.fits.file import Product
+from escape_hw.io.provenance import Provenance
+
+KIND_MATRIX = "IM"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class MatrixProduct(Product[CalibrationResult]):
+    """An interaction matrix read from disk."""
+
+    @property
+    def matrix(self) -> InteractionMatrix:
+        """The matrix to close the loop with."""
+        return self.result.matrix
+
+    @property
+    def grid(self) -> SensorGeometry:
+        """The sensor's geometry that its slopes belong to."""
+        return self.result.grid
+
+    @property
+    def registration(self) -> RegistrationEstimate | None:
+        """The registration it was computed for, when it is a pseudo-synthetic matrix."""
+        return self.result.registration
+
+
+def partial_path(path: Path) -> Path:
+    """The name under which an aborted run keeps what it measured: ``im.partial.fits``."""
+    return path if path.name.endswith(".partial.fits") else path.with_suffix(".partial.fits")
+
+
+def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance | None = None) -> Path:
+    """Write a calibration's matrix with grid, errors, basis, registration and configuration.
+
+    Parameters
+    ----------
+    path
+        Wanted name; the result of an aborted run is written as ``*.partial.fits`` instead.
+    result
+        What a calibration procedure returned.
+    origin
+        Where it comes from.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written; no half product is left.
+    ValueError
+        Matrix and grid do not belong together.
+    """
+    path, origin = Path(path), origin or Provenance()
+    matrix = result.matrix
+    if not np.array_equal(matrix.valid, result.grid.valid):
+        raise ValueError(f"the matrix and the geometry mark different {result.grid.elements} as valid")
+    if result.partial:
+        path = partial_path(path)
+    primary = fits_file.primary_hdu(KIND_MATRIX, matrix.system, matrix.simulated, result.partial, origin)
+    primary.header["METHOD"] = (fits_file.header_text(matrix.method), "how the matrix was made")
+    primary.header["FRAMES"] = (int(result.frames), "frames used")
+    primary.header["LOST"] = (int(result.lost_frames), "frames lost")
+    hdus = [
+        primary,
+        *_pack_matrix(matrix, ""),
+        fits_file.image_extension("M2C", matrix.m2c.astype(np.float64)),
+        fits_file.image_extension("VALID", matrix.valid),
+        *fits_geometry.pack_grid(result.grid),
+        fits_parts.pack_metrics(
+            {"sky_seconds": float(result.sky_seconds), "notes": list(result.notes)}, "RUN"
+        ),
+        fits_file.text_extension("CONFIG", origin.config_text),
+    ]
+    if result.measured is not None:
+        hdus += _pack_matrix(result.measured, "MEAS_")
+    if result.registration is not None:
+        hdus += fits_parts.pack_registration(result.registration)
+    if result.response is not None:
+        hdus.append(fits_parts.pack_response(result.response))
+    if result.mean_frame is not None:
+        hdus.append(fits_file.image_extension("FRAME", result.mean_frame.astype(np.float32), "count"))
+    fits_file.write(path, hdus)
+    return path
+
+
+def load_matrix(
+    path: Path | str,
+    *,
+    expect_system: str | None = None,
+    expect_sensor: str | None = None,
+    expect_basis: str | None = None,
+    expect_modes: int | None = None,
+    expect_actuators: int | None = None,
+    expect_m2c: ArrayLike | None = None,
+    expect_sub_apertures: tuple[int, int] | None = None,
+    allow_simulated: bool = True,
+) -> MatrixProduct:
+    """Read a matrix; every ``expect_...`` that is given must hold.
+
+    Parameters
+    ----------
+    expect_system, expect_sensor, expect_basis, expect_modes, expect_actuators
+        Name of the system, kind of sensor, kind of basis, number of modes and of actuators.
+    expect_m2c
+        Mode-to-command matrix ``(n_act, n_modes)``, compared element by element.
+    expect_sub_apertures
+        Shape ``(n_rows, n_columns)`` of the sub-apertures.
+    allow_simulated
+        False on hardware: a simulated matrix is refused.
+
+    Raises
+    ------
+    ProductError
+        Not there, truncated, damaged, of another kind, incomplete or from a newer version.
+    IncompatibleProduct
+        Sound, but not for this system, basis, mirror or mode.
+    """
+    product = MatrixProduct.read(path, KIND_MATRIX, _unpack)
+    path, header = product.path, product.header
+    matrix = product.matrix
+    _expect(
+        path,
+        "system",
+        header["SYSTEM"],
+        None if expect_system is None else fits_file.header_text(expect_system),
+    )
+    _expect(path, "kind of sensor", product.grid.kind, expect_sensor)
+    _expect(path, "kind of basis", header["BASIS"], expect_basis)
+    _expect(path, "number of actuators", matrix.m2c.shape[0], expect_actuators)
+    remedy = f"basis.n_modes={matrix.n_modes} would take this one"
+    _expect(path, "number of modes", matrix.n_modes, expect_modes, remedy)
+    _expect(path, "grid of sub-apertures", matrix.valid.shape, expect_sub_apertures)
+    if expect_m2c is not None:
+        _expect_basis(path, matrix.m2c, np.asarray(expect_m2c, float))
+    if matrix.simulated and not allow_simulated:
+        raise IncompatibleProduct(f"{path}: made in simulation; it is not for hardware (--force overrides)")
+    return product
+
+
+def _pack_matrix(matrix: InteractionMatrix, prefix: str) -> list[Any]:
+    return [
+        fits_file.image_extension(
+            f"{prefix}IM", matrix.data.astype(np.float32), matrix.slope_unit, METHOD=matrix.method
+        ),
+        fits_file.image_extension(f"{prefix}SIGMA", matrix.sigma.astype(np.float32), matrix.slope_unit),
+        fits_parts.pack_metrics(matrix.metrics, f"{prefix}METRICS"),
+    ]
+
+
+def _unpack_matrix(
+    path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any], prefix: str
+) -> InteractionMatrix:
+    cards = fits_file.require_extension(path, hdus, f"{prefix}IM").header
+    return InteractionMatrix(
+        data=fits_file.read_array(path, hdus, f"{prefix}IM", np.float32),
+        sigma=fits_file.read_array(path, hdus, f"{prefix}SIGMA", np.float32),
+        m2c=fits_file.read_array(path, hdus, "M2C", np.float64),
+        valid=fits_file.read_array(path, hdus, "VALID", np.uint8).astype(bool),
+        system=str(header["SYSTEM"]),
+        method=str(cards["METHOD"]),
+        simulated=bool(header["SIMULATE"]),
+        metrics=fits_parts.unpack_metrics(path, hdus, f"{prefix}METRICS"),
+        slope_unit=str(cards["BUNIT"]),
+    )
+
+
+def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> CalibrationResult:
+    run = fits_parts.unpack_metrics(path, hdus, "RUN")
+    frame = fits_file.read_array(path, hdus, "FRAME", np.float32) if "FRAME" in hdus else None
+    return CalibrationResult(
+        matrix=_unpack_matrix(path, hdus, header, ""),
+        grid=fits_geometry.unpack_grid(path, hdus),
+        frames=int(header["FRAMES"]),
+        lost_frames=int(header["LOST"]),
+        sky_seconds=float(run["sky_seconds"]),
+        response=fits_parts.unpack_response(path, hdus),
+        registration=fits_parts.unpack_registration(path, hdus),
+        measured=_unpack_matrix(path, hdus, header, "MEAS_") if "MEAS_IM" in hdus else None,
+        partial=header["FINISH"] == "aborted",
+        mean_frame=frame,
+        notes=tuple(str(note) for note in run["notes"]),
+    )
+
+
+def _expect(path: Path, what: str, found: object, wanted: object, remedy: str = "") -> None:
+    if wanted is not None and found != wanted:
+        out = f" ({remedy})" if remedy else ""
+        raise IncompatibleProduct(f"{path}: its {what} is {found!r}; {wanted!r} is needed{out}")
+
+
+def _expect_basis(path: Path, found: NDArray[np.float64], wanted: NDArray[np.float64]) -> None:
+    _expect(path, "shape of the basis", found.shape, wanted.shape)
+    worst = float(np.abs(found - wanted).max(initial=0.0))
+    if worst > 1e-9 * max(1.0, float(np.abs(wanted).max(initial=0.0))):
+        raise IncompatibleProduct(
+            f"{path}: its basis differs from this system's (by up to {worst:.3g} of stroke per unit mode)"
+        )
+
+
+def load_basis(path: Path | str) -> NDArray[np.float64]:
+    """Mode-to-command matrix of a file.
+
+    Parameters
+    ----------
+    path
+        An interaction matrix of ours, checked as such; or any FITS file whose first image with two axes
+        is the matrix, actuators along its rows (``NAXIS2``).
+
+    Returns
+    -------
+    ndarray of float64, ``(n_act, n_modes)``
+        As stored; nothing is scaled.
+
+    Raises
+    ------
+    ProductError
+        Not there, damaged, without such an image, or with values that are not finite.
+    """
+    path = Path(path)
+    try:
+        with astropy_fits.open(path, memmap=False) as hdus:
+            if "KIND" not in hdus[0].header:
+                return _read_matrix_image(path, hdus)
+    except OSError as error:
+        raise ProductError(f"{path}: cannot be read as FITS ({error})") from error
+    return load_matrix(path).matrix.m2c
+
+
+def _read_matrix_image(path: Path, hdus: astropy_fits.HDUList) -> NDArray[np.float64]:
+    images = (hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None)
+    m2c = next((np.asarray(data, np.float64) for data in images if data.ndim == 2), None)
+    if m2c is None:
+        raise ProductError(f"{path}: holds no image with two axes; a basis is (n_actuators, n_modes)")
+    if not np.isfinite(m2c).all():
+        raise ProductError(f"{path}: the basis holds values that are not finite")
+    return m2c

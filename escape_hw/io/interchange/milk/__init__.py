@@ -1,0 +1,1 @@
+"""Shared-memory images of milk and CACAO, read and written without their library."""

@@ -1,0 +1,1 @@
+"""Calibration files, configuration, geometry and shared-memory streams of pyRTC."""

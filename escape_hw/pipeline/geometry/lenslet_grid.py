@@ -1,0 +1,236 @@
+"""Finding the lenslet grid, the valid sub-apertures and the references from frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, optimize
+
+from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.errors import CalibrationError
+from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes, subaperture_windows
+
+#: How far the real pitch may lie from the nominal one.
+_PITCH_RANGE = 0.03
+#: Least contrast of the light folded at the pitch. Spots under the strongest screen of the bench leave
+#: 0.85, spots that do not stand on the lattice below 0.2.
+_CONTRAST = 0.3
+#: Contrast that the noise of a dark camera does not reach: it makes up to 0.06.
+_NOISE_CONTRAST = 0.1
+#: Spots further off the lattice than this many median distances do not count.
+_MAX_DISTANCE = 5.0
+#: A pixel brighter than so many times its brightest neighbour is no part of a spot, but hot.
+_HOT_PIXEL_RATIO = 10.0
+
+
+def _comb_power(profile: NDArray[np.float64], pitch: float) -> complex:
+    """Fourier component of a profile at one period per ``pitch``."""
+    return complex(np.sum(profile * np.exp(-2j * np.pi * np.arange(profile.size) / pitch)))
+
+
+def _pitch_and_phase(image: NDArray[np.float64], nominal: float) -> tuple[float, float, float]:
+    """Common pitch of both axes, and the position of one lenslet centre along x and y."""
+    profiles = [image.sum(axis=0), image.sum(axis=1)]
+    profiles = [p - ndimage.uniform_filter1d(p, round(nominal) | 1) for p in profiles]
+
+    def negative_power(pitch: float) -> float:
+        return -sum(abs(_comb_power(p, pitch)) ** 2 for p in profiles)
+
+    # The comb's peak is about pitch^2 / length wide: scan finer than that, then polish.
+    trial = nominal * (1 + np.linspace(-_PITCH_RANGE, _PITCH_RANGE, 241))
+    best = float(trial[np.argmin([negative_power(t) for t in trial])])
+    step = float(trial[1] - trial[0])
+    pitch = float(
+        optimize.minimize_scalar(negative_power, bounds=(best - step, best + step), method="bounded").x
+    )
+    phases = [-np.angle(_comb_power(p, pitch)) * pitch / (2 * np.pi) for p in profiles]
+    return pitch, float(phases[0]), float(phases[1])
+
+
+def _contrast(light: NDArray[np.float64], pitch: float) -> float:
+    """How much the light gathers once per pitch: 1 for points on the lattice, 0 for none."""
+    return sum(abs(_comb_power(light.sum(axis=axis), pitch)) for axis in (0, 1)) / (2 * float(light.sum()))
+
+
+def _check_lattice(light: NDArray[np.float64], pitch: float, nominal: float) -> None:
+    """Raise unless the spots really stand one pitch apart."""
+    contrast = _contrast(light, pitch)
+    if contrast < _NOISE_CONTRAST:
+        raise CalibrationError(
+            "no spots on the wavefront sensor, nothing but noise or an even glow; "
+            "check source, beam stop, exposure and sensor.pitch_px"
+        )
+    if abs(pitch / nominal - 1) > _PITCH_RANGE:
+        raise CalibrationError(
+            f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal}; "
+            "check sensor.pitch_px and the binning"
+        )
+    # Spots two or three of the assumed pitches apart look regular too, at a harmonic.
+    wider = max(_contrast(light, m * pitch) for m in (2, 3))
+    if contrast < _CONTRAST or wider > contrast / 2:
+        raise CalibrationError(
+            f"the spots on the wavefront sensor do not stand {nominal} pixels apart, as the design says; "
+            "check sensor.pitch_px and the binning, and that the light comes through the lenslets"
+        )
+
+
+def _lattice_fit(
+    rows: NDArray[np.intp], columns: NDArray[np.intp], spots: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Weighted least-squares pitch and origin (x, y) of spots on a square lattice.
+
+    Spots that lie further off than the many do (a hot pixel in the window) are left out.
+    """
+    n = rows.size
+    design = np.zeros((2, n, 3))
+    design[0, :, 0], design[1, :, 0] = columns, rows
+    design[0, :, 1] = design[1, :, 2] = 1.0
+    w: NDArray[np.floating] = np.sqrt(weight)
+    solution: NDArray[np.floating] = np.zeros(3)
+    for _ in range(3):
+        solution = np.linalg.lstsq(
+            (design * w[:, None]).reshape(2 * n, 3), (spots.T * w).ravel(), rcond=None
+        )[0]
+        off = np.hypot(*(spots.T - design @ solution))
+        w = np.sqrt(weight) * (off <= _MAX_DISTANCE * np.median(off) + 1e-6)
+    return float(solution[0]), float(solution[1]), float(solution[2])
+
+
+def find_lenslet_grid(
+    mean_frame: NDArray[np.float32],
+    *,
+    n_sub: int,
+    nominal_pitch_px: float,
+    threshold: float,
+    min_flux: float,
+    references: str = "lattice",
+) -> SubApertureGrid:
+    """Find pitch, offset, valid sub-apertures and references from a mean frame.
+
+    The mean of many frames will do, turbulent ones too: turbulence moves single spots, but a
+    lattice fitted to all of them keeps only the error of the mean tilt and focus.
+
+    Parameters
+    ----------
+    mean_frame
+        Mean of dark-subtracted frames in counts ``(rows, columns)``.
+    n_sub
+        Lenslets across the grid.
+    nominal_pitch_px
+        Design pitch in pixels; the real one may differ by 3 %.
+    threshold
+        Centre-of-gravity threshold in counts.
+    min_flux
+        Sub-apertures with less flux than this share of the brightest are left out.
+    references
+        ``"lattice"``: the references are the lattice points (the choice without a source);
+        ``"mean"``: the mean spot positions (the choice with one).
+
+    Returns
+    -------
+    SubApertureGrid
+
+    Raises
+    ------
+    CalibrationError
+        No regular spots, or too few lit sub-apertures.
+    """
+    if references not in ("lattice", "mean"):
+        raise ValueError(f"references is {references!r}; choose 'lattice' or 'mean'")
+    image = _without_hot_pixels(np.asarray(mean_frame, dtype=np.float64), n_sub)
+    light = np.maximum(image - threshold, 0.0)
+    if not light.any():
+        raise CalibrationError(
+            "no light above the threshold on the wavefront sensor; check source and exposure"
+        )
+    pitch, x, y = _pitch_and_phase(light, nominal_pitch_px)
+    x, y = _centre_lattice(light, pitch, x, y, n_sub)
+    for _ in range(3):
+        grid = _build_grid(image, n_sub, pitch, (x, y), min_flux)
+        spots = grid.centres_px() + _measure_spots(grid, light)
+        rows, columns = np.nonzero(grid.valid)
+        pitch, x, y = _lattice_fit(rows, columns, spots, np.minimum(grid.flux[grid.valid], 1.0).astype(float))
+    _check_lattice(light, pitch, nominal_pitch_px)
+    grid = _build_grid(image, n_sub, pitch, (x, y), min_flux)
+    if references == "mean":
+        grid = replace(grid, references_px=_measure_spots(grid, light).astype(np.float32))
+    return grid
+
+
+def _without_hot_pixels(image: NDArray[np.float64], n_sub: int) -> NDArray[np.float64]:
+    """The image with bright pixels that stand alone lowered to their brightest neighbour.
+
+    Otherwise, one hot pixel holds as much light as a whole spot, and a dark sub-aperture around it
+    passes for a lit one.
+    """
+    around = np.ones((3, 3), dtype=bool)
+    around[1, 1] = False
+    brightest = ndimage.maximum_filter(image, footprint=around, mode="nearest")
+    # In the dark, noise stands out from noise; only what is as bright as a spot can pass for one.
+    hot = (image > _HOT_PIXEL_RATIO * np.maximum(brightest, 0.0)) & (image > np.percentile(image, 99))
+    if hot.sum() > n_sub**2 / 10:
+        # So many are the spots themselves, each on a pixel.
+        return image
+    return np.where(hot, brightest, image)
+
+
+def _centre_lattice(
+    light: NDArray[np.float64], pitch: float, x: float, y: float, n_sub: int
+) -> tuple[float, float]:
+    """Number the lenslets so that the pupil's light is centred on the ``n_sub`` by ``n_sub`` grid."""
+    smooth = ndimage.uniform_filter(light, round(pitch))
+    # Opening by more than one pitch removes hot pixels, which would push the outline out.
+    kernel_size = round(1.5 * pitch) | 1
+    opened = ndimage.maximum_filter(ndimage.minimum_filter(smooth, kernel_size, mode="constant"), kernel_size)
+    # The outline of the pupil, not its brightness: a Gaussian beam need not be centred on it.
+    pupil_area = opened > 0.1 * np.percentile(opened, 99)
+    if not pupil_area.any():
+        raise CalibrationError(
+            "single bright pixels but no evenly lit pupil on the wavefront sensor; "
+            "check source, exposure and sensor.pitch_px"
+        )
+    rows, columns = np.nonzero(pupil_area)
+    half = (n_sub - 1) / 2
+
+    def first_centre(at: NDArray[np.intp], phase: float) -> float:
+        middle = 0.5 * float(at.min() + at.max())
+        return phase + pitch * round((middle - phase) / pitch - half)
+
+    return first_centre(columns, x), first_centre(rows, y)
+
+
+def _build_grid(
+    image: NDArray[np.float64], n_sub: int, pitch: float, origin: tuple[float, float], min_flux: float
+) -> SubApertureGrid:
+    line = np.arange(n_sub) * pitch
+    centres = np.stack([a.ravel() for a in np.meshgrid(origin[0] + line, origin[1] + line)], axis=1)
+    rows, columns = image.shape
+    boxes = subaperture_windows(centres, pitch, (rows, columns))
+    area = np.pad(image.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    top, end, left, right = boxes.T
+    flux = area[end, right] - area[top, right] - area[end, left] + area[top, left]
+    complete = (end - top >= int(pitch)) & (right - left >= int(pitch))
+    flux = np.where(complete, np.maximum(flux, 0.0), 0.0).reshape(n_sub, n_sub)
+    # Relative to the typical bright sub-aperture: one hot pixel must not darken all others.
+    counts = float(np.percentile(flux[flux > 0.02 * flux.max()], 95))
+    flux = flux / counts
+    valid = flux >= min_flux
+    if valid.sum() < 6:
+        raise CalibrationError(
+            f"only {int(valid.sum())} sub-apertures are lit above {min_flux:.0%} of the brightest; "
+            "check the beam, the camera region and sensor.min_flux"
+        )
+    return SubApertureGrid(
+        pitch, origin, valid, np.zeros((int(valid.sum()), 2), np.float32), flux.astype(np.float32), counts
+    )
+
+
+def _measure_spots(grid: SubApertureGrid, light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Spot offsets ``(n_valid, 2)`` of a mean frame that is no longer made of whole counts."""
+    rows, columns = light.shape
+    extractor = ShackHartmannSlopes(grid, (rows, columns), threshold=0.0)
+    scale = 60000.0 / float(light.max())
+    slopes = extractor(np.asarray(light * scale, dtype=np.uint16))
+    return np.asarray(slopes.reshape(2, -1).T, dtype=np.float64)

@@ -1,0 +1,84 @@
+"""From a frame to slopes: what all kinds of sensors share."""
+
+from __future__ import annotations
+
+import abc
+from typing import Generic
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.sensor import G
+
+
+class FrameSlopes(abc.ABC, Generic[G]):
+    """Slopes of one geometry on one camera region; a sensor fills in ``_compute``.
+
+    Each pixel counts as ``max(frame * gain - offset, 0)``, with the gain one over the flat.
+
+    Parameters
+    ----------
+    grid
+        The geometry.
+    shape
+        Region (rows, columns).
+    dark
+        Dark frame in counts, zeros by default.
+    flat
+        Relative pixel response, ones by default.
+    threshold
+        Level in counts above the dark that is subtracted.
+
+    Raises
+    ------
+    ValueError
+        Frame, dark or flat do not fit each other.
+    """
+
+    def __init__(
+        self,
+        grid: G,
+        shape: tuple[int, int],
+        dark: NDArray[np.float32] | None,
+        flat: NDArray[np.float32] | None,
+        threshold: float = 0.0,
+    ) -> None:
+        self.grid, self.shape, self.threshold = grid, shape, float(threshold)
+        self.dark = np.zeros(shape, np.float32) if dark is None else np.ascontiguousarray(dark, np.float32)
+        response = np.ones(shape, np.float32) if flat is None else np.asarray(flat, np.float32)
+        if self.dark.shape != shape or response.shape != shape:
+            raise ValueError(
+                f"dark {self.dark.shape} and flat {response.shape} must have the region's {shape}"
+            )
+        if not (response > 0).all():
+            raise ValueError("the flat has pixels that are not positive")
+        self._gain = np.ascontiguousarray(1 / response)
+        self._offset = np.ascontiguousarray(self.dark * self._gain + np.float32(threshold))
+        self._light = np.empty(grid.n_valid, np.float32)
+
+    @property
+    def flux(self) -> NDArray[np.float32]:
+        """Light above the threshold of each valid sub-aperture in the last frame ``(n_valid,)``, in counts.
+
+        Overwritten by the next frame, unless that one was given a flux array of its own.
+        """
+        return self._light
+
+    def __call__(
+        self,
+        frame: NDArray[np.uint16],
+        flux: NDArray[np.float32] | None = None,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """Slopes ``(n_slopes,)``, in ``out`` if given; ``flux (n_valid,)`` is filled when given."""
+        if frame.shape != self.shape:
+            raise ValueError(f"frame has shape {frame.shape}; the slopes were set up for {self.shape}")
+        slopes = np.empty(self.grid.n_slopes, np.float32) if out is None else out
+        self._compute(frame, slopes, self._light if flux is None else flux)
+        return slopes
+
+    @abc.abstractmethod
+    def _compute(
+        self, frame: NDArray[np.uint16], slopes: NDArray[np.float32], light: NDArray[np.float32]
+    ) -> None:
+        """Fill ``slopes (n_slopes,)`` and ``light (n_valid,)``."""

@@ -1,0 +1,185 @@
+"""Standard error of the mean of correlated series, and paired bootstrap comparison of two means."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Fewer values do not tell how they are correlated.
+MIN_SAMPLES = 10
+#: Statistical error of the window over its systematic one (Wolff 2004, S).
+_WOLFF_S = 1.5
+#: The window spans at least the root of so many times the length: the values of short series seem less
+#: correlated than they are. Found on loops of known scatter (docs/decisions/0013-strehl-errors.md).
+_MIN_WINDOW_FACTOR = 3.0
+#: The error is not stated below the root of this share of that of uncorrelated values.
+_MIN_VARIANCE_FRACTION = 0.5
+
+
+def standard_error(series: NDArray[np.floating]) -> float:
+    """Standard error of the mean of a stationary series.
+
+    ``sigma^2 = (C_0 + 2 sum over k up to W of (1 - k/n) C_k) / n`` with the autocovariances ``C_k``.
+    The window W is chosen so that what it cuts off and what it adds in noise are balanced (Wolff 2004,
+    Comput. Phys. Commun. 156, 143, eq. 52). About the series' own mean, every autocovariance comes out
+    too small by ``sigma^2``, which is solved for.
+
+    Parameters
+    ----------
+    series
+        Values in their order ``(n,)``.
+
+    Returns
+    -------
+    float
+        NaN for fewer than :data:`MIN_SAMPLES` values.
+    """
+    n = series.size
+    if n < MIN_SAMPLES:
+        return math.nan
+    covariance = _autocovariance(series - series.mean())
+    if not covariance[0] > 0:
+        return 0.0
+    window = min(max(_truncation_lag(covariance), int(math.sqrt(_MIN_WINDOW_FACTOR * n))), n // 3)
+    k = np.arange(1, window + 1)
+    total = float(covariance[0] + 2 * ((1 - k / n) * covariance[1 : window + 1]).sum())
+    degrees_of_freedom = n - (2 * window + 1) + window * (window + 1) / n
+    # That the sum comes out near zero or below is chance; values that alternate so well are none of ours.
+    return math.sqrt(max(total, _MIN_VARIANCE_FRACTION * float(covariance[0])) / degrees_of_freedom)
+
+
+def _autocovariance(centred: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Autocovariance by lag ``(n,)``."""
+    n = centred.size
+    transform = np.fft.rfft(centred, 2 * n)
+    products = np.fft.irfft(transform * transform.conj(), 2 * n)[:n]
+    return np.asarray(products / np.arange(n, 0, -1))
+
+
+def _truncation_lag(covariance: NDArray[np.float64]) -> int:
+    """Lag up to which autocovariances count."""
+    n, time = covariance.size, 0.5
+    for lag in range(1, n // 3):
+        time += covariance[lag] / covariance[0]
+        decay = 1e-9 if time <= 0.5 else _WOLFF_S / math.log((2 * time + 1) / (2 * time - 1))
+        if math.exp(-lag / decay) < decay / math.sqrt(lag * n):
+            return lag
+    return n // 3
+
+
+#: Fewer pairs know too little of their own scatter.
+MIN_PAIRS = 6
+#: Confidence of every statement.
+CONFIDENCE = 0.95
+_RESAMPLES = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class PairedComparison:
+    """Mean difference A - B of pairs.
+
+    Parameters
+    ----------
+    mean, sigma
+        The mean and its standard error.
+    low, high
+        Confidence interval of the mean, at :data:`CONFIDENCE`.
+    equivalence
+        Smallest margin x within which A and B are equivalent at :data:`CONFIDENCE`: two one-sided tests
+        (Schuirmann 1987), that is, the interval of twice the error probability lies within -x..x.
+    pairs
+        How many.
+    """
+
+    mean: float
+    sigma: float
+    low: float
+    high: float
+    equivalence: float
+    pairs: int
+
+    @property
+    def is_different(self) -> bool:
+        """Whether the interval leaves zero out."""
+        return self.low > 0 or self.high < 0
+
+    def is_equivalent(self, margin: float) -> bool:
+        """Whether A and B are shown to be equivalent within a margin."""
+        return self.equivalence <= margin
+
+
+def compare_pairs(
+    first: NDArray[np.floating], second: NDArray[np.floating], seed: int = 0
+) -> PairedComparison:
+    """Compare two series pair by pair, by the studentised bootstrap (Efron & Tibshirani 1993, ch. 12.5).
+
+    Resampled means are divided by their own standard errors, so that the intervals hold for few pairs,
+    where plain percentiles are too narrow.
+
+    Parameters
+    ----------
+    first, second
+        Values of A and B on the same air ``(n,)``.
+    seed
+        Of the resampling.
+
+    Raises
+    ------
+    ValueError
+        Not as many of one as of the other, or fewer than :data:`MIN_PAIRS`.
+    """
+    if first.shape != second.shape or first.ndim != 1 or first.size < MIN_PAIRS:
+        raise ValueError(f"{first.shape} and {second.shape}: at least {MIN_PAIRS} pairs are needed")
+    d = np.asarray(first, float) - np.asarray(second, float)
+    n, mean = d.size, float(d.mean())
+    sigma = float(d.std(ddof=1) / np.sqrt(n))
+    if not sigma > 0:
+        return PairedComparison(mean, 0.0, mean, mean, abs(mean), n)
+    drawn = d[np.random.default_rng(seed).integers(0, n, (_RESAMPLES, n))]
+    errors = drawn.std(axis=1, ddof=1) / np.sqrt(n)
+    # A resample of one value alone knows no error of its own; with six pairs that is one in ten thousand.
+    usable = errors > 1e-3 * sigma
+    t = (drawn.mean(axis=1)[usable] - mean) / errors[usable]
+    half, whole = (1 - CONFIDENCE) / 2, 1 - CONFIDENCE
+    below, narrow_below, narrow_above, above = np.quantile(t, [half, whole, 1 - whole, 1 - half])
+    low, high = mean - above * sigma, mean - below * sigma
+    margin = max(abs(mean - narrow_above * sigma), abs(mean - narrow_below * sigma))
+    return PairedComparison(mean, sigma, float(low), float(high), float(margin), n)
+
+
+def describe_comparison(first: str, second: str, comparison: PairedComparison, margin: float) -> str:
+    """What may be said of two arms, in percent of the Strehl ratio.
+
+    Parameters
+    ----------
+    first, second
+        Names of A and B.
+    found
+        Their comparison.
+    margin
+        Difference in the Strehl ratio that does not matter.
+    """
+    confidence = f"{100 * CONFIDENCE:.0f} %"
+    size = f"{100 * abs(comparison.mean):.2f} ± {100 * comparison.sigma:.2f} % Strehl"
+    if comparison.is_equivalent(margin):
+        text = (
+            f"{first} and {second} equivalent within {100 * comparison.equivalence:.2f} % Strehl at {confidence} "
+            f"(difference {100 * comparison.mean:+.2f} ± {100 * comparison.sigma:.2f} %)"
+        )
+    elif comparison.is_different:
+        better, worse = (first, second) if comparison.mean > 0 else (second, first)
+        text = f"{better} better than {worse} by {size} ({confidence}: {_interval(comparison)})"
+    else:
+        text = (
+            f"{first} against {second} undecided: {100 * comparison.mean:+.2f} ± {100 * comparison.sigma:.2f} % "
+            f"Strehl, equivalent only within {100 * comparison.equivalence:.2f} %; more pairs decide"
+        )
+    return text
+
+
+def _interval(comparison: PairedComparison) -> str:
+    low, high = sorted((abs(comparison.low), abs(comparison.high)))
+    return f"{100 * low:.2f} to {100 * high:.2f} %"

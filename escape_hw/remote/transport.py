@@ -1,0 +1,212 @@
+"""The client's end of the wire: one thread owns the sockets, callers wait with a deadline."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from typing import Any
+
+import zmq
+
+from escape_hw.errors import ServerGone
+from escape_hw.remote.address import Endpoint
+from escape_hw.remote.requests import error_from_document
+
+log = logging.getLogger(__name__)
+
+_POLL_MS = 500
+#: Number of a request whose answer nobody waits for.
+_HEARTBEAT_ID = b"0"
+#: Largest answer that is taken, bytes.
+_LARGEST = 256 << 20
+
+#: The answer, the bytes beside it, and the number of the state that holds what was done.
+Reply = tuple[Any, bytes, int]
+Keys = tuple[bytes, bytes, bytes]
+
+
+class ClientTransport:
+    """A connection to a server.
+
+    Parameters
+    ----------
+    endpoint
+        Where it listens.
+    on_event
+        Gets topic and document of every event, in the link's thread.
+    beat
+        Gives a message to be sent every ``heartbeat_s`` seconds, or ``None``; is told whether the server refused
+        the last one.
+    keys
+        The server's public key, this client's public and secret key; ``None`` on the same machine.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        on_event: Callable[[str, dict[str, Any]], object],
+        heartbeat: Callable[[bool], Mapping[str, Any] | None],
+        heartbeat_s: float = 0.5,
+        keys: Keys | None = None,
+    ) -> None:
+        self._on_event, self._heartbeat, self._heartbeat_s = on_event, heartbeat, heartbeat_s
+        self._context = zmq.Context()
+        self._requests = self._socket(zmq.DEALER, endpoint.requests, keys)
+        self._events = self._socket(zmq.SUB, endpoint.events, keys)
+        self._events.setsockopt(zmq.SUBSCRIBE, b"")
+        self._wake_receiver, self._wake_sender = (
+            self._context.socket(zmq.PAIR),
+            self._context.socket(zmq.PAIR),
+        )
+        self._wake_receiver.bind("inproc://bell")
+        self._wake_sender.connect("inproc://bell")
+        self._lock = threading.Lock()
+        self._outbox: deque[tuple[bytes, bytes]] = deque()
+        self._waiting: dict[bytes, Future[Reply]] = {}
+        self._numbers = itertools.count(1)
+        self._ending = self._heartbeat_refused = False
+        #: When the server was last heard of, monotonic seconds.
+        self.last_message_s = 0.0
+        self._thread = threading.Thread(target=self._run, name="escape-link", daemon=True)
+        self._thread.start()
+
+    def _socket(self, kind: int, address: str, keys: Keys | None) -> zmq.Socket[bytes]:
+        socket = self._context.socket(kind)
+        socket.setsockopt(zmq.LINGER, 200)
+        socket.setsockopt(zmq.MAXMSGSIZE, _LARGEST)
+        socket.setsockopt(zmq.RECONNECT_IVL, 100)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+        if kind == zmq.DEALER:
+            # The server tells connections apart by this; nobody else learns it. It outlives a reconnect.
+            socket.setsockopt(zmq.ROUTING_ID, b"c" + os.urandom(16))
+        if keys is not None:
+            socket.curve_serverkey, socket.curve_publickey, socket.curve_secretkey = keys
+        socket.connect(address)
+        return socket
+
+    def ask(self, message: Mapping[str, Any], timeout_s: float) -> Reply:
+        """Send a request and wait for its answer.
+
+        Raises
+        ------
+        ServerGone
+            No answer in time.
+        EscapeError
+            What the server raised.
+        """
+        answer: Future[Reply] = Future()
+        number = str(next(self._numbers)).encode()
+        with self._lock:
+            if self._ending:
+                raise ServerGone("this connection is closed")
+            self._waiting[number] = answer
+            self._outbox.append((number, json.dumps(message).encode()))
+            self._wake_sender.send(b"")
+        try:
+            return answer.result(timeout_s)
+        except FutureTimeoutError:
+            raise ServerGone(
+                f"no answer to '{message.get('verb')}' within {timeout_s:g} s; is the server still there?"
+            ) from None
+        finally:
+            with self._lock:
+                self._waiting.pop(number, None)
+
+    def close(self) -> None:
+        """Hang up; whoever waits for an answer gets none."""
+        with self._lock:
+            if self._ending:
+                return
+            self._ending = True
+            self._wake_sender.send(b"")
+        self._thread.join(timeout=5)
+        for socket in (self._requests, self._events, self._wake_receiver, self._wake_sender):
+            socket.close()
+        self._context.term()
+
+    def _run(self) -> None:
+        poller = zmq.Poller()
+        for socket in (self._requests, self._events, self._wake_receiver):
+            poller.register(socket, zmq.POLLIN)
+        last_heartbeat_s = 0.0
+        while not self._ending:
+            ready = dict(poller.poll(min(_POLL_MS, int(1000 * self._heartbeat_s))))
+            if self._wake_receiver in ready:
+                self._wake_receiver.recv()
+            self._send_all()
+            # An event that was sent before an answer is known before it.
+            if self._events in ready:
+                self._receive_events()
+            if self._requests in ready:
+                self._receive_reply()
+            if (
+                time.monotonic() - last_heartbeat_s > self._heartbeat_s
+                and (message := self._next_heartbeat()) is not None
+            ):
+                last_heartbeat_s = time.monotonic()
+                self._send(_HEARTBEAT_ID, json.dumps(message).encode())
+
+    def _next_heartbeat(self) -> Mapping[str, Any] | None:
+        refused, self._heartbeat_refused = self._heartbeat_refused, False
+        return self._heartbeat(refused)
+
+    def _send_all(self) -> None:
+        while True:
+            with self._lock:
+                if not self._outbox:
+                    return
+                number, text = self._outbox.popleft()
+            self._send(number, text)
+
+    def _send(self, number: bytes, text: bytes) -> None:
+        try:
+            self._requests.send_multipart([number, text], zmq.NOBLOCK)
+        except zmq.Again:
+            log.debug("the server takes nothing; request %s is dropped", number)
+
+    def _receive_reply(self) -> None:
+        parts = self._requests.recv_multipart()
+        self.last_message_s = time.monotonic()
+        with self._lock:
+            answer = self._waiting.pop(parts[0], None)
+        if answer is None and parts[0] != _HEARTBEAT_ID:
+            return
+        try:
+            reply = json.loads(parts[1])
+            if answer is None:
+                self._heartbeat_refused = not reply["ok"]
+                return
+            if reply["ok"]:
+                data = parts[2] if len(parts) > 2 else b""
+                answer.set_result((reply["answer"], data, int(reply.get("serial", 0))))
+            else:
+                answer.set_exception(error_from_document(reply["error"]))
+        except (IndexError, KeyError, ValueError) as error:
+            invalid_reply = ServerGone(f"the server's answer makes no sense: {error!r}")
+            if answer is None:
+                log.warning("%s", invalid_reply)
+            else:
+                answer.set_exception(invalid_reply)
+
+    def _receive_events(self) -> None:
+        while True:
+            try:
+                self._handle_event(self._events.recv_multipart(zmq.NOBLOCK))
+            except zmq.Again:
+                return
+
+    def _handle_event(self, parts: list[bytes]) -> None:
+        self.last_message_s = time.monotonic()
+        try:
+            self._on_event(parts[0].decode(), json.loads(parts[1]))
+        except Exception as error:
+            # One event that makes no sense must not end the connection.
+            log.warning("an event was not understood: %s: %s", type(error).__name__, error)

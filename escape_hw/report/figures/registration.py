@@ -1,0 +1,109 @@
+"""Figures of SPRINT: how it converged, and how its error falls with the frames used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.results import RegistrationEstimate
+from escape_hw.report.figures import style
+from escape_hw.report.tables import TITLES, format_with_error
+
+_SHORT_UNITS = {"% of Sub Aperture": "% sub-ap.", "deg": "deg", "% of Diameter": "% diam."}
+
+
+def convergence(estimate: RegistrationEstimate, planted: Registration | None = None) -> Figure:
+    """Step norm above, the five parameters below, per iteration (paper: SPRINT convergence figure).
+
+    The band is the final standard error around the final value, the dotted line a planted truth.
+    """
+    steps = estimate.iterations
+    number = np.arange(1, len(steps) + 1)
+    figure = style.new_figure(7.8, 8.2)
+    panels = figure.subplots(6, 1, sharex=True, height_ratios=[1.6, 1, 1, 1, 1, 1])
+    norm = np.array([step.step_norm for step in steps], float)
+    has_step = norm > 0
+    # A step of zero (the start, or a change of the model) has no place on a logarithmic scale.
+    panels[0].plot(number[has_step], norm[has_step], "o-", color=style.SERIES[0], ms=3, lw=1.3)
+    if has_step.any():
+        panels[0].set_yscale("log")
+    style.style_axes(panels[0]).set_ylabel("relative\nstep norm")
+    state = "converged" if estimate.converged else "NOT converged"
+    panels[0].set_title(
+        f"{state} after {len(steps)} iterations, reduced χ² {estimate.chi2:.3g}",
+        loc="left", color=style.INK, fontsize=9.5,
+    )  # fmt: skip
+    for panel, (name, value) in zip(panels[1:], estimate.measured().items(), strict=True):
+        title, unit = TITLES[name]
+        track = [getattr(step.registration, name) for step in steps]
+        panel.plot(number, track, "o-", color=style.SERIES[2], ms=2.5, lw=1.3)
+        low, high = value.value - value.sigma, value.value + value.sigma
+        panel.axhspan(low, high, color=style.SERIES[1], alpha=0.35, lw=0)
+        if planted is not None:
+            panel.axhline(getattr(planted, name), color=style.INK, lw=1.0, ls=":")
+        style.style_axes(panel).set_ylabel(f"{title}\n[{_SHORT_UNITS[unit]}]", fontsize=7.5)
+        panel.margins(y=0.2)
+        panel.yaxis.set_major_locator(MaxNLocator(3))
+        panel.set_title(format_with_error(value), loc="right", fontsize=8.5, color=style.INK, pad=2)
+    panels[-1].set_xlabel("iteration")
+    panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    figure.align_ylabels(list(panels))
+    return figure
+
+
+#: Bounds, how they are drawn, and what they are called.
+_BOUNDS = (
+    ("bound", "--", "Cramér-Rao bound, real mirror"),
+    ("exact_bound", ":", "Cramér-Rao bound, exact model"),
+)
+
+
+def error_curves(curves: Mapping[str, Any]) -> Figure:
+    """Error of the registration against the number of frames.
+
+    Parameters
+    ----------
+    curves
+        ``{"frames": [...], "estimators": {name: {parameter: [rms, ...]}}, "bound": {parameter:
+        [...]}, "goal": {parameter: value}}``; ``bound`` (Cramér-Rao, random effects included),
+        ``exact_bound`` (for an exact model) and ``goal`` may be missing.
+    """
+    frames = np.asarray(curves["frames"], float)
+    figure = style.new_figure(9.2, 5.2)
+    panels = figure.subplots(2, 3).ravel()
+    for panel, name in zip(panels, PARAMETERS, strict=False):
+        title, unit = TITLES[name]
+        for (label, errors), colour in zip(curves["estimators"].items(), style.SERIES, strict=False):
+            if name in errors:
+                panel.loglog(
+                    frames, _positive_or_nan(errors[name]), "o-", ms=3, lw=1.4, color=colour, label=label
+                )
+        for key, line, label in _BOUNDS:
+            if name in curves.get(key, {}):
+                panel.loglog(
+                    frames, _positive_or_nan(curves[key][name]), line, lw=1.1, color=style.INK, label=label
+                )
+        if name in curves.get("goal", {}):
+            panel.axhline(curves["goal"][name], color=style.MUTED, lw=1.0, ls=":", label="goal")
+        style.style_axes(panel).set_title(title, fontsize=9.5)
+        panel.set(xlabel="frames", ylabel=f"rms error [{_SHORT_UNITS[unit]}]")
+        # The frames themselves, few enough to be read: powers of ten tell little over one decade.
+        labelled = frames[:: -(-frames.size // 5)]
+        panel.xaxis.set_major_locator(FixedLocator(list(labelled)))
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
+        panel.xaxis.set_minor_locator(NullLocator())
+    handles, labels = panels[0].get_legend_handles_labels()
+    style.hide_axes(panels[5]).legend(
+        handles, labels, loc="center", frameon=False, fontsize=9, labelcolor=style.INK
+    )
+    return figure
+
+
+def _positive_or_nan(values: Any) -> Any:
+    data = np.asarray(values, float)
+    return np.where(data > 0, data, np.nan)

@@ -1,0 +1,136 @@
+"""One look for all figures; SVG that follows the page's light or dark colours."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, Normalize
+from matplotlib.figure import Figure, FigureBase
+from numpy.typing import NDArray
+
+# Figures are made without pyplot: no global state, no windows, safe in any thread.
+
+INK, MUTED, LINE = "#1d2733", "#66727f", "#cfd6dd"
+#: Distinguishable with any colour vision, on white and on near-black (after Tol and Okabe-Ito).
+SERIES = ("#2f7fc1", "#e07b1a", "#1b9e77", "#b565a7", "#b59a1d", "#c8505a")
+#: Diverging, perceptually even, safe for colour-blind eyes.
+DIVERGING = "RdBu_r"
+_VARIABLES = {INK: "var(--ink)", MUTED: "var(--muted)", LINE: "var(--line)"}
+_NAN_COLOUR = (0.5, 0.55, 0.6, 0.14)
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of that size in inches, transparent, laid out without overlaps."""
+    figure = Figure(figsize=(width, height), facecolor="none", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def colormap(name: str) -> Colormap:
+    """A colour map of Matplotlib by name."""
+    return matplotlib.colormaps[name]
+
+
+def style_axes(axes: Axes, *, grid: bool = True) -> Axes:
+    """Give axes with scales the common look."""
+    axes.set_facecolor("none")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(MUTED)
+        axes.spines[side].set_linewidth(0.7)
+    axes.tick_params(colors=INK, labelsize=8, width=0.7, length=3, which="both")
+    axes.xaxis.label.set(color=INK, fontsize=8.5)
+    axes.yaxis.label.set(color=INK, fontsize=8.5)
+    axes.title.set(color=INK, fontsize=9.5)
+    if grid:
+        axes.grid(True, color=LINE, linewidth=0.6)
+        axes.set_axisbelow(True)
+    return axes
+
+
+def hide_axes(axes: Axes) -> Axes:
+    """Axes that hold a picture: no frame, no ticks."""
+    axes.set_facecolor("none")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    return axes
+
+
+def legend(axes: Axes, **options: Any) -> None:
+    """A legend without a box."""
+    drawn_legend = axes.legend(frameon=False, fontsize=8, **options)
+    for text in drawn_legend.get_texts():
+        text.set_color(INK)
+
+
+def map_colours(
+    values: NDArray[np.float64], name: str, low: float, high: float, hidden: NDArray[np.bool_] | None = None
+) -> NDArray[np.float64]:
+    """Colours ``(rows, columns, 4)`` of a map; NaN becomes a neutral veil, ``hidden`` transparent."""
+    scaled = np.clip((np.nan_to_num(values) - low) / (high - low), 0, 1)
+    rgba = np.asarray(colormap(name)(scaled), dtype=float)
+    rgba[~np.isfinite(values)] = _NAN_COLOUR
+    if hidden is not None:
+        rgba[hidden] = 0
+    return rgba
+
+
+def colour_bar(
+    figure: FigureBase,
+    axes: Sequence[Axes],
+    name: str,
+    limits: tuple[float, float],
+    label: str,
+    shrink: float = 1.0,
+) -> None:
+    """A slim colour bar beside the axes it belongs to."""
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(*limits), colormap(name)),
+        ax=list(axes),
+        fraction=0.025,
+        pad=0.015,
+        aspect=35 * shrink,
+        shrink=shrink,
+    )
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(colors=INK, labelsize=8, width=0.7, length=3)
+    bar.set_label(label, color=INK, fontsize=8.5)
+
+
+def png(figure: Figure, dpi: int = 150) -> bytes:
+    """The figure on white as PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
+    return buffer.getvalue()
+
+
+def svg(figure: Figure, key: str) -> str:
+    """The figure as an SVG element to stand inside a page.
+
+    Its neutral colours become the page's CSS variables, and its ids carry ``key`` so that several
+    figures can share a page.
+    """
+    buffer = io.StringIO()
+    # A fixed salt and no date: the same figures give the same report, byte for byte.
+    with matplotlib.rc_context({"svg.hashsalt": "escape", "svg.image_inline": True}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, dpi=150)
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'\bid="', f'id="{key}-', text)
+    text = re.sub(r'(url\(|href=")#', rf"\1#{key}-", text)
+    for colour, variable in _VARIABLES.items():
+        text = text.replace(colour, variable)
+    # The page sets the width; the view box keeps the proportions.
+    return re.sub(r'(<svg[^>]*?) width="[^"]*"| height="[^"]*pt"', r"\1", text, count=2)

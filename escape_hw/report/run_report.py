@@ -1,0 +1,367 @@
+"""``report.html`` of a run folder, and one PNG with its matrices and PSFs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from escape_hw.errors import ProductError
+from escape_hw.io.storage import write_atomic
+from escape_hw.report import html, tables
+from escape_hw.report.content import RunContent, read_run
+from escape_hw.report.figures import bench as figures_bench
+from escape_hw.report.figures import gains as figures_gains
+from escape_hw.report.figures import matrix as figures_matrix
+from escape_hw.report.figures import registration as figures_registration
+from escape_hw.report.figures import style
+from escape_hw.report.figures import track as figures_track
+from escape_hw.report.sweep import sweep_section
+
+REPORT = "report.html"
+
+
+def write_report(folder: Path | str) -> Path:
+    """Build a run folder's report from its ``result.json`` and products.
+
+    Returns
+    -------
+    Path
+        The page written.
+
+    Raises
+    ------
+    ProductError
+        Not a run folder, or a product is missing or damaged.
+    StorageError
+        The page cannot be written.
+    """
+    run = read_run(folder)
+    path = run.folder / REPORT
+    write_atomic(path, render_page(run).encode())
+    return path
+
+
+def render_page(run: RunContent) -> str:
+    """The page as text."""
+    document = run.document
+    title = str(document.get("title") or f"{document['command']} on {document['system']}")
+    banners = [
+        ("simulated", "SIMULATED: every number on this page comes from a digital twin")
+        if run.simulated
+        else ("hardware", "HARDWARE")
+    ]
+    if run.partial():
+        banners.append(("aborted", "ABORTED BY THE OPERATOR: partial data"))
+    lead = " · ".join(
+        str(part)
+        for part in (
+            document["system"],
+            document.get("finished_utc") and f"{str(document['finished_utc'])[:19].replace('T', ' ')} UTC",
+            f"seed {document['seed']}" if document.get("seed") is not None else None,
+            document.get("software") and f"ESCAPE {document['software']}",
+        )
+        if part
+    )
+    parts = [
+        f"<h1>{html.escape(title)}</h1>",
+        f'<p class="lead">{html.escape(lead)}</p>',
+        html.key_values(_key_numbers(run)),
+    ]
+    parts += [
+        _criteria_section(document),
+        _registration_section(run),
+        _gains_section(run),
+        _loops_section(run),
+        sweep_section(document),
+        _track_section(run),
+        _matrices_section(run),
+        _sky_time_section(run),
+        _bench_section(run),
+    ]
+    parts.append(_origin_section(run))
+    return html.page(title, banners, [part for part in parts if part])
+
+
+def _key_numbers(run: RunContent) -> dict[str, str]:
+    found: dict[str, str] = {}
+    # A matrix and what was computed from it share their frames: one number for both.
+    shared: dict[str, list[str]] = {}
+    for label, result in run.calibrations.items():
+        if not result.frames:
+            continue
+        text = f"{result.frames:,} ({result.sky_seconds:.3g} s)".replace(",", "\u2009")
+        shared.setdefault(text, []).append(label)
+    for text, labels in shared.items():
+        found[f"{' and '.join(labels)}: frames"] = text
+    found |= _track_key_numbers(run.document)
+    if run.document.get("wall_seconds") is not None:
+        found["wall clock"] = f"{float(run.document['wall_seconds']):.0f} s"
+    for label, loop in run.loops.items():
+        if loop.strehl is not None:
+            found[f"{label}: Strehl ratio, peak"] = tables.format_percent(loop.strehl.peak).strip()
+    return found
+
+
+def _track_key_numbers(document: dict[str, Any]) -> dict[str, str]:
+    """What a tracked run comes to."""
+    if not document.get("track"):
+        return {}
+    frames = f"{document['frames']:,} ({document['seconds']:.3g} s)".replace(",", "\u2009")
+    n_accepted = sum(one["accepted"] for one in document["exchanges"])
+    found = {
+        "closed loop: frames": frames,
+        "pokes, of the stroke": f"±{100 * document['poke']:.3g} % each mode",
+        "new matrices taken": f"{n_accepted} of {len(document['exchanges'])} proposed",
+    }
+    if document.get("strehl") is not None:
+        found["Strehl ratio, peak, mean"] = f"{100 * document['strehl']:.1f} %"
+    return found
+
+
+def _criteria_section(document: dict[str, Any]) -> str:
+    return html.section("Criteria", html.criteria_list(document.get("criteria") or []))
+
+
+def _registration_section(run: RunContent) -> str:
+    estimates = run.estimates()
+    if not estimates:
+        return ""
+    caption = "Registration of the mirror seen by the sensor, with standard errors."
+    if run.planted is not None:
+        caption += " Δ: difference from the planted truth, which is shown only here; no estimator reads it."
+    parts = [html.table(tables.registration_table(estimates, run.planted), caption)]
+    for number, (label, estimate) in enumerate(estimates.items()):
+        if estimate.iterations:
+            what = f" ({label})" if label else ""
+            parts.append(
+                html.figure(
+                    f"sprint{number}",
+                    figures_registration.convergence(estimate, run.planted),
+                    f"SPRINT convergence{what}: step norm (top) and the parameters per iteration. "
+                    "Band: final value with its standard error."
+                    + (" Dotted: planted truth." if run.planted is not None else ""),
+                )
+            )
+        parts.append(html.note_list(list(estimate.warnings), "bad"))
+        parts.append(html.note_list(list(estimate.notes)))
+    return html.section("Registration", *parts)
+
+
+def _gains_section(run: RunContent) -> str:
+    parts = []
+    for number, (label, result) in enumerate(run.gains.items()):
+        if result.rounds:
+            caption = (
+                f"Optical gain of every mode relative to the {label} matrix, with standard errors, and its "
+                "smooth course with its own."
+            )
+            parts.append(html.figure(f"og{number}", figures_gains.optical_gains(result), caption))
+        caption = (
+            "First closure: effective gain and residual at each gain tried. Rounds: change of the gains."
+        )
+        parts.append(html.figure(f"bootstrap{number}", figures_gains.bootstrap(result), caption))
+        parts.append(html.table(tables.rounds_table(result), "Rounds of the bootstrap."))
+        parts.append(html.note_list(list(result.notes)))
+    return html.section("Optical gains", *parts) if parts else ""
+
+
+def _loops_section(run: RunContent) -> str:
+    if not run.loops:
+        return ""
+    parts = [html.table(tables.strehl_table(run.loops), "rms: residual wavefront seen by the sensor.")]
+    if any(loop.psf is not None for loop in run.loops.values()):
+        parts.append(
+            html.figure(
+                "psf",
+                figures_bench.stacked_psfs(run.loops, run.psf_px),
+                "Stacked closed-loop PSFs and the model PSF taken without turbulence, logarithmic stretch. "
+                "Strehl ratios from top to bottom: maximum, optical transfer function, energy within 3 "
+                "pixels of the maximum, each against the model.",
+            )
+        )
+    if any(loop.residual_nm.size for loop in run.loops.values()):
+        parts.append(
+            html.figure(
+                "residual",
+                figures_bench.residual_strip(run.loops),
+                "Residual wavefront seen by the sensor, from the closing of the loop on; logarithmic.",
+            )
+        )
+    scans = run.document.get("scans") or {}
+    if scans:
+        parts.append(
+            html.figure("gains", figures_bench.gain_scan(scans), "Search for each matrix's own best gain.")
+        )
+    return html.section("Closed loop", *parts)
+
+
+def _track_section(run: RunContent) -> str:
+    track = run.document.get("track")
+    if not track or not track["seconds"]:
+        return ""
+    exchanges, alarms = run.document["exchanges"], run.document["alarms"]
+    planted = run.document.get("planted_course")
+    drawing = figures_track.track_figure(track, exchanges, alarms, planted)
+    caption = (
+        "Live registration, optical gain and image quality, with standard errors. "
+        "Upright and dotted: a new matrix was taken into use. Upright and full: an alarm."
+        + (
+            ""
+            if planted is None
+            else " Dotted course: planted truth, shown only here; no estimator reads it."
+        )
+    )
+    lines = tuple(
+        (
+            f"{one['seconds']:.0f}", "exchanged" if one["accepted"] else "proposed",
+            f"{one['mismatch']:.1%} ± {one['mismatch_sigma']:.1%}",
+            f"{one['slowest']:.3f}", f"{one['fastest']:.3f}",
+        )
+        for one in exchanges
+    )  # fmt: skip
+    parts = [html.figure("track", drawing, caption)]
+    if lines:
+        heads = ("seconds", "", "change of the matrix", "slowest mode", "fastest mode")
+        what = (
+            "New matrices. Slowest, fastest: loop gain of the modes with the matrix before; 1 is asked for."
+        )
+        parts.append(html.table(tables.Table(heads, lines), what))
+    parts.append(html.note_list([f"after {one['seconds']:.0f} s: {one['text']}" for one in alarms], "bad"))
+    note = run.document.get("planted_note")
+    parts.append(html.note_list([note] if note else []))
+    return html.section("Tracking", *parts)
+
+
+def _matrices_section(run: RunContent) -> str:
+    matrices = run.matrices()
+    if not matrices:
+        return ""
+    parts = [
+        html.figure(
+            "modes",
+            figures_matrix.mode_maps(matrices),
+            "Interaction matrices: x and y slope maps of evenly spaced modes, each divided by its rms slope.",
+        )
+    ]
+    if any((matrix.sigma > 0).any() for matrix in matrices.values()):
+        parts.append(
+            html.figure(
+                "errors",
+                figures_matrix.errors_per_mode(matrices),
+                "Signal-to-noise ratio and standard error per mode. The errors of a computed matrix are "
+                "those of its registration and its gain, which all slopes share.",
+            )
+        )
+    calibration_notes = [
+        f"{label}: {note}" for label, result in run.calibrations.items() for note in result.notes
+    ]
+    return html.section("Interaction matrices", *parts, html.note_list(calibration_notes))
+
+
+def _sky_time_section(run: RunContent) -> str:
+    curves = run.document.get("sky_time")
+    if not curves:
+        notes = run.document.get("notes") or []
+        return html.section("Sky time", html.note_list(notes)) if notes else ""
+    drawing = figures_registration.error_curves(curves)
+    realisations = f", rms over {curves['plants']} random plants" if "plants" in curves else ""
+    caption = f"Error of the registration against the frames used{realisations}, with the Cramér-Rao bound."
+    fewest_frames = curves.get("fewest_frames") or {}
+    if fewest_frames:
+        met = ", ".join(f"{name} {count or 'none of these'}" for name, count in fewest_frames.items())
+        caption += f" Fewest frames that meet every goal: {met}."
+    calibration_notes = html.note_list([curves["note"]] if "note" in curves else [])
+    return html.section("Sky time", html.figure("skytime", drawing, caption), calibration_notes)
+
+
+def _mirror_figure(run: RunContent, command: NDArray[np.float64]) -> Figure | None:
+    """The command on the map of the actuators, when the run knows where they stand."""
+    layout, positions = run.layout, run.places_m
+    if layout is not None and command.size == int(layout.sum()):
+        return figures_bench.mirror_on_grid(command, layout)
+    if positions is not None and command.size == len(positions):
+        return figures_bench.mirror_without_grid(command, positions)
+    return None
+
+
+def _bench_section(run: RunContent) -> str:
+    parts = []
+    calibration = next((r for r in run.calibrations.values() if r.mean_frame is not None), None)
+    if calibration is not None and calibration.mean_frame is not None:
+        drawing = figures_bench.sensor_frame(calibration.mean_frame, calibration.grid, "mean frame")
+        parts.append(html.figure("mean", drawing, "Mean sensor frame and what was found on it."))
+    label, loop = next(reversed(run.loops.items()), ("", None))
+    if loop is not None and loop.last_frame is not None:
+        drawing = figures_bench.sensor_frame(loop.last_frame, None, "one frame")
+        parts.append(html.figure("frame", drawing, f"The last sensor frame of the {label} loop."))
+    shape = None if loop is None else _mirror_figure(run, loop.last_command)
+    if shape is not None:
+        parts.append(html.figure("mirror", shape, f"The last mirror command of the {label} loop."))
+    response = next((r.response for r in run.calibrations.values() if r.response is not None), None)
+    if response is not None:
+        caption = "Temporal response of mirror and sensor, from the pokes themselves, with standard errors."
+        parts.append(html.figure("response", figures_bench.temporal_response(response), caption))
+    return html.section("Bench", html.figure_row(*parts))
+
+
+def _origin_section(run: RunContent) -> str:
+    rows = tuple(
+        (name, path.name, run.digests.get(name, "–"))
+        for name, path in run.document["products"].items()
+        if path.suffix == ".fits"
+    )
+    files = html.table(tables.Table(("Product", "file", "SHA-256"), rows, numeric=False)) if rows else ""
+    return html.section(
+        "Origin",
+        files,
+        html.collapsible("Configuration", run.config_text),
+        html.collapsible("Log", run.log_text),
+    )
+
+
+#: Modes shown.
+_MODES = 5
+
+
+def write_picture(folder: Path | str, path: Path) -> Path:
+    """Draw the picture of a run folder as PNG.
+
+    Parameters
+    ----------
+    folder
+        A run with at least one matrix and one closed loop, such as ``escape reproduce`` leaves.
+    path
+        File to write.
+
+    Raises
+    ------
+    ProductError
+        Not a run folder, damaged, or without matrix or image.
+    StorageError
+        The picture cannot be written.
+    """
+    run = read_run(folder)
+    write_atomic(path, style.png(draw_picture(run), dpi=130))
+    return path
+
+
+def draw_picture(run: RunContent) -> Figure:
+    """The picture as a figure; see :func:`write_picture`."""
+    matrices = run.matrices()
+    if not matrices or not any(loop.psf is not None for loop in run.loops.values()):
+        raise ProductError(f"{run.folder}: holds no matrix or no closed-loop image to draw")
+    left = 1.0 + 2.15 * len(matrices)
+    figure = style.new_figure(left + 5.3, 6.2)
+    about = f"{run.document['system']}, {'SIMULATED' if run.simulated else 'hardware'}"
+    figure.suptitle(about, x=0.01, ha="left", color=style.MUTED, fontsize=9)
+    parts = figure.subfigures(1, 2, squeeze=False, width_ratios=[left, 5.3], wspace=0.02)[0]
+    for part, title in zip(parts, ("Interaction matrices", "Closed-loop images"), strict=True):
+        part.set_facecolor("none")
+        part.suptitle(title, color=style.INK, fontsize=12, fontweight="bold")
+    figures_matrix.draw_mode_maps(parts[0], matrices, _MODES)
+    figures_bench.draw_psfs(parts[1], run.loops, run.psf_px, rows=2)
+    return figure

@@ -1,0 +1,1 @@
+"""Progress bars for terminals and notebooks."""

@@ -1,0 +1,226 @@
+"""Hands on one device without any calibration: hold a shape, run a wave, watch a camera."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.camera import Camera, Frame, FrameStatus
+from escape_hw.api.mirror import DeformableMirror
+from escape_hw.api.procedure import Procedure, Reporter
+from escape_hw.errors import CommandRejected
+
+#: Commands per second of a wave, and seconds over which it rises.
+WAVE_HZ, RISE_S = 100.0, 0.5
+#: Moments of a period at which a wave is checked before it starts.
+_CHECKED_PHASES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class DriveResult:
+    """What became of shapes that were sent, fractions of full stroke.
+
+    Parameters
+    ----------
+    commands
+        How many were sent.
+    skipped
+        How many the mirror itself did not execute.
+    peak
+        Largest value that reached the mirror.
+    """
+
+    commands: int
+    skipped: int
+    peak: float
+
+
+@dataclass(frozen=True, slots=True)
+class CameraStatistics:
+    """A camera for a while.
+
+    Parameters
+    ----------
+    frames
+        Delivered.
+    status
+        The camera's own counters.
+    rate_hz
+        By the frames' own times.
+    mean, lowest, highest
+        Counts over all pixels and frames.
+    saturated
+        Saturated pixels of the worst frame.
+    """
+
+    frames: int
+    status: FrameStatus
+    rate_hz: float
+    mean: float
+    lowest: int
+    highest: int
+    saturated: int
+
+
+def poke_shape(dm: DeformableMirror, actuator: int, amplitude: float) -> NDArray[np.float64]:
+    """The flat shape ``(n_act,)`` with one actuator moved.
+
+    Raises
+    ------
+    CommandRejected
+        The mirror could not take it as it is; the message says what it could.
+    """
+    shape = dm.flat
+    shape[actuator] += amplitude
+    reached, report = dm.check(shape)
+    if not report.is_unchanged:
+        moved = reached[actuator] - dm.flat[actuator]
+        raise CommandRejected(
+            dm.name,
+            f"a poke of {amplitude:g} at actuator {actuator} is beyond its limits, which allow {moved:.4g} "
+            "beside the others at flat; ask for that or less",
+        )
+    return shape
+
+
+def hold_shape(dm: DeformableMirror, shape: NDArray[np.float64], seconds: float) -> Procedure[DriveResult]:
+    """Send a shape, keep it for a while, and end flat.
+
+    Parameters
+    ----------
+    dm
+        An open mirror.
+    shape
+        ``(n_act,)``, fractions of full stroke.
+    seconds
+        How long, by the wall clock.
+    """
+    report = Reporter("holding the shape", max(1, math.ceil(seconds)), "second")
+    try:
+        sent = dm.send(shape)
+        started = time.monotonic()
+        while (elapsed := time.monotonic() - started) < seconds:
+            yield report(int(elapsed))
+            time.sleep(min(Reporter.PERIOD_S, seconds - elapsed))
+        return DriveResult(1, int(sent.skipped), float(np.abs(sent.sent).max()))
+    finally:
+        dm.flatten()
+
+
+def wave_generator(
+    dm: DeformableMirror, amplitude: float, waves: float
+) -> Callable[[float], NDArray[np.float64]]:
+    """A wave over the mirror along x: a function that takes the phase in turns and gives ``(n_act,)``.
+
+    Raises
+    ------
+    CommandRejected
+        At some moment it would break a limit; the message says which amplitude would not.
+    """
+    x = dm.info.positions_m[:, 0]
+    along = waves * (x - x.min()) / max(float(np.ptp(x)), 1e-12)
+    flat = dm.flat
+    disabled = np.zeros(flat.size, dtype=bool)
+    disabled[list(dm.limits.disabled)] = True
+
+    def shape(turns: float) -> NDArray[np.float64]:
+        wanted: NDArray[np.float64] = flat + amplitude * np.sin(2 * np.pi * (along - turns))
+        wanted[disabled] = flat[disabled]
+        return wanted
+
+    fraction = min(dm.largest_legal_scale(shape(k / _CHECKED_PHASES)) for k in range(_CHECKED_PHASES))
+    if fraction < 1:
+        raise CommandRejected(
+            dm.name, f"a wave of {amplitude:g} breaks its limits; {fraction * amplitude:.3g} would not"
+        )
+    return shape
+
+
+def run_wave(
+    dm: DeformableMirror, shape: Callable[[float], NDArray[np.float64]], frequency_hz: float, seconds: float
+) -> Procedure[DriveResult]:
+    """Let a wave run over the mirror, rising slowly, and end flat.
+
+    Parameters
+    ----------
+    dm
+        An open mirror.
+    shape
+        From :func:`wave_generator`.
+    frequency_hz
+        Periods per second.
+    seconds
+        How long, by the wall clock.
+    """
+    report = Reporter("wave", max(1, math.ceil(seconds)), "second")
+    commands = skipped = 0
+    peak = 0.0
+    flat = dm.flat
+    try:
+        started = time.monotonic()
+        while (at := time.monotonic() - started) < seconds:
+            sent = dm.send(flat + (shape(frequency_hz * at) - flat) * min(1.0, at / RISE_S))
+            commands, skipped = commands + 1, skipped + sent.skipped
+            peak = max(peak, float(np.abs(sent.sent).max()))
+            if report.due():
+                yield report(int(at), commands=commands)
+            time.sleep(max(0.0, started + commands / WAVE_HZ - time.monotonic()))
+        return DriveResult(commands, skipped, peak)
+    finally:
+        dm.flatten()
+
+
+def grab_frames(camera: Camera, frames: int, timeout_s: float) -> Procedure[list[Frame]]:
+    """Take frames one after the other.
+
+    Parameters
+    ----------
+    camera
+        An open camera.
+    frames
+        How many.
+    timeout_s
+        Longest wait for each, seconds.
+    """
+    report = Reporter("grabbing", frames)
+    found: list[Frame] = []
+    for number in range(1, frames + 1):
+        found.append(camera.next_frame(timeout_s))
+        if report.due():
+            yield report(number)
+    camera.stop()
+    return found
+
+
+def monitor_camera(camera: Camera, seconds: float, timeout_s: float) -> Procedure[CameraStatistics]:
+    """Watch a camera for so many seconds of its own clock.
+
+    Parameters
+    ----------
+    camera
+        An open camera.
+    seconds
+        How long.
+    timeout_s
+        Longest wait for a frame, seconds.
+    """
+    report = Reporter("watching", max(1, math.ceil(seconds)), "second")
+    frames = saturated = highest = 0
+    lowest, total, first_ns, last_ns = camera.info.full_scale, 0.0, 0, 0
+    while frames < 2 or last_ns - first_ns < seconds * 1e9:
+        frame = camera.next_frame(timeout_s)
+        first_ns, last_ns, frames = first_ns or frame.exposed_ns, frame.exposed_ns, frames + 1
+        total += float(frame.data.mean())
+        lowest, highest = min(lowest, int(frame.data.min())), max(highest, int(frame.data.max()))
+        saturated = max(saturated, frame.n_saturated)
+        if report.due():
+            yield report(int((last_ns - first_ns) * 1e-9), frames=frames, highest=highest)
+    status = camera.status()
+    camera.stop()
+    rate = (frames - 1 + status.lost) / max((last_ns - first_ns) * 1e-9, 1e-9)
+    return CameraStatistics(frames, status, rate, total / frames, lowest, highest, saturated)

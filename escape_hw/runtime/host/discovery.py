@@ -1,0 +1,90 @@
+"""Finds devices without opening them."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import cast
+
+from escape_hw.api.discovery import DiscoveredDevice, Discoverer
+from escape_hw.runtime.host.computer import Host, SerialLine, UsbDevice
+
+GROUP = "escape.discover"
+#: What is known of USB devices by vendor: kind, driver, section.
+_USB = {
+    "20f7": ("camera", "ximea", "wfs"),
+    "1e10": ("camera", "aravis", "science"),
+    "1724": ("camera", "aravis", "science"),
+    "1a72": ("modulator", "pi-e727", "modulator"),
+}
+#: Vendors of serial lines that a controller of PI's may be behind.
+_SERIAL = ("0403", "1a72")
+#: Where ALPAO's SDK looks for the files of a mirror.
+_ALPAO_VARIABLES = ("ACECFG", "ACEROOT")
+
+
+def discover(hosts: Sequence[str] = (), host: Host | None = None) -> list[DiscoveredDevice]:
+    """Everything that can be seen.
+
+    Parameters
+    ----------
+    hosts
+        Computers to ask for devices on the network, ``name`` or ``name:port``; the network is never
+        searched through.
+    host
+        This computer.
+    """
+    host = host or Host()
+    found = [*_find_usb(host), *_find_serial(host), *_find_alpao(host)]
+    for entry in sorted(importlib.metadata.entry_points(group=GROUP), key=lambda one: one.name):
+        found += cast(Discoverer, entry.load())(hosts)
+    return found
+
+
+def _find_usb(host: Host) -> Iterator[DiscoveredDevice]:
+    for device in host.usb_devices():
+        if device.vendor in _USB:
+            kind, driver, section = _USB[device.vendor]
+            wire = '\n\n[devices.modulator.wire]\nkind = "usb"' if driver == "pi-e727" else ""
+            yield _describe(host, kind, driver, section, device, device.path, wire)
+
+
+def _find_serial(host: Host) -> Iterator[DiscoveredDevice]:
+    for line in host.serial_lines():
+        if line.usb.vendor in _SERIAL:
+            yield _describe(host, "modulator", "pi-e727", "modulator", line.usb, line.path, _line_toml(line))
+
+
+def _line_toml(line: SerialLine) -> str:
+    stable = f"/dev/escape/serial-{line.usb.serial}" if line.usb.serial else line.path
+    return f'\n\n[devices.modulator.wire]\nkind = "serial"\nserial_port = "{stable}"'
+
+
+def _describe(
+    host: Host, kind: str, driver: str, section: str, device: UsbDevice, path: str, more: str
+) -> DiscoveredDevice:
+    model = " ".join(word for word in (device.manufacturer, device.name) if word)
+    return DiscoveredDevice(
+        kind, model or f"{device.vendor}:{device.product}", device.serial, path, driver,
+        tuple(host.users_of(path)), device_section_toml(section, driver, device.serial) + more,
+    )  # fmt: skip
+
+
+def device_section_toml(section: str, driver: str, serial: str) -> str:
+    """Lines of a device's section."""
+    return f'[devices.{section}]\nmode = "hardware"\ndriver = "{driver}"\nserial = "{serial}"'
+
+
+def _find_alpao(host: Host) -> Iterator[DiscoveredDevice]:
+    """Mirrors whose files are there; the SDK tells only by opening them whether they are, too."""
+    for variable in _ALPAO_VARIABLES:
+        if not os.environ.get(variable):
+            continue
+        root = Path(os.environ[variable])
+        for file in sorted({*root.glob("*.acfg"), *(root / "config").glob("*.acfg")}):
+            toml = device_section_toml("dm", "alpao", file.stem)
+            toml += f'\n\n[devices.dm.options]\nconfig_folder = "{file.parent}"'
+            users = tuple(host.users_of(str(file)))
+            yield DiscoveredDevice("deformable mirror", "ALPAO", file.stem, str(file), "alpao", users, toml)

@@ -1,0 +1,1 @@
+"""One module per procedure (calibration, registration, gains, loop, tracking, sensor geometry, model PSF) from the request to the saved result, with what they share: task protocol, criteria, saving of products. The algorithms are in calibration/."""

@@ -1,0 +1,111 @@
+"""What a reproduced result must meet to count as reproduced."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from escape_hw.api.optical_gains import GainsResult
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.results import LoopResult, RegistrationEstimate
+
+#: Differences between SHORT and LONG in the paper's Table 1, to the last digit printed there.
+PAPER_DIFFERENCES = {
+    "shift_x": 1.3,
+    "shift_y": 0.4,
+    "rotation": 0.02,
+    "radial_scaling": 0.1,
+    "tangential_scaling": 0.19,
+}
+#: Largest pull (difference over standard error) that still counts as recovered.
+_LARGEST_PULL = 4.0
+
+
+def criterion(text: str, met: bool) -> dict[str, Any]:
+    """One criterion for documents and reports."""
+    return {"text": text, "met": bool(met)}
+
+
+def _readable_name(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def sprint_converged(label: str, estimate: RegistrationEstimate | None) -> dict[str, Any]:
+    """SPRINT converged."""
+    return criterion(f"{label}: SPRINT converged", estimate is not None and estimate.converged)
+
+
+def gains_converged(result: GainsResult) -> dict[str, Any]:
+    """The bootstrap of the optical gains converged."""
+    if not result.rounds:
+        return criterion("optical gains: measured at least once", False)
+    last = result.rounds[-1]
+    short = "" if last.reached else ", its frames ended before the accuracy asked for"
+    return criterion(
+        f"optical gains: converged in {len(result.rounds)} rounds (last change {100 * last.change:.1f} %, "
+        f"{100 * last.expected_change:.1f} % expected of the errors, "
+        f"poke {100 * last.poke:.2g} % of stroke{short})",
+        result.converged,
+    )
+
+
+def injected_value_recovered(
+    label: str, estimate: RegistrationEstimate, planted: Registration
+) -> dict[str, Any]:
+    """The planted registration lies within the error bars."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pulls = np.abs(estimate.registration.to_array() - planted.to_array()) / estimate.sigma
+    worst = float(pulls.max())  # NaN, from no error and no difference, counts as not met
+    return criterion(
+        f"{label}: planted registration recovered within {_LARGEST_PULL:g} standard errors "
+        f"(largest pull {worst:.1f}, {_readable_name(PARAMETERS[int(pulls.argmax())])})",
+        worst <= _LARGEST_PULL,
+    )
+
+
+def short_and_long_agree(short: RegistrationEstimate, long: RegistrationEstimate) -> list[dict[str, Any]]:
+    """SHORT and LONG agree at least as well as the paper's, parameter by parameter."""
+    criteria_met = []
+    for name, value in short.measured().items():
+        difference = abs(value.value - long.measured()[name].value)
+        allowed = PAPER_DIFFERENCES[name]
+        criteria_met.append(
+            criterion(
+                f"SHORT and LONG agree in {_readable_name(name)}: {difference:.3g} (paper: {allowed:g} {value.unit})",
+                difference <= allowed,
+            )
+        )
+    return criteria_met
+
+
+def loop_criteria(results: Mapping[str, LoopResult]) -> list[dict[str, Any]]:
+    """Every loop is stable; ESCAPE is not below the measured baseline beyond the error bar.
+
+    The baseline is push-pull or, where there is no source for it, DO-CRIME.
+    """
+    criteria_met = [criterion(f"{label}: loop stable", loop.stable) for label, loop in results.items()]
+    ours_name = "ESCAPE + OG" if "ESCAPE + OG" in results else "ESCAPE"
+    escape, name = results.get(ours_name), "push-pull" if "push-pull" in results else "DO-CRIME"
+    baseline = results.get(name)
+    if escape is None or baseline is None or escape.model_psf is None or baseline.model_psf is None:
+        return criteria_met
+    if escape.strehl is None or baseline.strehl is None or not math.isfinite(escape.strehl.peak.sigma):
+        return [
+            *criteria_met,
+            criterion(f"Strehl of {ours_name} and {name} compared: their loops were too short", False),
+        ]
+    for way, what in (("peak", "peak"), ("otf", "OTF"), ("encircled", "encircled")):
+        ours, theirs = getattr(escape.strehl, way), getattr(baseline.strehl, way)
+        error = math.hypot(ours.sigma, theirs.sigma)
+        difference = ours.value - theirs.value
+        criteria_met.append(
+            criterion(
+                f"Strehl ({what}) of {ours_name} minus {name}: {100 * difference:+.1f} ± "
+                f"{100 * error:.1f} %, not below zero by more than two standard errors",
+                difference >= -2 * error,
+            )
+        )
+    return criteria_met

@@ -1,0 +1,113 @@
+"""Keeps what a run made: products, ``result.json``, report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from escape_hw.api.optical_gains import GainsResult
+from escape_hw.api.results import CalibrationResult, LoopResult
+from escape_hw.io.fits.gains import save_gains
+from escape_hw.io.fits.loop import save_loop
+from escape_hw.io.fits.matrix import save_matrix
+from escape_hw.io.fits.telemetry import LoopTelemetry, save_telemetry
+from escape_hw.io.provenance import file_sha256
+from escape_hw.io.run_folder import RunFolder
+from escape_hw.report.run_report import REPORT, write_report
+from escape_hw.runtime.session.record import BenchRecord
+
+
+def product_key(label: str) -> str:
+    """A label as a product's name: ``DO-CRIME SHORT`` becomes ``docrime_short``."""
+    return re.sub(r"[^a-z0-9]+", "_", label.lower().replace("do-crime", "docrime")).strip("_")
+
+
+def add_calibration(
+    folder: RunFolder,
+    record: BenchRecord,
+    name: str,
+    result: CalibrationResult,
+    parents: Mapping[str, Path] | None = None,
+) -> Path:
+    """Save a calibration as ``NAME.fits`` and list it among the products.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    known = {path.name: file_sha256(path) for path in (parents or {}).values()}
+    return folder.add_product(name, save_matrix(folder.file(f"{name}.fits"), result, record.origin(known)))
+
+
+def add_loop(
+    folder: RunFolder, record: BenchRecord, name: str, result: LoopResult, matrix: Path | None = None
+) -> Path:
+    """Save a closed-loop run as ``NAME.fits``, with the matrix that closed it as its parent.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    parents = {} if matrix is None else {matrix.name: file_sha256(matrix)}
+    path = folder.file(f"{name}.fits")
+    saved = save_loop(path, result, record.system, record.simulated, record.origin(parents))
+    return folder.add_product(name, saved)
+
+
+def add_telemetry(
+    folder: RunFolder, record: BenchRecord, name: str, telemetry: LoopTelemetry, matrix: Path
+) -> Path:
+    """Save a loop's telemetry as ``NAME.fits``, with the matrix that closed it as its parent.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    origin = record.origin({matrix.name: file_sha256(matrix)})
+    path = folder.file(f"{name}.fits")
+    return folder.add_product(name, save_telemetry(path, telemetry, record.system, record.simulated, origin))
+
+
+def add_gains(
+    folder: RunFolder, record: BenchRecord, name: str, result: GainsResult, parents: Mapping[str, Path]
+) -> Path:
+    """Save a bootstrap of optical gains as ``NAME.fits``, with the matrices it was made from as parents.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    known = {path.name: file_sha256(path) for path in parents.values()}
+    path = folder.file(f"{name}.fits")
+    return folder.add_product(
+        name, save_gains(path, result, record.system, record.simulated, record.origin(known))
+    )
+
+
+def write_run_result(folder: RunFolder, document: Mapping[str, Any]) -> dict[str, Any]:
+    """Write ``result.json``, build the report, and return the document with the products' paths.
+
+    An aborted run gets no report, which takes seconds: its operator waits. ``escape report`` makes it.
+
+    Raises
+    ------
+    StorageError
+        It cannot be written.
+    """
+    if document.get("partial"):
+        folder.write_result(document)
+    else:
+        folder.add_product("report", folder.file(REPORT))
+        folder.write_result(document)
+        write_report(folder.path)
+    return {
+        **document,
+        **folder.location_fields(),
+        "products": {k: str(v) for k, v in folder.products.items()},
+    }

@@ -1,0 +1,113 @@
+"""What a run writes down about the bench it ran on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+from escape_hw.api.registration import Registration
+from escape_hw.bench import Bench
+from escape_hw.config.system import SystemConfig
+from escape_hw.io import documents
+from escape_hw.io.provenance import Provenance, format_utc, get_git_state, get_software_version
+
+
+@dataclass(frozen=True, slots=True)
+class BenchRecord:
+    """Identity of an opened bench, kept after it is closed.
+
+    ``planted`` is the registration hidden in a twin: for reports only, no estimator may see it. ``asked``
+    is what a run that can be gone on with was asked for.
+    """
+
+    system: str
+    simulated: bool
+    seed: int
+    config_text: str
+    basis: str
+    serials: Mapping[str, str]
+    layout: tuple[str, ...]
+    places_m: tuple[tuple[float, float], ...]
+    psf_px: float | None
+    planted: Registration | None
+    started: datetime = field(default_factory=lambda: datetime.now(UTC))
+    asked: Mapping[str, Any] | None = None
+
+    @classmethod
+    def from_bench(cls, bench: Bench) -> BenchRecord:
+        """Take it from an open bench."""
+        config = bench.config
+        devices = {"dm": bench.dm, "wfs": bench.wfs, "modulator": bench.modulator, "science": bench.science}
+        simulated = bool(bench.simulated)
+        science = config.devices.science
+        # A registration that moves is not one that a single number could be held against.
+        is_static = simulated and not config.twin.drift.is_drifting
+        return cls(
+            system=config.system.name,
+            simulated=simulated,
+            seed=config.system.seed,
+            config_text=config.to_toml(),
+            basis=config.basis.kind,
+            serials={name: device.info.serial for name, device in devices.items() if device is not None},
+            layout=actuator_layout(bench),
+            places_m=actuator_positions(bench),
+            psf_px=None if science is None else float(science.psf_px),
+            planted=config.twin.registration.to_registration() if is_static else None,
+        )
+
+    def origin(self, parents: Mapping[str, str] | None = None) -> Provenance:
+        """Provenance of a product made on this bench."""
+        return Provenance(self.config_text, self.basis, self.seed, self.serials, parents or {}, self.started)
+
+    def header_fields(self, command: str) -> dict[str, Any]:
+        """What the run's document begins with."""
+        return {
+            **documents.header_fields(command, self.system, self.simulated, self.seed),
+            "software": get_software_version(),
+            "git": get_git_state(),
+            "started_utc": format_utc(self.started),
+            **({} if self.asked is None else {"asked": dict(self.asked)}),
+            "planted": None if self.planted is None else self.planted.to_dict(),
+            "bench": {
+                "layout": list(self.layout),
+                "places_m": [list(place) for place in self.places_m],
+                "psf_px": self.psf_px,
+            },
+        }
+
+    def footer_fields(self, wall_seconds: float) -> dict[str, Any]:
+        """What the run's document ends with."""
+        return {"finished_utc": format_utc(), "wall_seconds": wall_seconds}
+
+
+def config_provenance(config: SystemConfig) -> Provenance:
+    """Provenance of a product computed from a configuration alone, with nothing opened."""
+    return Provenance(config.to_toml(), config.basis.kind, config.system.seed, {}, {}, datetime.now(UTC))
+
+
+def actuator_layout(bench: Bench) -> tuple[str, ...]:
+    """Map of the actuators as rows of 0 and 1; empty when they do not stand on a grid."""
+    layout = bench.dm.info.layout
+    return () if layout is None else tuple("".join("1" if spot else "0" for spot in row) for row in layout)
+
+
+def actuator_positions(bench: Bench) -> tuple[tuple[float, float], ...]:
+    """Where actuators without a grid stand, (x, y) in metres; empty when they have one."""
+    info = bench.dm.info
+    return () if info.layout is not None else tuple((float(x), float(y)) for x, y in info.positions_m)
+
+
+@contextmanager
+def without_turbulence(bench: Bench) -> Iterator[None]:
+    """Take the phase screen out of the beam for a while, when the bench has one."""
+    if bench.screen is None or not bench.screen.state.inserted:
+        yield
+        return
+    bench.screen.set(inserted=False)
+    try:
+        yield
+    finally:
+        bench.screen.set(inserted=True)

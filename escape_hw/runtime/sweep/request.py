@@ -1,0 +1,182 @@
+"""How a sweep is asked for: what may be varied where, and the sweep as one call. Loads without Optuna."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from escape_hw.errors import ConfigError
+from escape_hw.runtime.sweep.search_space import (
+    DELAY_KEY,
+    LOOP_KEYS,
+    Parameter,
+    default_space,
+    parse_parameter,
+)
+
+if TYPE_CHECKING:
+    from escape_hw.config.system import SystemConfig
+    from escape_hw.runtime.session.system import CalibrationLike, System
+    from escape_hw.runtime.sweep.description import SweepDescription
+    from escape_hw.runtime.sweep.result import SweepResult
+
+#: Parts of the configuration that the matrices were measured with.
+_FIXED_SECTIONS = ("system", "sensor", "basis", "devices", "schema")
+
+
+def require_optuna() -> None:
+    """Say what is missing.
+
+    Raises
+    ------
+    ConfigError
+        Optuna or scikit-learn is not installed.
+    """
+    missing = [name for name in ("optuna", "sklearn") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            "a sweep needs Optuna and scikit-learn, which are not installed: "
+            "pip install 'escape-hw[sweep]' (in a clone: .venv/bin/pip install --editable '.[sweep]')"
+        )
+
+
+def parse_search_space(config: SystemConfig, texts: Sequence[str]) -> tuple[Parameter, ...]:
+    """What is varied; on hardware everything within limits that a person has set.
+
+    Parameters
+    ----------
+    config
+        Of the system.
+    texts
+        See :func:`~escape_hw.runtime.sweep.search_space.parse_parameter`.
+
+    Raises
+    ------
+    ConfigError
+        A text cannot be read, a key cannot be varied, or hardware lacks limits.
+    """
+    given = [parse_parameter(text) for text in texts]
+    for one in given:
+        if "." not in one.key and one.key not in (*LOOP_KEYS, DELAY_KEY):
+            known = ", ".join((*LOOP_KEYS, DELAY_KEY))
+            raise ConfigError(
+                f"--vary {one.key}: it is one of {known}, or a key of the configuration with its section"
+            )
+        if one.key.partition(".")[0] in _FIXED_SECTIONS:
+            raise ConfigError(
+                f"--vary {one.key}: the matrices were measured with one; make them anew and compare sweeps"
+            )
+        if not config.simulated and one.key not in LOOP_KEYS:
+            raise ConfigError(f"--vary {one.key}: on hardware only {', '.join(LOOP_KEYS)} can be varied")
+    missing = [key for key in LOOP_KEYS if key not in {one.key for one in given}]
+    if not config.simulated and missing:
+        raise ConfigError(
+            f"on hardware a person sets the limits of every parameter; missing: {', '.join(missing)} "
+            "(--gain, --leak, --drop LOW:HIGH, or one value that stays)"
+        )
+    return default_space(config.basis.n_modes, given)
+
+
+def require_loop_frames(config: SystemConfig, frames: int) -> None:
+    """Refuse loops too short for the Strehl ratios that a sweep judges them by.
+
+    Raises
+    ------
+    ConfigError
+        Says how many frames are needed; or there is no science camera.
+    """
+    from escape_hw.calibration.loop.runner import SETTLING_S, minimum_strehl_frames
+
+    science = config.devices.science
+    if science is None:
+        raise ConfigError(f"'{config.system.name}' has no science camera to judge the loops of a sweep by")
+    least = minimum_strehl_frames(config.devices.wfs.frame_rate_hz, science.frame_rate_hz)
+    if frames < least:
+        raise ConfigError(
+            f"--frames {frames}: too short for Strehl ratios with errors; a loop closes in {SETTLING_S:g} s, "
+            f"and then the science camera has to take some frames at {science.frame_rate_hz:g} Hz; "
+            f"the least is --frames {least}"
+        )
+
+
+def run_matrix_sweep(
+    bench: System,
+    matrices: Mapping[str, CalibrationLike],
+    folder: Path,
+    vary: Sequence[str],
+    asked: Mapping[str, Any],
+    *,
+    workers: int,
+    scheduler: str | None,
+    progress: bool,
+) -> SweepResult:
+    """A sweep with matrices in memory; see :meth:`~escape_hw.runtime.session.system.System.sweep`."""
+    require_optuna()
+    space = parse_search_space(bench.config, vary)
+    require_loop_frames(bench.config, asked["frames"])
+    from escape_hw.runtime.sweep.description import DESCRIPTION_FILE, read_description
+    from escape_hw.runtime.sweep.result import analyse_sweep
+    from escape_hw.runtime.sweep.run import run_sweep
+    from escape_hw.runtime.sweep.workers import DaskWorkers, LocalWorkers
+
+    description = _prepare_sweep(bench, matrices, folder, space, asked, progress)
+    if (folder / DESCRIPTION_FILE).is_file() and read_description(
+        folder
+    ).settings() == description.settings():
+        description = read_description(folder)
+    description.save(folder)
+    if not description.sweep.simulated:
+        return analyse_sweep(
+            description.sweep,
+            bench.run(run_sweep(description.sweep, description.store(), bench), progress=progress),
+        )
+    pool = LocalWorkers(workers) if scheduler is None else DaskWorkers(scheduler)
+    try:
+        found = bench.run(run_sweep(description.sweep, description.store(), pool), progress=progress)
+    finally:
+        pool.close()
+    return analyse_sweep(description.sweep, found, description.margin)
+
+
+def _prepare_sweep(
+    bench: System,
+    matrices: Mapping[str, CalibrationLike],
+    folder: Path,
+    space: tuple[Parameter, ...],
+    asked: Mapping[str, Any],
+    progress: bool,
+) -> SweepDescription:
+    import numpy as np
+
+    from escape_hw.io.fits.matrix import load_matrix, save_matrix
+    from escape_hw.io.storage import make_folder
+    from escape_hw.runtime.procedures.products import product_key
+    from escape_hw.runtime.session.system import as_calibration
+    from escape_hw.runtime.sweep.description import SweepDescription
+    from escape_hw.runtime.sweep.design import Design, MatrixVariant
+    from escape_hw.runtime.sweep.run import Sweep
+
+    folder = folder.absolute()
+    make_folder(folder)
+    arms = []
+    for label, given in matrices.items():
+        calibration = as_calibration(given)
+        path = folder / f"{product_key(label)}.fits"
+        # A file that holds this very matrix stays: its checksum says whether a study goes on.
+        existing = load_matrix(path) if path.is_file() else None
+        if existing is None or not np.array_equal(existing.matrix.data, calibration.matrix.data):
+            existing = load_matrix(save_matrix(path, calibration))
+        arms.append(MatrixVariant(label, False, path, existing.sha256))
+    psf = None
+    if all("." not in one.key for one in space):
+        psf = folder / "model_psf.npy"
+        if not psf.is_file():
+            np.save(psf, bench.take_model_psf(progress=progress))
+    sweep = Sweep(
+        bench.config.to_toml(), tuple(arms), space, Design(trials=asked["trials"]), asked["frames"],
+        bench.config.system.seed, "peak", None if psf is None else str(psf), bench.simulated,
+    )  # fmt: skip
+    storage = asked["storage"] or f"sqlite:///{folder / 'study.db'}"
+    return SweepDescription(sweep, storage, "sweep", asked["sampler"], asked["margin"]).validate()

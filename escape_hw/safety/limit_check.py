@@ -1,0 +1,40 @@
+"""Whether a command obeys every limit, in one compiled pass: most do, and a loop waits for the answer."""
+
+from __future__ import annotations
+
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def obeys_limits(  # type: ignore[no-untyped-def]
+    shape,
+    last,
+    disabled,
+    mean_weights,
+    first_of_pair,
+    second_of_pair,
+    max_stroke,
+    max_slew,
+    max_mean,
+    max_neighbour,
+):  # pragma: no cover
+    """True when a shape ``(n_act,)`` obeys; what is not a number does not.
+
+    Parameters are those of :class:`~escape_hw.safety.guard.CommandGuard`, limits with head-room for rounding
+    and infinite where a rule is off; ``mean_weights (n_act,)`` is empty where there is none for the mean.
+    """
+    for i in range(shape.size):
+        if not (abs(shape[i]) <= max_stroke and abs(shape[i] - last[i]) <= max_slew):
+            return False
+    for i in disabled:
+        if shape[i] != 0.0:
+            return False
+    mean = 0.0
+    for i in range(mean_weights.size):
+        mean += shape[i] * mean_weights[i]
+    if not abs(mean) <= max_mean:
+        return False
+    for k in range(first_of_pair.size):
+        if not abs(shape[first_of_pair[k]] - shape[second_of_pair[k]]) <= max_neighbour:
+            return False
+    return True

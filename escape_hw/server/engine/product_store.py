@@ -1,0 +1,117 @@
+"""The products that the engine holds, by name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from escape_hw.errors import ConfigError, ProductError
+from escape_hw.io.fits import file as fits_file
+from escape_hw.io.fits.gains import KIND_GAINS, load_gains
+from escape_hw.io.fits.loop import KIND_PSF, load_loop
+from escape_hw.io.fits.matrix import KIND_MATRIX, load_matrix
+from escape_hw.remote.state import ProductEntry
+
+
+class ProductStore:
+    """Products by name; each lies in a file, and only that is remembered.
+
+    Parameters
+    ----------
+    folders
+        Where files may lie that a client asks to load.
+    """
+
+    def __init__(self, folders: Iterable[Path]) -> None:
+        self._folders = tuple(folder.resolve() for folder in folders)
+        self._products: dict[str, ProductEntry] = {}
+
+    @property
+    def products(self) -> tuple[ProductEntry, ...]:
+        """What lies here, the newest last."""
+        return tuple(self._products.values())
+
+    def matrix(self, name: str) -> Path:
+        """The file of a matrix.
+
+        Raises
+        ------
+        ConfigError
+            There is none of that name.
+        """
+        product = self._products.get(name)
+        if product is None or product.kind != "matrix":
+            known = ", ".join(one.name for one in self.products if one.kind == "matrix") or "none yet"
+            raise ConfigError(f"no matrix is called '{name}' (there are: {known}); load it, or calibrate")
+        return Path(product.path)
+
+    def readable_path(self, path: str) -> Path:
+        """A path that a client named, if it lies where the server may read.
+
+        Raises
+        ------
+        ProductError
+            It lies elsewhere; says where it may lie.
+        """
+        resolved = Path(path).expanduser().resolve()
+        if not any(resolved.is_relative_to(folder) for folder in self._folders):
+            where = ", ".join(map(str, self._folders))
+            raise ProductError(
+                f"{resolved}: this server reads from {where} only; copy it there, or start the server with "
+                "--read FOLDER"
+            )
+        return resolved
+
+    def load(self, path: str, name: str | None = None) -> ProductEntry:
+        """Put a file on the shelf.
+
+        Raises
+        ------
+        ProductError
+            It may not be read, is damaged, or of a kind that nobody asks for by name.
+        """
+        return self.put(self.readable_path(path), name)
+
+    def put(self, path: Path, name: str | None = None) -> ProductEntry:
+        """Put a file on the shelf that the server itself wrote.
+
+        Raises
+        ------
+        ProductError
+            As for :meth:`load`.
+        """
+        hdus, _ = fits_file.read(path)
+        kind = str(fits_file.header_dict(hdus).get("KIND", ""))
+        describe = _KINDS.get(kind)
+        if describe is None:
+            raise ProductError(f"{path}: it is of kind '{kind}'; a server takes {', '.join(_KINDS)}")
+        word, summary = describe(path)
+        valid_name = re.sub(r"[^\w .+@:-]", "-", path.stem if name is None else name)[:80]
+        product = ProductEntry(name=valid_name, kind=word, path=str(path), summary=summary)
+        self._products.pop(valid_name, None)
+        self._products[valid_name] = product
+        return product
+
+
+def _matrix(path: Path) -> tuple[str, str]:
+    result = load_matrix(path).result
+    return "matrix", f"{result.matrix.method}, {result.frames} frames, {result.matrix.n_modes} modes"
+
+
+def _gains(path: Path) -> tuple[str, str]:
+    result = load_gains(path).result
+    return "gains", f"gains beside {result.method}, {len(result.rounds)} rounds"
+
+
+def _psf(path: Path) -> tuple[str, str]:
+    result = load_loop(path).result
+    return "psf", f"loop on {result.method}, {result.frames} frames"
+
+
+_KINDS: dict[str, Callable[[Path], tuple[str, Any]]] = {
+    KIND_MATRIX: _matrix,
+    KIND_GAINS: _gains,
+    KIND_PSF: _psf,
+}

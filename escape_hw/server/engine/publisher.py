@@ -1,0 +1,165 @@
+"""What passes through a bench, into shared memory for whoever looks, and counted on the way."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.callbacks import Callbacks
+from escape_hw.api.camera import Frame
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.errors import StorageError
+from escape_hw.remote.source import STREAMS
+from escape_hw.remote.state import StreamEntry
+from escape_hw.streams.ring import SLOTS, RingWriter
+from escape_hw.streams.segments import segment_name
+
+log = logging.getLogger(__name__)
+
+#: Least room of a ring's entry, so that what grows seldom outgrows it.
+_MIN_BYTES = 16384
+#: Entries kept of streams that are recorded at full rate: as long as a recorder may be held up.
+_SLOTS = {"frames": 16, "slopes": 64, "modes": 64, "commands": 64}
+
+
+class StreamPublisher:
+    """Rings by stream, made when something is written for the first time.
+
+    Parameters
+    ----------
+    system
+        Name of the system, part of the segments' names.
+
+    Attributes
+    ----------
+    frame, command
+        The newest frame and command, for statistics.
+    frames, commands
+        How many there were.
+    grid, geometries
+        The sensor's geometry that slopes were last made on, ``None`` before it was found; how many so far.
+    residual_nm
+        Newest rms residual of a closed loop; 0 before the first.
+    """
+
+    def __init__(self, system: str) -> None:
+        self._system = system
+        self._rings: dict[str, RingWriter] = {}
+        self._failed_streams: set[str] = set()
+        self.frame: Frame | None = None
+        self.command: NDArray[np.float64] | None = None
+        self.frames = self.commands = 0
+        self.residual_nm = 0.0
+        self.grid: SensorGeometry | None = None
+        self.geometries = 0
+        self._full_scale_meta = b""
+
+    @property
+    def top(self) -> float:
+        """Value at which a pixel of the sensor's camera is saturated; 0: unknown."""
+        return float(json.loads(self._full_scale_meta or b'{"top": 0}')["top"])
+
+    @top.setter
+    def top(self, counts: float) -> None:
+        self._full_scale_meta = json.dumps({"top": counts}).encode()
+
+    @property
+    def callbacks(self) -> Callbacks:
+        """What a bench is to call."""
+        return Callbacks(
+            frame=self._frame,
+            science=self._science,
+            slopes=self._slopes,
+            command=self._command,
+            residual=self._residual,
+            geometry=self.set_geometry,
+        )
+
+    @property
+    def entries(self) -> tuple[StreamEntry, ...]:
+        """The streams there are, for clients."""
+        return tuple(
+            StreamEntry(name=name, segment=ring.name, unit=STREAMS[name])
+            for name, ring in tuple(self._rings.items())
+        )
+
+    def set_geometry(self, grid: SensorGeometry) -> None:
+        """Remember the sensor's geometry, for clients that ask."""
+        if grid is not self.grid:
+            self.grid = grid
+            self.geometries += 1
+
+    def arrays(self, arrays: Mapping[str, NDArray[Any]], **meta: float | str) -> None:
+        """Publish what a procedure tells on its way; what is no stream is left out."""
+        text = json.dumps(meta).encode()[:256] if meta else b""
+        for name in STREAMS.keys() & arrays.keys():
+            array = np.ascontiguousarray(arrays[name])
+            ring = self._ring(name, array)
+            if ring is not None:
+                ring.write(array, ring.written, meta=text)
+
+    def close(self) -> None:
+        """Remove the segments."""
+        for ring in self._rings.values():
+            ring.close()
+        self._rings.clear()
+
+    def _ring(self, name: str, data: NDArray[Any]) -> RingWriter | None:
+        """A stream's ring, large enough for this array; ``None`` where there is no memory for one."""
+        ring = self._rings.get(name)
+        if ring is not None and data.nbytes <= ring.capacity:
+            return ring
+        if name in self._failed_streams:
+            return None
+        room = max(_MIN_BYTES, data.nbytes if ring is None else 2 * data.nbytes)
+        if ring is not None:
+            # Its readers see that it is closed and look for the new one under the same name.
+            del self._rings[name]
+            ring.close()
+        try:
+            self._rings[name] = RingWriter(segment_name(self._system, name), room, _SLOTS.get(name, SLOTS))
+        except StorageError as error:
+            log.error("stream '%s' cannot be shown: %s", name, error)
+            self._failed_streams.add(name)
+            return None
+        return self._rings[name]
+
+    def _frame(self, frame: Frame) -> None:
+        self.frame = frame
+        self.frames += 1
+        self._write("frames", frame.data, frame.index, frame.exposed_ns, self._full_scale_meta)
+
+    def _science(self, frame: Frame) -> None:
+        self._write("psf", frame.data, frame.index, frame.exposed_ns)
+
+    def _slopes(self, index: int, slopes: NDArray[np.float32]) -> None:
+        self._write("slopes", slopes, index)
+
+    def _command(self, command: NDArray[np.float64]) -> None:
+        self.command = command
+        self.commands += 1
+        self._write("commands", command, self.commands)
+
+    def reset_residual(self) -> None:
+        """Another loop is about to be closed: the residual of the one before says nothing of it."""
+        self.residual_nm = 0.0
+
+    def _residual(self, index: int, modes: NDArray[np.float32], rms: float) -> None:
+        self.residual_nm = rms
+        self._write("modes", modes, index)
+
+    def _write(
+        self, name: str, data: NDArray[Any], index: int, exposed_ns: int = 0, meta: bytes = b""
+    ) -> None:
+        ring = self._rings.get(name)
+        if ring is None or data.nbytes > ring.capacity:
+            ring = self._ring(name, data)
+            if ring is None:
+                return
+        ring.write(data, index, exposed_ns, time.monotonic_ns(), meta)

@@ -1,0 +1,1 @@
+"""What makes the mirror safe when something fails: limits on the engine's state, the fail-safe process, and the journal of how the previous server ended. Limits on single commands are in escape_hw.safety."""

@@ -1,0 +1,1 @@
+"""Recording of streams to disk and reading the files back."""

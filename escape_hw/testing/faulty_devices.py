@@ -1,0 +1,190 @@
+"""Devices that fail on demand, around any mirror or camera."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
+from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout
+
+
+class FaultyMirror(DeformableMirror):
+    """A mirror around another one that records what reaches it and fails on demand.
+
+    Without faults it keeps the mirror's contract.
+
+    Parameters
+    ----------
+    inner
+        The mirror to pass commands on to; its name and limits are taken over.
+    fail_sends
+        Transfers that fail once with :class:`~escape_hw.errors.DeviceError`, counted from 0 over
+        the life of this object, the ramps of ``flatten`` included.
+    lost_from
+        The transfer from which on all fail with :class:`~escape_hw.errors.DeviceLost`. The inner
+        mirror is then disconnected by ``close`` too, but what it does is not seen.
+
+    Attributes
+    ----------
+    reached
+        Every shape that reached the inner mirror, in order.
+    """
+
+    def __init__(
+        self,
+        inner: DeformableMirror,
+        *,
+        fail_sends: Collection[int] = (),
+        lost_from: int | None = None,
+    ) -> None:
+        super().__init__(inner.name, inner.limits)
+        self.inner = inner
+        self.fail_sends = frozenset(fail_sends)
+        self.lost_from = lost_from
+        self.reached: list[NDArray[np.float64]] = []
+        self.transfers = 0
+
+    @property
+    def info(self) -> DMInfo:
+        """Identity and geometry of the inner mirror."""
+        return self.inner.info
+
+    def now_ns(self) -> int:
+        """The inner mirror's clock."""
+        return self.inner.now_ns()
+
+    def _open(self) -> None:
+        self.inner.open()
+        if self._flat is None:
+            self._flat = self.inner.flat
+
+    def _close(self) -> None:
+        self.inner.close()
+
+    def _release_after_failed_open(self) -> None:
+        self.inner.close()
+
+    def _present_shape(self) -> NDArray[np.float64]:
+        return self.inner.shape
+
+    def _send(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        number = self.transfers
+        self.transfers += 1
+        if self.lost_from is not None and number >= self.lost_from:
+            raise DeviceLost(self.name, f"lost at transfer {number}, as arranged")
+        if number in self.fail_sends:
+            raise DeviceError(self.name, f"transfer {number} failed, as arranged")
+        report = self.inner.send(command)
+        self.reached.append(report.sent.copy())
+        return report.sent if report.skipped else None
+
+
+class FaultyCamera(Camera):
+    """A camera around another one that loses, repeats and withholds frames on demand.
+
+    Without faults it keeps the camera's contract. Faults go by the inner camera's frame index.
+
+    Parameters
+    ----------
+    inner
+        The camera to take frames from; its name is taken over.
+    drop
+        Indices of frames that get lost.
+    drop_every
+        Lose every frame whose index divides by this.
+    repeat
+        Indices of frames that are delivered a second time, as some drivers do after an overrun;
+        ``next_frame`` then refuses the copy.
+    stall_from
+        Index from which on no frame comes any more: every call times out.
+    lost_from
+        Index from which on every call raises :class:`~escape_hw.errors.DeviceLost`.
+    """
+
+    def __init__(
+        self,
+        inner: Camera,
+        *,
+        drop: Collection[int] = (),
+        drop_every: int | None = None,
+        repeat: Collection[int] = (),
+        stall_from: int | None = None,
+        lost_from: int | None = None,
+    ) -> None:
+        super().__init__(inner.name)
+        if drop_every is not None and drop_every < 2:
+            raise ValueError(f"drop_every is {drop_every}; from 2 on some frames are left")
+        self.inner = inner
+        self.drop = frozenset(drop)
+        self.drop_every = drop_every
+        self.repeat = frozenset(repeat)
+        self.stall_from = stall_from
+        self.lost_from = lost_from
+        self._repeated: Frame | None = None
+
+    @property
+    def info(self) -> CameraInfo:
+        """Identity of the inner camera."""
+        return self.inner.info
+
+    @property
+    def settings(self) -> CameraSettings:
+        """Settings of the inner camera."""
+        return self.inner.settings
+
+    def now_ns(self) -> int:
+        """The inner camera's clock."""
+        return self.inner.now_ns()
+
+    def _open(self) -> None:
+        self.inner.open()
+
+    def _close(self) -> None:
+        self.inner.close()
+
+    def _release_after_failed_open(self) -> None:
+        self.inner.close()
+
+    def _check(self, want: CameraSettings) -> CameraSettings:
+        return self.inner.check(want)
+
+    def _configure(self, settings: CameraSettings) -> None:
+        self.inner.configure(settings)
+
+    def _start(self) -> None:
+        self._repeated = None
+        self.inner.start()
+
+    def _stop(self) -> None:
+        self.inner.stop()
+
+    def _next_frame(self, timeout_s: float) -> Frame:
+        if self._repeated is not None:
+            frame, self._repeated = self._repeated, None
+            return frame
+        deadline = self.now_ns() + int(timeout_s * 1e9)
+        while True:
+            left = (deadline - self.now_ns()) * 1e-9
+            if left <= 0:
+                raise FrameTimeout(self.name, f"no frame within {timeout_s:g} s")
+            try:
+                frame = self.inner.next_frame(left)
+            except FrameTimeout:
+                raise FrameTimeout(self.name, f"no frame within {timeout_s:g} s") from None
+            if self.lost_from is not None and frame.index >= self.lost_from:
+                raise DeviceLost(self.name, f"lost at frame {frame.index}, as arranged")
+            if not self._is_withheld(frame.index):
+                break
+        if frame.index in self.repeat:
+            self._repeated = replace(frame)
+        return frame
+
+    def _is_withheld(self, index: int) -> bool:
+        if self.stall_from is not None and index >= self.stall_from:
+            return True
+        return index in self.drop or (self.drop_every is not None and index % self.drop_every == 0)

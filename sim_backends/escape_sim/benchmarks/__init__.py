@@ -1,1 +1,0 @@
-"""Benchmark stages of the twin, found through the entry-point group ``escape.benchmarks``."""

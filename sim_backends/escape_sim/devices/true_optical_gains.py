@@ -1,0 +1,105 @@
+"""The twin's own response around frozen wavefronts: the truth that optical gains are judged by.
+
+For tests and benchmarks alone; nothing that calibrates may read it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.bench import Bench
+from escape_hw.pipeline.slopes.pyramid import slopes_of_image
+from escape_sim.devices.bench import SimBench
+
+#: Poke of the push-pull in metres of optical path, rms: far below what bends the response.
+_POKE_M = 2e-9
+
+
+def get_simulated_bench(bench: Bench) -> SimBench:
+    """The simulated bench behind a system's twins.
+
+    Raises
+    ------
+    TypeError
+        Its mirror is no twin.
+    """
+    twin = getattr(bench.dm, "twin", None)
+    if not isinstance(twin, SimBench):
+        raise TypeError(f"{bench.dm.name} is no twin; only a twin's truth can be looked at")
+    return twin
+
+
+class WavefrontRecorder:
+    """Keeps the wavefront in front of the sensor now and then while something runs.
+
+    Parameters
+    ----------
+    twin
+        The simulated bench; this object adds itself to its onlookers.
+    every
+        Frames from one wavefront kept to the next.
+    """
+
+    def __init__(self, twin: SimBench, every: int) -> None:
+        self.wavefronts: list[NDArray[np.float32]] = []
+        self._twin, self._every, self._n_frames, self.recording = twin, every, 0, True
+        twin.path_callbacks.append(self)
+
+    def __call__(self, opd: NDArray[np.float32], time_s: float) -> None:
+        """Take the optical path ``(n, n)`` in metres of a frame."""
+        self._n_frames += 1
+        if self.recording and self._n_frames % self._every == 0:
+            self.wavefronts.append(self._twin.sensor_opd(opd, time_s))
+
+    def close(self) -> None:
+        """Look no longer."""
+        self._twin.path_callbacks.remove(self)
+
+
+def true_optical_gains(
+    twin: SimBench,
+    pupils: PyramidPupils,
+    m2c: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    wavefronts: Sequence[NDArray[np.float32]],
+    modes: Sequence[int] | None = None,
+) -> NDArray[np.float64]:
+    """Optical gains by push-pull around frozen wavefronts, without noise.
+
+    Parameters
+    ----------
+    twin
+        Its optics and its true mirror answer.
+    pupils
+        Where the pipeline takes the slopes.
+    m2c
+        Modes ``(n_act, n_modes)``.
+    rows
+        Take slopes to gains ``(n_modes, n_slopes)``
+        (:func:`~escape_hw.calibration.optical_gain.matrix_comparison.projector`).
+    wavefronts
+        Optical paths ``(n, n)`` in metres in front of the sensor.
+    modes
+        Which modes; all by default.
+
+    Returns
+    -------
+    ndarray, ``(n_wavefronts, n_modes)``
+        NaN for modes not asked for.
+    """
+    selected = range(m2c.shape[1]) if modes is None else modes
+    stroke = twin.config.devices.dm.stroke_m
+    amplitude = _POKE_M / (2 * stroke)
+    gains = np.full((len(wavefronts), m2c.shape[1]), np.nan)
+    sensor = twin.sensor()
+    for mode in selected:
+        shape = twin.mirror_opd(m2c[:, mode] * amplitude)
+        for k, wavefront in enumerate(wavefronts):
+            slopes_up = slopes_of_image(sensor.frame(wavefront + shape), pupils)
+            slopes_down = slopes_of_image(sensor.frame(wavefront - shape), pupils)
+            gains[k, mode] = rows[mode] @ (slopes_up - slopes_down) / (2 * amplitude)
+    return gains

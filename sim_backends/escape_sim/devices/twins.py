@@ -1,0 +1,468 @@
+"""Simulated devices of a bench: mirror, wavefront-sensor camera, science camera, phase screens, modulator, adaptive secondary; their entry points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
+from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
+from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
+from escape_hw.api.phase_screen import PhaseScreen, ScreenInfo, ScreenState
+from escape_hw.config.sensor import PyramidSection
+from escape_hw.errors import ConfigError, FrameTimeout, SettingRejected
+from escape_sim.devices.bench import SimBench
+from escape_sim.mirror.shell import AMBIENT_C, RISE_C_PER_A, TRANSITION_S, Shell
+from escape_sim.optics.detector import Detector
+from escape_sim.optics.focal_plane import FocalPlane
+
+if TYPE_CHECKING:
+    from escape_hw.config.system import SystemConfig
+
+
+_BENCH_KEY = "simulated bench"
+
+
+def shared_bench(config: SystemConfig, shared: dict[str, object]) -> SimBench:
+    """The one simulated bench behind all twins of an opened system."""
+    bench = shared.setdefault(_BENCH_KEY, None) or SimBench(config)
+    if not isinstance(bench, SimBench):
+        raise TypeError(f"shared[{_BENCH_KEY!r}] holds a {type(bench).__name__}, not a SimBench")
+    shared[_BENCH_KEY] = bench
+    return bench
+
+
+def existing_bench(shared: dict[str, object]) -> SimBench | None:
+    """The simulated bench of an opened system, if any of its devices is a twin that has been made."""
+    bench = shared.get(_BENCH_KEY)
+    return bench if isinstance(bench, SimBench) else None
+
+
+def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> SimMirror:
+    """Entry point ``sim-alpao``."""
+    return SimMirror(name, shared_bench(config, shared))
+
+
+def make_wfs_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> SimWavefrontSensorCamera:
+    """Entry point ``sim-ximea``."""
+    return SimWavefrontSensorCamera(name, shared_bench(config, shared))
+
+
+def make_science_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> SimScienceCamera:
+    """Entry point ``sim-science``."""
+    return SimScienceCamera(name, shared_bench(config, shared))
+
+
+def make_screen(name: str, config: SystemConfig, shared: dict[str, object]) -> SimPhaseScreen:
+    """Entry point ``sim-screen``."""
+    return SimPhaseScreen(name, shared_bench(config, shared))
+
+
+class SimMirror(DeformableMirror):
+    """Twin of the ALPAO DM97: latency, settling, creep, gain scatter, saturation."""
+
+    def __init__(self, name: str, bench: SimBench) -> None:
+        super().__init__(name, bench.config.devices.dm.limits.to_limits())
+        self._bench = bench
+        self._info = bench.config.devices.dm.info("simulated ALPAO DM97-15", simulated=True)
+
+    @property
+    def info(self) -> DMInfo:
+        """Identity and geometry."""
+        return self._info
+
+    @property
+    def twin(self) -> SimBench:
+        """The simulated bench, hidden truth and all; for tests and benchmarks alone."""
+        return self._bench
+
+    def now_ns(self) -> int:
+        """Simulated time in nanoseconds."""
+        return self._bench.now_ns
+
+    def _open(self) -> None:
+        self._bench.set_positions(np.zeros(self._info.n_act))
+
+    def _close(self) -> None:
+        """Nothing to release."""
+
+    def _send(self, command: NDArray[np.float64]) -> None:
+        self._bench.drive(command)
+
+
+class _SimCamera(Camera):
+    """What both simulated cameras share: settings and limits of the sensor."""
+
+    def __init__(
+        self, name: str, bench: SimBench, info: CameraInfo, settings: CameraSettings, step_s: float
+    ) -> None:
+        super().__init__(name)
+        self._bench, self._info, self._settings, self._step_s = bench, info, settings, step_s
+        self._start_s, self._next_index = 0.0, 0
+
+    @property
+    def info(self) -> CameraInfo:
+        """Identity and fixed properties."""
+        return self._info
+
+    @property
+    def settings(self) -> CameraSettings:
+        """The settings in force."""
+        return self._settings
+
+    def now_ns(self) -> int:
+        """Simulated time in nanoseconds."""
+        return self._bench.now_ns
+
+    def _open(self) -> None:
+        """Nothing to connect."""
+
+    def _close(self) -> None:
+        """Nothing to release."""
+
+    def _start(self) -> None:
+        self._start_s, self._next_index = self._bench.now_s, 0
+
+    def _stop(self) -> None:
+        """The clock simply runs on."""
+
+    def _fastest_hz(self, region: Region) -> float:
+        """Highest frame rate for a region; rows cost time, columns do not."""
+        return 1.0 / (20e-6 + 4.65e-6 * region.height)
+
+    def _check(self, want: CameraSettings) -> CameraSettings:
+        fastest = self._fastest_hz(want.region)
+        if want.frame_rate_hz > fastest * 1.0001:
+            raise SettingRejected(
+                self.name,
+                f"frame_rate_hz is {want.frame_rate_hz:g}; "
+                f"{want.region.height} rows allow at most {fastest:.1f}",
+            )
+        if not 0 <= want.gain_db <= 12:
+            raise SettingRejected(self.name, f"gain_db is {want.gain_db:g}; it must lie in 0..12")
+        longest = 1 / want.frame_rate_hz
+        exposure = min(max(round(want.exposure_s / self._step_s) * self._step_s, self._step_s), longest)
+        return CameraSettings(want.region, exposure, want.frame_rate_hz, want.gain_db)
+
+    def _configure(self, settings: CameraSettings) -> None:
+        self._settings = settings
+
+    def _next_frame_index(self, arrival_delay_s: float) -> int:
+        """Number of the frame to deliver next: a late reader gets the newest complete one."""
+        period = 1 / self.settings.frame_rate_hz
+        n_complete = int((self._bench.now_s - self._start_s - arrival_delay_s) / period + 1e-9)
+        return max(self._next_index, n_complete)
+
+    def _advance_to_arrival(self, arrival_s: float, timeout_s: float) -> None:
+        bench = self._bench
+        if arrival_s > bench.now_s + timeout_s:
+            bench.advance_to(bench.now_s + timeout_s)
+            raise FrameTimeout(
+                self.name,
+                f"no frame within {timeout_s:g} s; check trigger, exposure ({self.settings.exposure_s:g} s) "
+                "and cable, or allow a longer timeout",
+            )
+        bench.advance_to(arrival_s)
+
+
+class SimWavefrontSensorCamera(_SimCamera):
+    """Twin of the XIMEA camera behind lenslets or pyramid: rate limits, noise, lost frames.
+
+    A modulator triggers it once per turn, or once in so many turns as its own rate comes nearest to;
+    then it exposes whole turns.
+    """
+
+    def __init__(self, name: str, bench: SimBench) -> None:
+        c = bench.config.devices.wfs
+        super().__init__(
+            name,
+            bench,
+            CameraInfo("simulated XIMEA MQ013MG-ON", c.serial, c.sensor_px[::-1], c.bit_depth, True),
+            c.settings(),
+            1e-6,
+        )
+        self._nominal = Region(*c.region)
+        self._period, self._first = 0.0, 0
+
+    @property
+    def settings(self) -> CameraSettings:
+        """The settings in force."""
+        return self._with_trigger_period(self._settings)
+
+    def _with_trigger_period(self, settings: CameraSettings) -> CameraSettings:
+        """The settings as the modulator's trigger changes them."""
+        cycle_s = self._bench.beam_path.cycle_period_s
+        if cycle_s is None:
+            return settings
+        frame = max(1, round(1 / (settings.frame_rate_hz * cycle_s))) * cycle_s
+        return replace(settings, exposure_s=frame, frame_rate_hz=1 / frame)
+
+    def _check(self, want: CameraSettings) -> CameraSettings:
+        if want.region != self._nominal and (
+            want.region.x < self._nominal.x
+            or want.region.y < self._nominal.y
+            or want.region.x + want.region.width > self._nominal.x + self._nominal.width
+            or want.region.y + want.region.height > self._nominal.y + self._nominal.height
+        ):
+            raise SettingRejected(
+                self.name, f"region {want.region} leaves the lit part of the sensor, {self._nominal}"
+            )
+        return self._with_trigger_period(super()._check(want))
+
+    def _start(self) -> None:
+        super()._start()
+        self._period, self._first = 1 / self.settings.frame_rate_hz, 0
+
+    def _update_trigger_period(self) -> None:
+        """Count on from here when the modulator has started, stopped or changed its pace."""
+        period = 1 / self.settings.frame_rate_hz
+        if period != self._period:
+            self._first, self._period = self._first + self._next_index, period
+            self._start_s, self._next_index = self._bench.now_s, 0
+
+    def _next_frame(self, timeout_s: float) -> Frame:
+        self._update_trigger_period()
+        bench, s, twin = self._bench, self.settings, self._bench.config.twin
+        period = self._period
+        deadline = bench.now_s + timeout_s
+        while True:
+            k = self._next_frame_index(s.exposure_s + twin.readout_s)
+            start = self._start_s + k * period
+            end = start + s.exposure_s
+            self._advance_to_arrival(end + twin.readout_s, max(deadline - bench.now_s, 0.0))
+            self._next_index = k + 1
+            if not twin.loss_probability or bench.frame_rng.random() >= twin.loss_probability:
+                break
+        image, opd = bench.wfs_image(start, end)
+        bench.record_optical_path(opd, end)
+        gain = 10 ** (s.gain_db / 20)
+        source, sky = bench.wfs_light(s.exposure_s)
+        data, saturated = bench.wfs_detector.expose(image, source * gain, sky * gain)
+        r, n = s.region, self._nominal
+        data = data[r.y - n.y : r.y - n.y + r.height, r.x - n.x : r.x - n.x + r.width]
+        data.flags.writeable = False
+        return Frame(data, self._first + k, round(end * 1e9), bench.now_ns, saturated)
+
+
+class SimScienceCamera(_SimCamera):
+    """Twin of the science camera: integrates the focal plane beside the running loop."""
+
+    def __init__(self, name: str, bench: SimBench) -> None:
+        c = bench.config.devices.science
+        if c is None:
+            raise ConfigError(f"system {bench.config.system.name!r} has no [devices.science] section")
+        super().__init__(
+            name,
+            bench,
+            CameraInfo("simulated FLIR Grasshopper3", c.serial, c.sensor_px[::-1], c.bit_depth, True),
+            c.settings(),
+            1e-6,
+        )
+        self._plane: FocalPlane | None = None
+        self._detector: Detector | None = None
+
+    def _start(self) -> None:
+        super()._start()
+        shape = (self._settings.region.height, self._settings.region.width)
+        if self._plane is None or self._detector is None or self._detector.shape != shape:
+            self._plane, self._detector = self._bench.focal_plane(shape), self._bench.science_detector(shape)
+        self._bench.start_integration(
+            self._plane, self._settings.exposure_s, 1 / self._settings.frame_rate_hz
+        )
+
+    def _stop(self) -> None:
+        self._bench.stop_integration()
+
+    def _next_frame(self, timeout_s: float) -> Frame:
+        bench, s = self._bench, self._settings
+        k = self._next_frame_index(s.exposure_s)
+        end = self._start_s + k / s.frame_rate_hz + s.exposure_s
+        self._advance_to_arrival(end, timeout_s)
+        self._next_index = k + 1
+        image = bench.mean_image(k, end)
+        if self._detector is None:
+            raise RuntimeError("the science camera is not running")
+        scale = s.exposure_s / (
+            bench.config.devices.science.exposure_s if bench.config.devices.science else 1
+        )
+        electrons = 0.0 if bench.beam_blocked else bench.config.twin.science.photons_per_frame * scale
+        data, saturated = self._detector.expose(image, electrons)
+        data.flags.writeable = False
+        return Frame(data, k, round(end * 1e9), bench.now_ns, saturated)
+
+
+class SimPhaseScreen(PhaseScreen):
+    """Twin of the changer with rotating phase screens."""
+
+    def __init__(self, name: str, bench: SimBench) -> None:
+        super().__init__(name)
+        self._bench = bench
+
+    @property
+    def info(self) -> ScreenInfo:
+        """Identity."""
+        screen = self._bench.config.devices.screen
+        return ScreenInfo("simulated phase screens", screen.serial if screen else "", simulated=True)
+
+    @property
+    def state(self) -> ScreenState:
+        """The present state."""
+        b = self._bench
+        return ScreenState(b.plates.number, b.plates.inserted, b.plates.speed_m_s, b.beam_blocked)
+
+    @property
+    def n_screens(self) -> int:
+        """How many screens the changer holds."""
+        screen = self._bench.config.devices.screen
+        return len(screen.screens_r0_m) if screen else 0
+
+    def _open(self) -> None:
+        """Nothing to connect."""
+
+    def _close(self) -> None:
+        """The plate keeps turning."""
+
+    def _set(self, want: ScreenState) -> None:
+        b = self._bench
+        b.plates.number, b.plates.inserted, b.beam_blocked = want.screen, want.inserted, want.blocked
+        b.plates.set_speed(want.speed_m_s, b.now_s)
+
+
+#: Servo clock of the controller; a turn is a whole number of its steps.
+SERVO_S = 50e-6
+#: Fewest and most steps of a turn: a kilohertz is all that a loaded stage does, and its memory ends.
+_CYCLE_STEPS = (20, 262_144)
+
+
+def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> SimModulator:
+    """Entry point ``sim-e727``."""
+    return SimModulator(name, shared_bench(config, shared))
+
+
+class SimModulator(TipTiltModulator):
+    """Twin of the PI S-330 with its E-727: a frequency that the servo clock rounds, a slow start.
+
+    It says what it was told to do, as the real one does: the ellipse, the lag between its axes and
+    the drift of its centre are seen by the beam only (``twin.pyramid``).
+    """
+
+    def __init__(self, name: str, bench: SimBench) -> None:
+        super().__init__(name)
+        section = bench.config.devices.modulator
+        if section is None:
+            raise ConfigError(f"system {bench.config.system.name!r} has no [devices.modulator] section")
+        bench.config.sensor_as(PyramidSection)
+        self._bench = bench
+        self._info = ModulatorInfo(
+            "simulated PI S-330 with E-727", section.serial, section.max_tilt_rad, True
+        )
+
+    @property
+    def info(self) -> ModulatorInfo:
+        """Identity and reach."""
+        return self._info
+
+    @property
+    def modulation(self) -> Modulation | None:
+        """The modulation in force."""
+        return self._bench.beam_path.modulation
+
+    def now_ns(self) -> int:
+        """Simulated time in nanoseconds."""
+        return self._bench.now_ns
+
+    def _open(self) -> None:
+        """Nothing to connect; the stage is parked."""
+
+    def _close(self) -> None:
+        """Nothing to release."""
+
+    def _check(self, want: Modulation) -> Modulation:
+        steps = round(1 / (want.frequency_hz * SERVO_S))
+        least, most = _CYCLE_STEPS
+        if not least <= steps <= most:
+            raise SettingRejected(
+                self.name,
+                f"frequency_hz is {want.frequency_hz:g}; it does {1 / (most * SERVO_S):.2g} to "
+                f"{1 / (least * SERVO_S):g} Hz",
+            )
+        return replace(want, frequency_hz=1 / (steps * SERVO_S))
+
+    def _modulate(self, modulation: Modulation) -> None:
+        bench = self._bench
+        bench.advance_to(bench.now_s + bench.config.twin.pyramid.start_s)
+        bench.beam_path.modulation = modulation
+
+    def _park(self) -> None:
+        self._bench.beam_path.modulation = None
+
+
+def make_secondary(name: str, config: SystemConfig, shared: dict[str, object]) -> SimAdaptiveSecondary:
+    """Entry point ``sim-asm``."""
+    return SimAdaptiveSecondary(name, shared_bench(config, shared))
+
+
+class SimAdaptiveSecondary(AdaptiveSecondary):
+    """Twin of the MMT's 336-actuator mirror: dynamics and latency as any twin, and a shell that floats.
+
+    The option ``lift`` of its device section, true by default, says whether opening it leads to
+    ``RUNNING``. :meth:`trip` plays a fault.
+    """
+
+    def __init__(self, name: str, bench: SimBench) -> None:
+        dm = bench.config.devices.dm
+        super().__init__(name, dm.limits.to_limits(), lift=bool(dm.options.get("lift", True)))
+        self._bench = bench
+        self._info = dm.info("simulated MMT adaptive secondary", simulated=True)
+        noise = np.random.SeedSequence(bench.config.system.seed, spawn_key=(0xA5,))
+        self._shell = Shell(bench, dm.n_act, dm.stroke_m, np.random.default_rng(noise))
+
+    @property
+    def info(self) -> DMInfo:
+        """Identity and geometry."""
+        return self._info
+
+    def now_ns(self) -> int:
+        """Simulated time in nanoseconds."""
+        return self._bench.now_ns
+
+    def trip(self, reason: str) -> None:
+        """Play a fault: coils off, the shell falls back on its reference body, latched."""
+        self._shell.trip(reason)
+
+    def _open(self) -> None:
+        """Nothing to connect."""
+
+    def _close(self) -> None:
+        """The mirror stays as it is."""
+
+    def _send_to_shell(self, command: NDArray[np.float64]) -> None:
+        self._bench.drive(command)
+
+    def _state(self) -> ShellState:
+        return self._shell.state
+
+    def _step(self, state: ShellState) -> None:
+        self._bench.advance_to(self._bench.now_s + TRANSITION_S[state])
+        self._shell.finish_transition(state, self.flat)
+
+    def _recover(self) -> None:
+        self._shell.recover()
+
+    def _measure_positions(self) -> NDArray[np.float64]:
+        return self._shell.measure_positions()
+
+    def _observe_health(self) -> ShellHealth:
+        return self._health()
+
+    def _health(self) -> ShellHealth:
+        shell = self._shell
+        current = float(shell.currents_a().max())
+        return ShellHealth(
+            self._bench.now_ns, shell.state, shell.gap_m(), current, AMBIENT_C + RISE_C_PER_A * current, 0,
+            shell.fault,
+        )  # fmt: skip

@@ -1,0 +1,281 @@
+"""The emulated PI E-727: bytes in, a reply for each command out. Knows nothing of sockets."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_sim.emulators.e727.gcs import (
+    MAX_ARGUMENTS,
+    ONE_BYTE,
+    CommandFramer,
+    GcsError,
+    format_lines,
+    items,
+    number,
+    parse_integer,
+    value_text,
+)
+from escape_sim.emulators.e727.motion import MotionCommands
+from escape_sim.emulators.e727.stage import SERVO_S, TRANSIENT_STEPS, Trajectory, Wave
+from escape_sim.emulators.e727.state import ControllerSettings, ControllerState
+from escape_sim.emulators.e727.wave_generator import WaveGenerators
+
+IDENTITY = "(c)2015-2018 Physik Instrumente (PI) GmbH & Co. KG, E-727.3SDA, {serial}, 14.11.01.05 emulated"
+Handler = Callable[[Sequence[str]], str | None]
+#: Points of a turn that optics are told.
+_SAMPLES = 256
+
+
+class E727Controller:
+    """A controller with a tip-tilt stage on its first two channels and nothing on the third.
+
+    Parameters
+    ----------
+    make
+        Which controller and stage to be.
+    clock
+        Seconds, monotonic.
+    """
+
+    def __init__(
+        self, settings: ControllerSettings | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.settings = settings or ControllerSettings()
+        self.state = ControllerState(self.settings, clock)
+        self.lock = threading.RLock()
+        #: Every command as it was understood, in order.
+        self.received_commands: list[str] = []
+        self._framer = CommandFramer()
+        self._unread_command = ""
+        self._cycle_cache: tuple[int, list[Trajectory], tuple[float, NDArray[np.float64]] | None] | None = (
+            None
+        )
+        self._build_handlers()
+
+    def _build_handlers(self) -> None:
+        """Handlers for the present state."""
+        self.waves = WaveGenerators(self.state)
+        motion, waves, recorder = MotionCommands(self.state), self.waves, self.state.recorder
+        self._motion = motion
+        self._handlers: dict[str, Handler] = {
+            "*IDN?": self._identity, "CSV?": lambda _: "2.0\n", "SAI?": self._axes, "HLP?": self._help,
+            "HPA?": self._parameter_list, "VER?": lambda _: "FW_DSP: 14.11.01.05\n", "CST?": self._stages,
+            "IFC?": lambda _: "RSBAUD=115200\n",
+            "CCL": self._set_level, "CCL?": lambda _: f"{self.state.level}\n",
+            "SPA": self._set_parameter, "SPA?": self._parameters, "WPA": self._save, "RBT": self._reboot,
+            "SVO": motion.servo, "SVO?": motion.servos, "SVA": motion.volts, "SVA?": motion.commanded_volts,
+            "VOL?": motion.voltages, "ATZ": motion.auto_zero, "ATZ?": motion.is_zeroed, "MOV": motion.move,
+            "MVR": motion.move_by, "MOV?": motion.targets, "POS?": motion.positions, "ONT?": motion.on_target,
+            "VEL": motion.velocity, "VEL?": motion.velocities, "TMN?": motion.lower, "TMX?": motion.upper,
+            "PUN?": motion.units, "HLT": motion.halt, "STP": motion.halt,
+            "WAV": waves.define, "WAV?": waves.lengths, "GWD?": waves.read, "WCL": waves.clear,
+            "WSL": waves.select, "WSL?": waves.selections, "WGC": waves.set_cycles, "WGC?": waves.cycles,
+            "WOS": waves.set_offset, "WOS?": waves.offsets, "WTR": waves.set_rate, "WTR?": waves.rates,
+            "WGO": waves.set_modes, "WGO?": waves.modes, "WGR": self._start_recording, "STE": self._step_response,
+            "IMP": self._step_response, "TWC": waves.clear_trigger, "TWS": waves.set_trigger,
+            "CTO": waves.set_output, "CTO?": waves.output, "DRC": recorder.configure,
+            "DRC?": recorder.configuration, "DRT": recorder.set_trigger,
+            "DRT?": lambda _: "0=0 0\n",
+            "RTR": recorder.set_rate, "RTR?": lambda _: f"{recorder.rate}\n",
+            "TNR?": lambda _: f"{len(recorder.sources)}\n", "DRL?": recorder.lengths, "DRR?": recorder.read,
+        }  # fmt: skip
+
+    # ------------------------------------------------------------------ wire
+    def receive(self, data: bytes) -> list[str | None]:
+        """Take what arrived; returns the commands that it completes, for :meth:`execute`."""
+        with self.lock:
+            return list(self._framer.feed(data))
+
+    def execute(self, line: str | None) -> bytes:
+        """Carry out a command (``None``: a line that was too long); returns its reply, empty if none."""
+        with self.lock:
+            return self._execute(line)
+
+    def end_session(self) -> str:
+        """The client has gone: an unfinished line is forgotten. Returns how it left the stage."""
+        with self.lock:
+            self._framer.clear()
+            self._check_error_was_read("hung up")
+            return self.state.describe()
+
+    def _execute(self, line: str | None) -> bytes:
+        if line is None:
+            return self._refuse("a line without end", GcsError(3))
+        readable = ONE_BYTE.get(line, line)
+        self.received_commands.append(readable)
+        try:
+            return self._dispatch(line)
+        except GcsError as refusal:
+            return self._refuse(readable, refusal)
+
+    def _refuse(self, line: str, refusal: GcsError) -> bytes:
+        """Remember the error. A careful driver foresees every refusal; a stop is none."""
+        self.state.error = refusal.number
+        if refusal.number != 10:
+            self.state.report_violation(f"{line}: {refusal}")
+        self._unread_command = "" if line.partition(" ")[0].endswith("?") else line
+        return b""
+
+    def _dispatch(self, line: str) -> bytes:
+        if line in ONE_BYTE:
+            return self._handle_single_byte(ONE_BYTE[line])
+        words = line.split()
+        name, args = words[0].upper(), words[1:]
+        if name == "ERR?":
+            self._unread_command = ""
+            error, self.state.error = self.state.error, 0
+            return f"{error}\n".encode()
+        if not name.endswith("?"):
+            self._check_error_was_read(line)
+            self._unread_command = line
+        if len(args) > MAX_ARGUMENTS:
+            raise GcsError(24)
+        if name not in self._handlers:
+            raise GcsError(2)
+        reply = self._handlers[name](args)
+        return b"" if reply is None else reply.encode("cp1252")
+
+    def _check_error_was_read(self, now: str) -> None:
+        """Complain when the last set command's error was never asked for."""
+        if self._unread_command:
+            self.state.report_violation(f"no ERR? after '{self._unread_command}' (then: '{now}')")
+            self._unread_command = ""
+
+    def _handle_single_byte(self, line: str) -> bytes:
+        """Commands of a single byte, as people write them."""
+        if line == "#24":
+            self._motion.halt([])
+        busy = any(self.state.is_zeroing(name) for name in self.state.axes)
+        reply = {"#5": f"{self._motion.moving_mask():x}", "#8": "0", "#9": f"{self.waves.running():x}"}
+        if line == "#7":
+            return bytes([0xB0 if busy else 0xB1, 0x0A])
+        return f"{reply[line]}\n".encode()
+
+    # ------------------------------------------------------------------ housekeeping
+    def _identity(self, args: Sequence[str]) -> str:
+        return IDENTITY.format(serial=self.settings.serial) + "\n"
+
+    def _axes(self, args: Sequence[str]) -> str:
+        return format_lines(["1", "2", "3"])
+
+    def _help(self, args: Sequence[str]) -> str:
+        return format_lines(
+            ["The following commands are valid:", *sorted([*self._handlers, "ERR?", "#5", "#7", "#9", "#24"])]
+        )
+
+    def _parameter_list(self, args: Sequence[str]) -> str:
+        return format_lines(
+            [f"0x{key:X}= 0 1 FLOAT parameter" for key in sorted({key for _, key in self.state.parameters})]
+        )
+
+    def _stages(self, args: Sequence[str]) -> str:
+        names = {"1": "S-330.2SL", "2": "S-330.2SL", "3": "NOSTAGE"}
+        if any(name not in names for name in args):
+            raise GcsError(15)
+        return items({name: names[name] for name in args or names})
+
+    def _set_level(self, args: Sequence[str]) -> None:
+        if not args:
+            raise GcsError(26)
+        level = parse_integer(args[0])
+        if level not in (0, 1):
+            raise GcsError(17)
+        if level == 1 and args[1:] != ["advanced"]:
+            raise GcsError(56)
+        self.state.level = level
+
+    def _set_parameter(self, args: Sequence[str]) -> None:
+        if len(args) < 3:
+            raise GcsError(26)
+        if self.state.level < 1:
+            raise GcsError(60)
+        item, parameter, value = args[0], parse_integer(args[1]), number(args[2])
+        if (item, parameter) not in self.state.parameters:
+            raise GcsError(54)
+        if parameter >= 0x0E000000:
+            raise GcsError(64)
+        self.state.parameters[item, parameter] = value
+
+    def _parameters(self, args: Sequence[str]) -> str:
+        keys = [(args[k], parse_integer(args[k + 1])) for k in range(0, len(args) - 1, 2)] or list(
+            self.state.parameters
+        )
+        if any(key not in self.state.parameters for key in keys):
+            raise GcsError(54)
+        # The identifier comes back without its leading zeros.
+        return format_lines(
+            [f"{item} 0x{key:X}={value_text(self.state.parameters[item, key])}" for item, key in keys]
+        )
+
+    def _save(self, args: Sequence[str]) -> None:
+        if list(args) != ["100"]:
+            raise GcsError(56)
+
+    def _start_recording(self, args: Sequence[str]) -> None:
+        self.state.recorder.start()
+
+    def _step_response(self, args: Sequence[str]) -> None:
+        """``STE`` and ``IMP``: recorded moves; the stage here makes the step only."""
+        self.state.recorder.start()
+        self._motion.move_by(args)
+
+    def _reboot(self, args: Sequence[str]) -> None:
+        self.reset()
+
+    def reset(self, *, power_cut: bool = False) -> None:
+        """Start anew; a power cut forgets auto-zero as well."""
+        with self.lock:
+            zeroed = not power_cut and all(axis.zeroed for axis in self.state.axes.values())
+            self.state.power_up(zeroed=zeroed)
+            self._framer.clear()
+            self._unread_command = ""
+            self._build_handlers()
+
+    # ------------------------------------------------------------------ optics
+    def steady_cycle(self) -> tuple[float, NDArray[np.float64]] | None:
+        """One turn of the stage once it has settled: duration in seconds, true places ``(_SAMPLES, 2)``.
+
+        In microradians; ``None`` while not both axes are driven by waves of one period. The same object
+        as long as nothing changes.
+        """
+        with self.lock:
+            sources = [axis.trajectory for axis in self.state.stage.axes.values()]
+            running = self.waves.running()
+            if (
+                self._cycle_cache is None
+                or self._cycle_cache[0] != running
+                or self._cycle_cache[1] != sources
+            ):
+                self._cycle_cache = (running, sources, self._compute_steady_cycle())
+            return self._cycle_cache[2]
+
+    def _compute_steady_cycle(self) -> tuple[float, NDArray[np.float64]] | None:
+        lengths, tracks = set(), []
+        for name, axis in self.state.stage.axes.items():
+            trajectory = axis.trajectory
+            if not isinstance(trajectory, Wave) or not self.state.is_wave_driven(name):
+                return None
+            steps = len(trajectory.table) * trajectory.rate
+            track = axis.steady(trajectory.start + (TRANSIENT_STEPS // steps + 1) * steps, steps)
+            at = np.arange(_SAMPLES) * steps / _SAMPLES
+            lengths.add(steps)
+            tracks.append(np.interp(at, np.arange(steps + 1), [*track, track[0]]))
+        if len(lengths) != 1:
+            return None
+        return lengths.pop() * SERVO_S, np.stack(tracks, axis=1)
+
+    def report(self) -> dict[str, Any]:
+        """Counters and condition."""
+        with self.lock:
+            return {
+                "commands": len(self.received_commands),
+                "condition": self.state.describe(),
+                "servo": {name: axis.servo for name, axis in self.state.axes.items()},
+                "position_urad": {name: self.state.position(name) for name in self.state.axes},
+            }

@@ -1,0 +1,339 @@
+"""Wave tables, wave generators and the generator's trigger of the emulated controller."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_sim.emulators.e727.gcs import (
+    GcsError,
+    array,
+    format_lines,
+    group_arguments,
+    items,
+    number,
+    parse_integer,
+)
+from escape_sim.emulators.e727.stage import SERVO_S, Hold, Wave
+from escape_sim.emulators.e727.state import ControllerState
+
+#: Tables, points of all together, and the largest jump at a start that counts as none.
+TABLES, POINTS = 120, 262_144
+MAX_START_JUMP = 0.02
+
+
+@dataclass
+class GeneratorSettings:
+    """Settings of the wave generator of one axis."""
+
+    table: int = 0
+    cycles: int = 0
+    offset: float = 0.0
+    rate: int = 1
+    interpolate: bool = False
+    mode: int = 0
+
+
+class WaveGenerators:
+    """Tables and generators.
+
+    Parameters
+    ----------
+    state
+        The controller's.
+    """
+
+    def __init__(self, state: ControllerState) -> None:
+        self._state = state
+        self.tables: dict[int, NDArray[np.float64]] = {}
+        self.generators = {name: GeneratorSettings() for name in state.axes}
+        #: Trigger: level of the outputs at points of the wave, and the outputs that carry it.
+        self.levels: dict[int, dict[int, int]] = {}
+        self.outputs: dict[tuple[int, int], float] = {}
+
+    # ------------------------------------------------------------------ tables
+    def define(self, args: Sequence[str]) -> None:
+        """``WAV table X|&|+ SIN_P|PNT ...``."""
+        if len(args) < 4:
+            raise GcsError(26)
+        table, how, kind = self._table_number(args[0]), args[1].upper(), args[2].upper()
+        if any(g.table == table and self._state.is_wave_driven(a) for a, g in self.generators.items()):
+            raise GcsError(73)
+        if kind not in ("SIN_P", "PNT"):
+            raise GcsError(402)
+        segment = _sine(args[3:]) if kind == "SIN_P" else _points(args[3:])
+        if how == "X":
+            combined = segment
+        elif how in ("&", "+") and table not in self.tables:
+            raise GcsError(401)
+        elif how == "&":
+            combined = np.concatenate([self.tables[table], segment])
+        elif how == "+" and len(segment) == len(self.tables[table]):
+            combined = self.tables[table] + segment
+        else:
+            raise GcsError(403 if how == "+" else 17)
+        others = sum(len(data) for key, data in self.tables.items() if key != table)
+        if others + len(combined) > POINTS:
+            raise GcsError(67)
+        self.tables[table] = combined
+
+    def clear(self, args: Sequence[str]) -> None:
+        """``WCL table``."""
+        for (text,) in group_arguments(args, 1):
+            table = self._table_number(text)
+            if any(g.table == table and self._state.is_wave_driven(a) for a, g in self.generators.items()):
+                raise GcsError(73)
+            self.tables.pop(table, None)
+
+    def lengths(self, args: Sequence[str]) -> str:
+        """``WAV? table 1``: points of each table."""
+        wanted = (
+            [self._table_number(table) for table, what in group_arguments(args, 2) if _require_value(what, 1)]
+            if args
+            else []
+        )
+        return format_lines(
+            [f"{t} 1={len(self.tables.get(t, ())):.9e}" for t in wanted or sorted(self.tables) or [1]]
+        )
+
+    def read(self, args: Sequence[str]) -> str:
+        """``GWD? first points tables``."""
+        if len(args) < 3:
+            raise GcsError(26)
+        first, count = parse_integer(args[0]), parse_integer(args[1])
+        tables = [self._table_number(text) for text in args[2:]]
+        if any(table not in self.tables for table in tables):
+            raise GcsError(401)
+        shortest = min(len(self.tables[table]) for table in tables)
+        if first < 1 or count < 1 or first + count - 1 > shortest:
+            raise GcsError(17)
+        return array(
+            {f"Wave Table {t}": self.tables[t][first - 1 : first - 1 + count] for t in tables}, SERVO_S
+        )
+
+    # ------------------------------------------------------------------ generators
+    def select(self, args: Sequence[str]) -> None:
+        """``WSL generator table``; 0 selects none."""
+        for name, text in group_arguments(args, 2):
+            self._require_not_running(name)
+            table = parse_integer(text)
+            if table and self._table_number(text) not in self.tables:
+                raise GcsError(401)
+            self.generators[name].table = table
+
+    def set_cycles(self, args: Sequence[str]) -> None:
+        """``WGC generator cycles``."""
+        for name, text in group_arguments(args, 2):
+            self._require_not_running(name)
+            if parse_integer(text) < 0:
+                raise GcsError(17)
+            self.generators[name].cycles = parse_integer(text)
+
+    def set_offset(self, args: Sequence[str]) -> None:
+        """``WOS generator offset``."""
+        for name, text in group_arguments(args, 2):
+            self._require_not_running(name)
+            self.generators[name].offset = number(text)
+
+    def set_rate(self, args: Sequence[str]) -> None:
+        """``WTR generator rate interpolation``; generator 0: all."""
+        for name, text, how in group_arguments(args, 3):
+            if not 1 <= parse_integer(text) <= 1_000_000 or parse_integer(how) not in (0, 1):
+                raise GcsError(17)
+            for one in self.generators if name == "0" else [name]:
+                self._require_not_running(one)
+                self.generators[one].rate, self.generators[one].interpolate = (
+                    parse_integer(text),
+                    bool(parse_integer(how)),
+                )
+
+    def set_modes(self, args: Sequence[str]) -> None:
+        """``WGO generator mode``: bit 0 starts, 0 stops; all of one line in the same cycle."""
+        state = self._state
+        pairs = [(name, parse_integer(text)) for name, text in group_arguments(args, 2)]
+        waves = {name: self._prepare_wave(name, mode) for name, mode in pairs if mode}
+        state.stage.advance()
+        now = state.stage.now
+        running = [name for name in state.axes if state.is_wave_driven(name)]
+        for name, mode in pairs:
+            state.axis(name)
+            self.generators[name].mode = mode
+            if mode:
+                self._check_start(name, waves[name], running)
+                generator = self.generators[name]
+                state.stage.axes[name].trajectory = Wave(
+                    waves[name], now, generator.rate, generator.cycles, generator.interpolate
+                )
+            elif state.is_wave_driven(name):
+                state.stage.axes[name].trajectory = Hold(state.target(name))
+        if waves:
+            state.recorder.start()
+
+    def _prepare_wave(self, name: str, mode: int) -> NDArray[np.float64]:
+        """The targets that a generator is about to play."""
+        state = self._state
+        state.axis(name)
+        if mode not in (1, 0x101):
+            raise GcsError(406)
+        state.require_idle(name)
+        generator = self.generators[name]
+        if not generator.table:
+            raise GcsError(75)
+        if generator.table not in self.tables:
+            raise GcsError(401)
+        if not state.axes[name].servo:
+            raise GcsError(5)
+        wave = self.tables[generator.table] + generator.offset
+        low, high = state.travel(name)
+        if wave.min() < low or wave.max() > high:
+            raise GcsError(405)
+        return wave
+
+    def _check_start(self, name: str, wave: NDArray[np.float64], running: Sequence[str]) -> None:
+        jump = abs(wave[0] - self._state.position(name))
+        if jump > MAX_START_JUMP * max(np.ptp(wave), 1.0):
+            self._state.report_violation(f"WGO {name} starts with a jump of {jump:.1f} urad; MOV there first")
+        if running:
+            self._state.report_violation(
+                f"WGO {name} starts while {' and '.join(running)} turns already: the phase between "
+                "the axes is lost"
+            )
+
+    def modes(self, args: Sequence[str]) -> str:
+        """``WGO?``."""
+        for name in self.generators:
+            if not self._state.is_wave_driven(name):
+                self.generators[name].mode = 0
+        return items({name: f"0x{self.generators[name].mode:x}" for name in self._axes_of(args)})
+
+    def selections(self, args: Sequence[str]) -> str:
+        """``WSL?``."""
+        return items({name: self.generators[name].table for name in self._axes_of(args)})
+
+    def cycles(self, args: Sequence[str]) -> str:
+        """``WGC?``."""
+        return items({name: self.generators[name].cycles for name in self._axes_of(args)})
+
+    def offsets(self, args: Sequence[str]) -> str:
+        """``WOS?``."""
+        return items({name: self.generators[name].offset for name in self._axes_of(args)})
+
+    def rates(self, args: Sequence[str]) -> str:
+        """``WTR?``."""
+        rows = [(n, self.generators[n]) for n in self._axes_of(args)]
+        return format_lines([f"{name}={g.rate} {int(g.interpolate)}" for name, g in rows])
+
+    def running(self) -> int:
+        """``#9``: a bit for each generator that runs."""
+        return sum(self._state.is_wave_driven(name) << bit for bit, name in enumerate(self._state.axes))
+
+    # ------------------------------------------------------------------ trigger
+    def clear_trigger(self, args: Sequence[str]) -> None:
+        """``TWC``."""
+        if args:
+            raise GcsError(24)
+        self.levels.clear()
+
+    def set_trigger(self, args: Sequence[str]) -> None:
+        """``TWS line point level``."""
+        for text, point, level in group_arguments(args, 3):
+            if (
+                parse_integer(text) not in (1, 2, 3)
+                or parse_integer(point) < 1
+                or parse_integer(level) not in (0, 1)
+            ):
+                raise GcsError(17)
+            self.levels.setdefault(parse_integer(text), {})[parse_integer(point)] = parse_integer(level)
+
+    def set_output(self, args: Sequence[str]) -> None:
+        """``CTO line parameter value``; parameter 3 is the mode, 4 of it the generator's trigger."""
+        for text, parameter, value in group_arguments(args, 3):
+            if parse_integer(text) not in (1, 2, 3) or parse_integer(parameter) not in (
+                1,
+                2,
+                3,
+                5,
+                6,
+                7,
+                8,
+                9,
+            ):
+                raise GcsError(17)
+            if parse_integer(parameter) == 3 and parse_integer(value) not in (0, 2, 3, 4):
+                raise GcsError(17)
+            self.outputs[parse_integer(text), parse_integer(parameter)] = number(value)
+
+    def output(self, args: Sequence[str]) -> str:
+        """``CTO?``."""
+        pairs = (
+            [(parse_integer(a), parse_integer(b)) for a, b in group_arguments(args, 2)]
+            if args
+            else sorted(self.outputs)
+        )
+        if any(pair not in self.outputs for pair in pairs) or not pairs:
+            raise GcsError(17)
+        return format_lines(
+            [f"{line} {parameter}={self.outputs[line, parameter]:g}" for line, parameter in pairs]
+        )
+
+    def pulses_s(self, output: int, name: str) -> NDArray[np.float64]:
+        """Moments of rising edges within one turn ``(n,)``, seconds from its start; empty: no pulses."""
+        levels, wave = self.levels.get(output, {}), self._state.stage.axes[name].trajectory
+        if self.outputs.get((output, 3)) != 4 or not levels or not isinstance(wave, Wave):
+            return np.empty(0)
+        state, points = 0, []
+        for point in range(1, len(wave.table) + 1):
+            level = levels.get(point, state)
+            if level > state:
+                points.append(point - 1)
+            state = level
+        return np.array(points, float) * wave.rate * SERVO_S
+
+    # ------------------------------------------------------------------ arguments
+    def _require_not_running(self, name: str) -> None:
+        self._state.axis(name)
+        if self._state.is_wave_driven(name):
+            raise GcsError(73)
+
+    def _axes_of(self, args: Sequence[str]) -> list[str]:
+        return self._state.axes_of(args)
+
+    def _table_number(self, text: str) -> int:
+        if not 1 <= parse_integer(text) <= TABLES:
+            raise GcsError(400)
+        return parse_integer(text)
+
+
+def _require_value(text: str, value: int) -> bool:
+    if parse_integer(text) != value:
+        raise GcsError(17)
+    return True
+
+
+def _sine(args: Sequence[str]) -> NDArray[np.float64]:
+    """``N A O L S C``: from the offset to offset plus amplitude at the centre, and back; starts at ``S``."""
+    if len(args) != 6:
+        raise GcsError(404)
+    segment, length, start, centre = (parse_integer(args[k]) for k in (0, 3, 4, 5))
+    amplitude, offset = number(args[1]), number(args[2])
+    if segment < 1 or length < 2 or length > segment:
+        raise GcsError(403)
+    if not 0 <= start < segment or not 0 < centre < length:
+        raise GcsError(405)
+    along = (np.arange(segment) - start) % segment
+    rising = np.where(along < centre, along / (2 * centre), 0.5 + (along - centre) / (2 * (length - centre)))
+    curve = offset + amplitude / 2 * (1 - np.cos(2 * np.pi * np.minimum(rising, 1.0)))
+    return np.asarray(curve, np.float64)
+
+
+def _points(args: Sequence[str]) -> NDArray[np.float64]:
+    """``1 n v1 ... vn``."""
+    first, count = parse_integer(args[0]), parse_integer(args[1]) if len(args) > 1 else 0
+    if first != 1:
+        raise GcsError(405)
+    if count < 1 or len(args) - 2 != count:
+        raise GcsError(404)
+    return np.array([number(text) for text in args[2:]])

@@ -1,0 +1,234 @@
+"""Influence functions of a deformable mirror under any registration: Gaussian (separable factors) or measured on a grid (cubic splines)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.special import factorial
+
+from escape_hw.api.registration import Registration
+from escape_hw.errors import ConfigError
+
+#: Share of an influence function's peak below which a term of a series is left out.
+_NEGLIGIBLE = 1e-13
+
+
+def layout_positions(layout: NDArray[np.bool_], pitch_m: float) -> NDArray[np.float64]:
+    """Actuator positions ``(n_act, 2)`` as (x, y) in metres, in row-major order."""
+    rows, columns = np.nonzero(layout)
+    centre = (np.array(layout.shape[::-1]) - 1) / 2
+    return (np.stack([columns, rows], axis=1) - centre) * pitch_m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InfluenceFunctions:
+    """Gaussian influence functions, optionally with per-actuator widths and a broad wing.
+
+    The surface per unit command is ``(1 - w) G(s_i) + w G(wing_scale s_i)`` times the actuator's
+    gain, where ``G`` is a Gaussian of peak 1 that falls to ``coupling`` at one pitch. As in
+    OOPAO (``DeformableMirror.modesComputation``), scalings stretch the shapes as they do the
+    positions, and rotation moves the actuators without turning their shapes.
+
+    Parameters
+    ----------
+    positions_m
+        Nominal positions ``(n_act, 2)`` as (x, y) on the pupil in metres.
+    pitch_m
+        Actuator pitch on the pupil in metres.
+    coupling
+        Mechanical coupling: relative surface one pitch away.
+    width
+        Scale of the Gaussian width, one number or ``(n_act,)``.
+    gain
+        Gain of each actuator, one number or ``(n_act,)``.
+    wing
+        Share ``w`` of the broad Gaussian.
+    wing_scale
+        Its width relative to the narrow one.
+    """
+
+    positions_m: NDArray[np.float64]
+    pitch_m: float
+    coupling: float
+    width: float | NDArray[np.float64] = 1.0
+    gain: float | NDArray[np.float64] = 1.0
+    wing: float = 0.0
+    wing_scale: float = 2.0
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        return len(self.positions_m)
+
+    def registered_positions(self, registration: Registration, sub_aperture_m: float) -> NDArray[np.float64]:
+        """Positions ``(n_act, 2)`` in metres under a registration."""
+        matrix, offset = registration.affine(sub_aperture_m)
+        return np.asarray(self.positions_m @ matrix.T + offset)
+
+    def factors(
+        self,
+        registration: Registration,
+        sub_aperture_m: float,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Separable factors of the surfaces.
+
+        Parameters
+        ----------
+        registration, sub_aperture_m
+            Registration and the size of a sub-aperture in metres that its shifts refer to.
+        x_m, y_m
+            Columns' and rows' coordinates ``(n_x,)`` and ``(n_y,)`` in metres.
+
+        Returns
+        -------
+        along_x : ndarray, ``(n_x, n_act, n_terms)``
+        along_y : ndarray, ``(n_y, n_act, n_terms)``
+            The surface of actuator ``a`` is ``sum_t along_y[:, a, t] x along_x[:, a, t]``: one term,
+            two with wings, and a dozen times as many under an anamorphosis angle, which makes an
+            ellipse that no product of functions of x and y is.
+        """
+        at = self.registered_positions(registration, sub_aperture_m)
+        sigma = np.broadcast_to(
+            np.asarray(self.width) * self.pitch_m / np.sqrt(2 * np.log(1 / self.coupling)), (self.n_act,)
+        )
+        # exp(-(d, Q d) / (2 sigma^2)) with Q = S^-2, so that shapes are stretched as positions are.
+        inverse = np.linalg.inv(registration.scaling_matrix)
+        q = inverse @ inverse
+        dx = (x_m[:, None] - at[:, 0]) / sigma
+        dy = (y_m[:, None] - at[:, 1]) / sigma
+        gain = np.broadcast_to(np.asarray(self.gain, dtype=float), (self.n_act,))
+        x, y = [], []
+        for share, scale in [(1.0 - self.wing, 1.0)] + ([(self.wing, self.wing_scale)] if self.wing else []):
+            u, v = dx / scale, dy / scale
+            gauss_x, gauss_y = np.exp(-0.5 * q[0, 0] * u**2), share * gain * np.exp(-0.5 * q[1, 1] * v**2)
+            for power, weight in enumerate(_cross_term_weights(q)):
+                x.append(gauss_x * u**power if power else gauss_x)
+                y.append(gauss_y * (weight * v**power) if power else gauss_y)
+        return np.stack(x, axis=2), np.stack(y, axis=2)
+
+    def surfaces(
+        self,
+        registration: Registration,
+        sub_aperture_m: float,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
+        along_x, along_y = self.factors(registration, sub_aperture_m, x_m, y_m)
+        return np.asarray(np.einsum("yat,xat->ayx", along_y, along_x))
+
+
+def _cross_term_weights(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights ``(n,)`` of the powers of ``u v`` in ``exp(-q_xy u v)``.
+
+    Beside ``exp(-q_xx u^2 / 2 - q_yy v^2 / 2)`` the k-th term is at most ``r^k / sqrt(2 pi k)`` with
+    ``r = |q_xy| / sqrt(q_xx q_yy)``, which a mirror that is nearly square keeps far below one.
+    """
+    ratio = abs(q[0, 1]) / np.sqrt(q[0, 0] * q[1, 1])
+    if ratio < _NEGLIGIBLE:
+        return np.ones(1)
+    k = np.arange(1 + int(np.ceil(np.log(_NEGLIGIBLE) / np.log(ratio))))
+    return np.asarray((-q[0, 1]) ** k / factorial(k))
+
+
+class MeasuredInfluenceFunctions:
+    """Influence functions as measured on a grid, read between its points by cubic splines.
+
+    A registration moves, turns and stretches the whole surface, the shapes with the positions.
+    Beyond the measured square a surface is zero.
+
+    Parameters
+    ----------
+    surfaces
+        Surfaces per unit command ``(n_act, n, n)`` in fractions of full stroke; x along columns, y
+        along rows, the mirror's centre in the middle of the array.
+    pixel_m
+        Distance between its points on the pupil in metres.
+    gain
+        Gain of each actuator, one number or ``(n_act,)``.
+
+    Raises
+    ------
+    ValueError
+        Not a stack of squares of finite numbers.
+    """
+
+    def __init__(
+        self, surfaces: NDArray[np.float64], pixel_m: float, gain: float | NDArray[np.float64] = 1.0
+    ) -> None:
+        cube = np.asarray(surfaces, dtype=float)
+        if cube.ndim != 3 or cube.shape[1] != cube.shape[2] or min(cube.shape) < 1:
+            raise ValueError(f"influence functions of shape {cube.shape}; they must be (n_act, n, n)")
+        if not np.isfinite(cube).all() or not pixel_m > 0:
+            raise ValueError(
+                f"influence functions are not all finite, or their pixel of {pixel_m} m is not positive"
+            )
+        scaled = cube * np.broadcast_to(np.asarray(gain, dtype=float), (len(cube),))[:, None, None]
+        # A margin of zeros, so that a spline does not ring at the edge of what was measured.
+        self._margin = 4
+        padded = np.pad(scaled, ((0, 0), (self._margin,) * 2, (self._margin,) * 2))
+        self._splines = np.stack([ndimage.spline_filter(s, order=3, mode="mirror") for s in padded])
+        self._n, self._pixel = cube.shape[1], pixel_m
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        return len(self._splines)
+
+    def surfaces(
+        self,
+        registration: Registration,
+        sub_aperture_m: float,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke.
+
+        Parameters
+        ----------
+        registration, sub_aperture_m
+            Registration and the size of a sub-aperture in metres that its shifts refer to.
+        x_m, y_m
+            Columns' and rows' coordinates ``(n_x,)`` and ``(n_y,)`` in metres.
+        """
+        matrix, offset = registration.affine(sub_aperture_m)
+        x, y = np.meshgrid(x_m, y_m)
+        nominal_xy = np.linalg.solve(matrix, np.stack([x.ravel() - offset[0], y.ravel() - offset[1]]))
+        pixel_coordinates = nominal_xy[::-1] / self._pixel + (self._n - 1) / 2 + self._margin
+        out = np.empty((self.n_act, y_m.size, x_m.size))
+        for number, spline in enumerate(self._splines):
+            values = ndimage.map_coordinates(
+                spline, pixel_coordinates, order=3, mode="constant", cval=0.0, prefilter=False
+            )
+            out[number] = values.reshape(out.shape[1:])
+        return out
+
+
+def read_influence_functions(file: str, n_act: int) -> NDArray[np.float64]:
+    """Influence functions ``(n_act, n, n)`` from the first image of a FITS file.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or holds something else.
+    """
+    path = Path(file).expanduser()
+    try:
+        cube = np.asarray(fits.getdata(path), dtype=float)
+    except (OSError, TypeError, ValueError, IndexError) as error:
+        raise ConfigError(f"influence functions cannot be read from {path}: {error}") from error
+    if cube.ndim != 3 or cube.shape[1] != cube.shape[2] or len(cube) != n_act:
+        raise ConfigError(
+            f"{path} holds an array of shape {cube.shape}; influence functions of {n_act} actuators "
+            f"have the shape ({n_act}, n, n)"
+        )
+    if not np.isfinite(cube).all():
+        raise ConfigError(f"{path} holds influence functions that are not finite")
+    return cube

@@ -1,0 +1,199 @@
+"""Surfaces of modes under a registration and their derivatives, as products of separable factors; interpolation nodes that carry such a surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from escape_hw.api.registration import Registration
+from escape_sim.mirror.influence_functions import InfluenceFunctions
+
+#: Derivatives are by the five parameters of the registration, in their order, and by the width.
+N_DERIVATIVES = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GaussianFactors:
+    """Factors of all influence functions on a grid, with what their derivatives are made of.
+
+    With ``X_0 = exp(-u^2 / 2)``, ``u = (x - x_a) / s_x``, the derivative of a factor by the
+    actuator's place is ``X_1 = X_0 u / s_x`` and by the logarithm of its width ``X_2 = X_0 u^2``.
+
+    Parameters
+    ----------
+    along_x, along_y
+        ``(3, n_x, n_act)`` and ``(3, n_y, n_act)``: ``X_0, X_1, X_2`` and the same along y.
+    place
+        Derivatives of the actuators' places ``(6, 2, n_act)`` as (x, y), in metres per unit of the
+        parameter.
+    spread
+        Derivatives of the logarithm of the widths along x and y ``(6, 2)``.
+    """
+
+    along_x: NDArray[np.floating]
+    along_y: NDArray[np.floating]
+    position: NDArray[np.floating]
+    log_width: NDArray[np.floating]
+
+
+def gaussian_factors(
+    influence: InfluenceFunctions,
+    registration: Registration,
+    sub_aperture_m: float,
+    x_m: NDArray[np.float64],
+    y_m: NDArray[np.float64],
+    dtype: DTypeLike = np.float32,
+) -> GaussianFactors:
+    """Factors and derivatives of influence functions without a wing.
+
+    Parameters
+    ----------
+    influence
+        The influence functions; the gain is contained in the factors along y.
+    registration, sub_aperture_m
+        Registration and the size of a sub-aperture in metres that its shifts refer to.
+    x_m, y_m
+        Columns' and rows' coordinates ``(n_x,)`` and ``(n_y,)`` in metres.
+    dtype
+        Precision of the factors; single precision is worth 1e-6 of a surface.
+
+    Raises
+    ------
+    ValueError
+        The influence functions have a wing, or one width or gain per actuator; or the registration
+        has an anamorphosis angle.
+    """
+    if influence.wing or np.ndim(influence.width) or np.ndim(influence.gain):
+        raise ValueError("derivatives are known for equal Gaussian influence functions without a wing only")
+    if registration.anamorphosis_angle:
+        raise ValueError("derivatives are known without an anamorphosis angle only; no solver asks for one")
+    at = influence.registered_positions(registration, sub_aperture_m)
+    sigma = float(influence.width) * influence.pitch_m / np.sqrt(2 * np.log(1 / influence.coupling))
+    stretch = 1 + np.array([registration.radial_scaling, registration.tangential_scaling]) / 100
+    factors_xy = []
+    for coordinates, position, s in (
+        (x_m, at[:, 0], sigma * stretch[0]),
+        (y_m, at[:, 1], sigma * stretch[1]),
+    ):
+        u = (coordinates[:, None] - position) / s
+        gauss = np.exp(-0.5 * np.square(u))
+        factors_xy.append(np.stack([gauss, gauss * u / s, gauss * np.square(u)]))
+    factors_xy[1] *= float(influence.gain)
+    position, log_width = _parameter_derivatives(influence, registration, sub_aperture_m, stretch)
+    return GaussianFactors(
+        factors_xy[0].astype(dtype), factors_xy[1].astype(dtype), position.astype(dtype), log_width
+    )
+
+
+def _parameter_derivatives(
+    influence: InfluenceFunctions,
+    registration: Registration,
+    sub_aperture_m: float,
+    stretch: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How places and widths follow the parameters, from ``Registration.affine``."""
+    matrix, _ = registration.affine(sub_aperture_m)
+    rotation = matrix / stretch
+    nominal = influence.positions_m.T
+    quarter_turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    position = np.zeros((N_DERIVATIVES, 2, influence.n_act))
+    position[0, 0] = position[1, 1] = sub_aperture_m / 100
+    position[2] = np.deg2rad(1.0) * quarter_turn @ matrix @ nominal
+    position[3] = rotation[:, :1] * nominal[:1] / 100
+    position[4] = rotation[:, 1:] * nominal[1:] / 100
+    log_width = np.zeros((N_DERIVATIVES, 2))
+    log_width[3, 0], log_width[4, 1] = 0.01 / stretch
+    log_width[5] = 1 / float(influence.width)
+    return position, log_width
+
+
+def mode_surfaces(factors: GaussianFactors, m2c: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Surfaces of modes ``(n_y, n_x, n_modes)`` in fractions of full stroke.
+
+    Parameters
+    ----------
+    factors
+        From :func:`gaussian_factors`.
+    m2c
+        Mode-to-command matrix ``(n_act, n_modes)``.
+    """
+    return _product(factors.along_y[0], factors.along_x[0], m2c.astype(factors.along_x.dtype))
+
+
+def mode_derivatives(factors: GaussianFactors, m2c: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Surfaces of modes and their derivatives ``(n_y, n_x, 1 + 6, n_modes)``, the surfaces first.
+
+    Parameters
+    ----------
+    factors
+        From :func:`gaussian_factors`.
+    m2c
+        Mode-to-command matrix ``(n_act, n_modes)``.
+    """
+    x, y = factors.along_x, factors.along_y
+    c = m2c.astype(x.dtype)
+    out = np.empty((y.shape[1], x.shape[1], 1 + N_DERIVATIVES, c.shape[1]), x.dtype)
+    out[:, :, 0] = _product(y[0], x[0], c)
+    for p in range(N_DERIVATIVES):
+        (shift_x, shift_y), (width_x, width_y) = factors.position[p], factors.log_width[p].astype(x.dtype)
+        total = out[:, :, 1 + p]
+        total[...] = 0
+        if shift_x.any() or width_x:
+            total += _product(y[0], x[1] * shift_x + x[2] * width_x, c)
+        if shift_y.any() or width_y:
+            total += _product(y[1] * shift_y + y[2] * width_y, x[0], c)
+    return out
+
+
+def _product(
+    along_y: NDArray[np.floating], along_x: NDArray[np.floating], c: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    """``sum_a y_a x_a c_am`` as one matrix product ``(n_y, n_x, n_modes)``."""
+    n_act, n_modes = c.shape
+    right = (along_x.T[:, :, None] * c[:, None, :]).reshape(n_act, -1)
+    return (along_y @ right).reshape(along_y.shape[0], along_x.shape[0], n_modes)
+
+
+#: Nodes for each standard deviation of an influence function across half the pupil. The Chebyshev
+#: coefficients of a Gaussian fall as ``exp(-(k sigma)^2 / 2)``: 6 leave 2e-7 at nominal width, 1e-5
+#: at 0.8 of it.
+_NODES_PER_SIGMA = 6.0
+
+
+def surface_nodes(
+    samples_m: NDArray[np.float64], sigma_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+    """Nodes along an axis, and the matrix from values there to values at the samples.
+
+    Chebyshev nodes and barycentric interpolation (Berrut and Trefethen 2004), or the samples
+    themselves where these are fewer.
+
+    Parameters
+    ----------
+    samples_m
+        Samples along the axis ``(n,)`` in metres, ascending.
+    sigma_m
+        Smallest standard deviation of an influence function in metres.
+
+    Returns
+    -------
+    nodes_m : ndarray, ``(m,)``
+    carry : ndarray, ``(n, m)``
+        None where the nodes are the samples.
+    """
+    middle, half = (samples_m[0] + samples_m[-1]) / 2, (samples_m[-1] - samples_m[0]) / 2
+    m = int(np.ceil(_NODES_PER_SIGMA * half / sigma_m)) + 1
+    if m >= samples_m.size:
+        return samples_m, None
+    angle = (2 * np.arange(m) + 1) * np.pi / (2 * m)
+    nodes = middle - half * np.cos(angle)
+    weights = np.sin(angle) * (-1.0) ** np.arange(m)
+    distance = samples_m[:, None] - nodes
+    on_node = distance == 0
+    share = weights / np.where(on_node, 1.0, distance)
+    interpolation = share / share.sum(axis=1, keepdims=True)
+    exact = on_node.any(axis=1)
+    interpolation[exact] = on_node[exact]
+    return nodes, interpolation.astype(np.float32)

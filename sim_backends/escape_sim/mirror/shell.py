@@ -1,0 +1,145 @@
+"""The thin shell of an adaptive secondary as it behaves: states, gap, currents, sensors, faults."""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.adaptive_secondary import ShellState
+from escape_sim.mirror.dynamics import MirrorDynamics
+
+#: Gap of the floating shell (paper: about 50 um) and of one that lies on its reference body, metres.
+FLOATING_GAP_M, RESTED_GAP_M = 50e-6, 2e-6
+#: Noise of a capacitive position sensor in metres.
+SENSOR_NOISE_M = 3e-9
+#: Time in seconds that each step of the ladder takes.
+TRANSITION_S = {ShellState.OFF: 0.5, ShellState.RESTED: 1.0, ShellState.SET: 2.0, ShellState.RUNNING: 0.1}
+#: Coil current in amperes that holds the shell, and what full stroke against the stiff shell adds.
+HOLDING_CURRENT_A, FULL_STROKE_CURRENT_A = 0.05, 0.5
+#: Temperature in degrees Celsius of coils without current, and its rise per ampere.
+AMBIENT_C, RISE_C_PER_A = 15.0, 10.0
+
+
+class MovingActuators(Protocol):
+    """What moves: actuators that follow shapes ``(n_act,)``, fractions of full stroke, in their time."""
+
+    @property
+    def now_s(self) -> float:
+        """Monotonic seconds."""
+
+    def drive(self, shape: NDArray[np.float64]) -> None:
+        """A command on its usual way, with whatever latency that has."""
+
+    def set_positions(self, shape: NDArray[np.float64]) -> None:
+        """A shape that is taken at once, without a command."""
+
+    def positions(self) -> NDArray[np.float64]:
+        """Where the actuators are now."""
+
+
+class RealTimeActuators:
+    """Actuators that move in real time.
+
+    Parameters
+    ----------
+    n_act
+        Number of actuators.
+    settling_s
+        Time to settle within 5 % of a step, in seconds.
+    """
+
+    def __init__(self, n_act: int, settling_s: float) -> None:
+        self._start = time.monotonic()
+        self._dynamics = MirrorDynamics(n_act, settling_s, 0.0, 1.0)
+
+    @property
+    def now_s(self) -> float:
+        """Seconds since it was made."""
+        return time.monotonic() - self._start
+
+    def drive(self, shape: NDArray[np.float64]) -> None:
+        """Take a command now."""
+        self._dynamics.command(self.now_s, shape)
+
+    set_positions = drive
+
+    def positions(self) -> NDArray[np.float64]:
+        """Where the actuators are now."""
+        now = self.now_s
+        return self._dynamics.mean(now, now)
+
+
+class Shell:
+    """State, fault and sensors of a shell over actuators that move.
+
+    Parameters
+    ----------
+    plant
+        The actuators.
+    n_act
+        How many.
+    stroke_m
+        Metres of surface for a command of 1.
+    noise
+        Random generator of the position sensors.
+    """
+
+    def __init__(
+        self, actuators: MovingActuators, n_act: int, stroke_m: float, noise: np.random.Generator
+    ) -> None:
+        self._actuators, self.n_act, self.stroke_m, self._noise = actuators, n_act, stroke_m, noise
+        self.state, self.fault = ShellState.OFF, ""
+        #: Actuators whose sensor delivers nothing, and those whose coil carries too much: (number, A).
+        self.unreadable: set[int] = set()
+        self.excess_a: dict[int, float] = {}
+
+    @property
+    def is_floating(self) -> bool:
+        """True while the shell does not touch its reference body."""
+        return self.state in (ShellState.SET, ShellState.RUNNING)
+
+    def finish_transition(self, state: ShellState, flat: NDArray[np.float64]) -> None:
+        """End a step of the ladder: afloat the shell is flat, at rest it has its body's shape."""
+        self.state = state
+        self._actuators.set_positions(flat if self.is_floating else np.zeros(self.n_act))
+
+    def drive(self, shape: NDArray[np.float64]) -> None:
+        """A command ``(n_act,)``, fractions of full stroke, on its usual way."""
+        self._actuators.drive(shape)
+
+    def trip(self, reason: str) -> None:
+        """Coils off: the shell falls back on its reference body, latched."""
+        self.state, self.fault = ShellState.FAULT, reason
+        self._actuators.set_positions(np.zeros(self.n_act))
+
+    def recover(self) -> None:
+        """End a fault; the shell lies at rest."""
+        self.state, self.fault = ShellState.RESTED, ""
+
+    def measure_positions(self) -> NDArray[np.float64]:
+        """Noisy positions ``(n_act,)``, fractions of full stroke; NaN where a sensor is blind."""
+        measured_positions = self._actuators.positions()
+        measured_positions = measured_positions + self._noise.standard_normal(measured_positions.size) * (
+            SENSOR_NOISE_M / self.stroke_m
+        )
+        if self.unreadable:
+            measured_positions[sorted(self.unreadable)] = np.nan
+        return measured_positions
+
+    def gap_m(self) -> float:
+        """Mean gap in metres."""
+        if not self.is_floating:
+            return RESTED_GAP_M
+        return FLOATING_GAP_M + float(self._actuators.positions().mean()) * self.stroke_m
+
+    def currents_a(self) -> NDArray[np.float64]:
+        """Coil currents ``(n_act,)`` in amperes."""
+        if not self.is_floating:
+            return np.zeros(self.n_act)
+        currents = HOLDING_CURRENT_A + FULL_STROKE_CURRENT_A * np.abs(self._actuators.positions())
+        for actuator, ampere in self.excess_a.items():
+            currents[actuator] = ampere
+        return currents

@@ -1,0 +1,287 @@
+"""Mirror surface of all actuators for a command, in single precision, and its slow change when the registration drifts (flexure)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_sim.mirror.influence_functions import InfluenceFunctions
+
+if TYPE_CHECKING:
+    from escape_hw.config.twin import TwinDrift
+
+
+#: Height, relative to the peak, below which a sample belongs to no actuator. All that is left out of
+#: a surface stays below this times the command, summed over actuators that are far away.
+NEGLIGIBLE_HEIGHT = 1e-6
+#: Products of one GEMM that take as long as one of the loop over windows (measured: 4 to 7).
+_GEMM_SPEEDUP = 6.0
+
+
+class InfluenceModel(Protocol):
+    """Influence functions of a mirror under any registration."""
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        ...
+
+    def surfaces(
+        self,
+        registration: Registration,
+        sub_aperture_m: float,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
+        ...
+
+
+class SurfaceFunction(Protocol):
+    """Commands to surfaces on a fixed grid."""
+
+    def __call__(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``."""
+        ...
+
+
+def make_mirror_surface(
+    influence: InfluenceModel,
+    registration: Registration,
+    sub_aperture_m: float,
+    x_m: NDArray[np.float64],
+    y_m: NDArray[np.float64],
+) -> SurfaceFunction:
+    """The faster of the ways to compute a surface.
+
+    One matrix product over all actuators is best while each of them reaches across much of the
+    pupil; for many actuators it is better to add each to the samples that it reaches.
+
+    Parameters
+    ----------
+    influence
+        Gaussian or measured influence functions.
+    registration, sub_aperture_m
+        Registration and the size of a sub-aperture in metres that its shifts refer to.
+    x_m, y_m
+        Columns' and rows' coordinates ``(n_x,)`` and ``(n_y,)`` in metres.
+    """
+    if not isinstance(influence, InfluenceFunctions):
+        return GriddedSurface(influence.surfaces(registration, sub_aperture_m, x_m, y_m))
+    along_x, along_y = influence.factors(registration, sub_aperture_m, x_m, y_m)
+    windows = WindowedSurface(along_x, along_y)
+    dense = x_m.size * y_m.size * influence.n_act * along_x.shape[2]
+    return windows if windows.products * _GEMM_SPEEDUP < dense else DenseSurface(along_x, along_y)
+
+
+class DenseSurface:
+    """Separable influence functions, all in one matrix product.
+
+    Parameters
+    ----------
+    along_x, along_y
+        Factors ``(n_x, n_act, n_terms)`` and ``(n_y, n_act, n_terms)``, see
+        ``InfluenceFunctions.factors``.
+    """
+
+    def __init__(self, along_x: NDArray[np.float64], along_y: NDArray[np.float64]) -> None:
+        self._terms = along_x.shape[2]
+        self._x = np.ascontiguousarray(along_x.reshape(len(along_x), -1).T, dtype=np.float32)
+        self._y = np.ascontiguousarray(along_y.reshape(len(along_y), -1), dtype=np.float32)
+
+    def __call__(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``."""
+        weights = np.repeat(command, self._terms).astype(np.float32)
+        return np.asarray((self._y * weights) @ self._x)
+
+
+def _windows(
+    profile: NDArray[np.float64], threshold: NDArray[np.float64] | float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First sample and the one after the last ``(k,)`` at which each profile ``(n, k)`` exceeds a level."""
+    above = np.abs(profile) > threshold
+    reached = above.any(axis=0)
+    first = np.where(reached, above.argmax(axis=0), 0)
+    return first, np.where(reached, len(profile) - above[::-1].argmax(axis=0), 0)
+
+
+class WindowedSurface:
+    """Separable influence functions, each added where it reaches.
+
+    Parameters
+    ----------
+    along_x, along_y
+        As for :class:`DenseSurface`.
+
+    Attributes
+    ----------
+    products
+        Multiplications per surface.
+    """
+
+    def __init__(self, along_x: NDArray[np.float64], along_y: NDArray[np.float64]) -> None:
+        n_x, _, terms = along_x.shape
+        x, y = along_x.reshape(n_x, -1), along_y.reshape(len(along_y), -1)
+        # What counts is the product with the other factor at its highest, against a peak of one.
+        highest_x, highest_y = (np.maximum(np.abs(f).max(axis=0), 1e-30) for f in (x, y))
+        # Columns of the factors next to each other in memory, in an order that stays close on the surface.
+        self._x, self._y = (np.ascontiguousarray(f.T, dtype=np.float32) for f in (x, y))
+        self._left, self._right = _windows(x, NEGLIGIBLE_HEIGHT / highest_y)
+        self._top, self._bottom = _windows(y, NEGLIGIBLE_HEIGHT / highest_x)
+        self._terms, self._shape = terms, (len(along_y), n_x)
+        self.products = int(((self._right - self._left) * (self._bottom - self._top)).sum())
+
+    def __call__(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``."""
+        out = np.zeros(self._shape, np.float32)
+        _add_windows(
+            np.asarray(command, np.float32), self._terms, self._x, self._y, self._left, self._right,
+            self._top, self._bottom, out,
+        )  # fmt: skip
+        return out
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _add_windows(command, terms, along_x, along_y, left, right, top, bottom, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for k in range(along_x.shape[0]):
+        weight = command[k // terms]
+        if weight == 0:
+            continue
+        line = along_x[k, left[k] : right[k]]
+        for i in range(top[k], bottom[k]):
+            factor = weight * along_y[k, i]
+            target = out[i, left[k] : right[k]]
+            for j in range(line.size):
+                target[j] += factor * line[j]
+
+
+class GriddedSurface:
+    """Influence functions of any shape, each added where it reaches.
+
+    Parameters
+    ----------
+    surfaces
+        Surfaces per unit command ``(n_act, n_y, n_x)``.
+    """
+
+    def __init__(self, surfaces: NDArray[np.float64]) -> None:
+        size = np.abs(surfaces)
+        threshold = NEGLIGIBLE_HEIGHT * float(size.max())
+        self._top, self._bottom = _windows(size.max(axis=2).T, threshold)
+        self._left, self._right = _windows(size.max(axis=1).T, threshold)
+        patches = [
+            surface[t:b, a:z].astype(np.float32).ravel()
+            for surface, t, b, a, z in zip(
+                surfaces, self._top, self._bottom, self._left, self._right, strict=True
+            )
+        ]
+        self._start = np.concatenate([[0], np.cumsum([stamp.size for stamp in patches])])
+        self._patches = np.concatenate(patches)
+        self._shape = surfaces.shape[1:]
+
+    def __call__(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``."""
+        out = np.zeros(self._shape, np.float32)
+        _add_patches(
+            np.asarray(command, np.float32), self._patches, self._start, self._left, self._right, self._top,
+            self._bottom, out,
+        )  # fmt: skip
+        return out
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _add_patches(command, patches, start, left, right, top, bottom, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for k in range(command.size):
+        weight = command[k]
+        width = right[k] - left[k]
+        if weight == 0 or width <= 0:
+            continue
+        for i in range(top[k], bottom[k]):
+            begin = start[k] + (i - top[k]) * width
+            line = patches[begin : begin + width]
+            target = out[i, left[k] : right[k]]
+            for j in range(width):
+                target[j] += weight * line[j]
+
+
+#: Largest way of each parameter between two derivations of the surface, in its units. A hundredth of
+#: a percent of a sub-aperture is a fifth of what the best registration errs by.
+_MAX_PARAMETER_CHANGE = np.array([0.01, 0.01, 3e-4, 0.003, 0.003])
+
+
+class Flexure:
+    """Where the mirror sits at a moment: hidden truth.
+
+    Parameters
+    ----------
+    start
+        Registration at time zero.
+    drift
+        Rates, sinusoid and period.
+
+    Attributes
+    ----------
+    step_s
+        Seconds in which no parameter moves by more than the surface is derived anew for.
+    """
+
+    def __init__(self, start: Registration, drift: TwinDrift) -> None:
+        self._start, self._drift = start, drift
+        rate, swing = (
+            np.array([getattr(part, name) for name in PARAMETERS]) for part in (drift.rate, drift.swing)
+        )
+        max_rate = float(
+            ((np.abs(rate) + np.abs(swing) * 2 * math.pi / drift.period_s) / _MAX_PARAMETER_CHANGE).max()
+        )
+        self.update_interval_s = 1 / max_rate if max_rate else math.inf
+
+    def at(self, time_s: float) -> Registration:
+        """The registration at a time of the twin's clock, in seconds."""
+        registration = Registration.from_array(self._start.to_array() + self._drift.offsets_at(time_s))
+        return replace(registration, anamorphosis_angle=self._start.anamorphosis_angle)
+
+
+class DriftingSurface:
+    """Commands to surfaces under a registration that moves; derived anew as seldom as it may be.
+
+    The surface of a moment depends on that moment alone, whatever was asked before.
+
+    Parameters
+    ----------
+    influence, sub_aperture_m, x_m, y_m
+        As for :func:`~escape_sim.mirror.surface.make_mirror_surface`.
+    flexure
+        Where the mirror sits.
+    """
+
+    def __init__(
+        self,
+        influence: InfluenceModel,
+        flexure: Flexure,
+        sub_aperture_m: float,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
+    ) -> None:
+        self._influence, self._flexure, self._sub_aperture_m = influence, flexure, sub_aperture_m
+        self._x, self._y = x_m, y_m
+        self._number = 0
+        self._surface = self._surface_of_step(0)
+
+    def __call__(self, command: NDArray[np.float64], time_s: float) -> NDArray[np.float32]:
+        """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)`` at a time."""
+        number = math.floor(time_s / self._flexure.update_interval_s)
+        if number != self._number:
+            self._surface, self._number = self._surface_of_step(number), number
+        return self._surface(command)
+
+    def _surface_of_step(self, number: int) -> SurfaceFunction:
+        """The surface in the middle of step ``number``."""
+        interval_s = self._flexure.update_interval_s
+        registration = self._flexure.at(0.0 if math.isinf(interval_s) else (number + 0.5) * interval_s)
+        return make_mirror_surface(self._influence, registration, self._sub_aperture_m, self._x, self._y)

@@ -1,0 +1,1 @@
+"""Fast synthetic models of the sensors' response to the mirror, as inverted by SPRINT: analytic derivatives for Shack-Hartmann and pyramid, averaged over turbulence. Nothing here reads the twin's true state."""

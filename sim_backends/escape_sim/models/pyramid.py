@@ -1,0 +1,343 @@
+"""SPRINT's nominal synthetic model of a pyramid system, fast and analytic."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.pyramid import PyramidPupils, pupil_boxes
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.modes.bases import build_basis
+from escape_hw.config.sensor import PyramidSection
+from escape_sim.atmosphere.von_karman import structure_function
+from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.mode_surfaces import (
+    N_DERIVATIVES,
+    GaussianFactors,
+    gaussian_factors,
+    mode_derivatives,
+    mode_surfaces,
+    surface_nodes,
+)
+from escape_sim.models.pyramid_response import slope_response
+from escape_sim.models.pyramid_turbulence import (
+    RandomPokes,
+    estimate_strength,
+    sample_distances,
+    turbulence_registration_scatter,
+    unit_screens,
+)
+from escape_sim.optics.fourier_filter import next_fast_length
+from escape_sim.optics.modulation import ModulationPath
+from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_from_images, pupil_geometry
+from escape_sim.optics.pyramid import GridRegion, Prism, PyramidOptics
+
+if TYPE_CHECKING:
+    from escape_hw.config.system import SystemConfig
+
+#: Outer scale of the turbulence in pupil diameters: a few pupils, as the modal basis has it.
+_OUTER_SCALE = 4.0
+#: Turbulence weaker than this many r0 across the pupil leaves the response what it is at rest.
+_NEGLIGIBLE_STRENGTH = 0.5
+#: What scalings may err by in common on a pyramid under turbulence and pokes, in % of the diameter: what the
+#: mean over some twenty twins can hide (docs/decisions/0018-pyramids-in-truth.md, "Scalings that leaned").
+_SCALING_SYSTEMATIC = 0.05
+#: Slopes at the rim may answer so much more or less than the model's (found: 0.2 to 0.3): pixels saturate
+#: when pokes gather the light, and what the pokes do at the rim is only nearly known.
+_GAIN_TREND = 0.3
+#: On a telescope pixels that get less of a bright one's light are dirt's, or the shadow's or the rim's ...
+_MIN_RELATIVE_FLUX = 0.85
+#: ... and their squares count by so much, unless more than half would.
+_MIN_SLOPE_WEIGHT = 1e-3
+#: Shapes of the mirror that are looked at under each state of the air.
+_N_SHAPES = 10
+#: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
+_STRENGTH_UNCERTAINTY, _ELLIPSE = 0.4, 0.05
+#: Doubt in pixels about the images' place relative to each other, and the pattern of it that matters: one
+#: diagonal pair against the other makes the x slopes hold some of the y slopes' derivative, as a shift does.
+#: The other patterns displace images whose sum is in a slope or whose difference answers to no phase.
+_IMAGE_POSITION_ERROR_PX, _DIAGONALS = 0.1, np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def nominal_pupils(config: SystemConfig) -> PyramidPupils:
+    """The design's pupil images, valid where the design beam is bright enough."""
+    sensor, pupil = config.sensor_as(PyramidSection), pupil_geometry(config)
+    n, p = pupil.n_sub, pupil.n_pix
+    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
+    flux /= np.percentile(flux[flux > 0], 95)
+    valid = flux >= sensor.min_flux
+    centres = np.array(sensor.pupils_px)
+    return PyramidPupils(
+        centres, float(n), pupil_boxes(centres, n), valid,
+        np.zeros((int(valid.sum()), 2), np.float32), flux.astype(np.float32),
+        normalisation=sensor.normalisation, modulation=sensor.modulation,
+    )  # fmt: skip
+
+
+class PyramidModel:
+    """Small-signal slopes of a modulated pyramid behind a Gaussian-actuator mirror.
+
+    The slopes' derivatives by the phase at every sample of the pupil are worked out once, at a flat
+    wavefront or in the mean over turbulence as strong as the slopes' motion tells. They are kept on
+    the few nodes that carry a mirror surface; a matrix under any registration is then one product.
+    The mean matters: open-loop turbulence of 22 r0 across the pupil lowers the response to modes of
+    low order to 0.38, of middle order to 0.31 and of high order to 0.53 of what it is at rest.
+
+    Parameters
+    ----------
+    config
+        The design: sensor, mirror and beam. Its ``twin`` section is not read.
+    pupils
+        The pupil images found on the camera.
+    modulation
+        Path of the image over the pyramid; by default a circle of the pupils' radius.
+    turbulence
+        Pupil diameters over r0 to average over; by default what the pupils' motion tells.
+    basis
+        Modes ``(n_act, n_modes)`` that were poked; by default those of the configuration.
+
+    Raises
+    ------
+    CalibrationError
+        The pupils do not fit the design.
+    """
+
+    name = "fast"
+
+    def __init__(
+        self,
+        config: SystemConfig,
+        pupils: PyramidPupils,
+        *,
+        modulation: ModulationPath | None = None,
+        turbulence: float | None = None,
+        basis: NDArray[np.float64] | None = None,
+    ) -> None:
+        pupil = pupil_from_images(config, pupils)
+        self._config, self._pupils, self._pupil = config, pupils, pupil
+        self._positions = actuator_positions(config)
+        self._pitch = pitch_on_pupil(config)
+        self._coupling = config.devices.dm.coupling
+        self._modes = basis
+        self._modulation = modulation or ModulationPath.circle(pupils.modulation)
+        # A surface changes the path by twice as much.
+        scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
+        self._pokes = self._measured_pokes(scale) if pupils.pokes else None
+        if turbulence is None:
+            turbulence = estimate_strength(self.optics(), pupils, _OUTER_SCALE, self._pokes)
+        self.turbulence = turbulence if turbulence >= _NEGLIGIBLE_STRENGTH else 0.0
+        sigma = self._pitch / np.sqrt(2 * np.log(1 / self._coupling))
+        self._nodes, self._interpolation = surface_nodes(pupil.coordinates_m, sigma)
+        self._response = self._compute_phase_derivatives()
+        self._response *= np.float32(scale)
+        self._executor = ThreadPoolExecutor(1, "pyramid-model")
+        self._variants: list[PyramidModel] | None = None
+        self._shifted_models: dict[tuple[float, float], PyramidModel] = {}
+        self._turbulence_scatter: NDArray[np.float64] | None = None
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        return len(self._positions)
+
+    @property
+    def sub_aperture_m(self) -> float:
+        """Size of a pixel of the pupil image in metres."""
+        return self._pupil.sub_aperture_m
+
+    @property
+    def registration_systematic_error(self) -> NDArray[np.float64]:
+        """Errors of the pupil images' place and of the air's own, see :class:`HasSystematicError`."""
+        shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
+        scaling = _SCALING_SYSTEMATIC if self.turbulence or self._pokes else 0.0
+        return np.asarray(np.hypot([shift, shift, 0.0, scaling, scaling], self._turbulence_uncertainty()))
+
+    @property
+    def gain_trend(self) -> float:
+        """Scatter of trends of the slopes' gains, see :class:`HasGainTrend`; a pyramid at rest has none."""
+        return _GAIN_TREND if self.turbulence or self._pokes else 0.0
+
+    @property
+    def slope_weights(self) -> NDArray[np.float64]:
+        """What pixels count, see :class:`HasSlopeWeights`: on a telescope those that are well lit.
+
+        Dirt stops a part of the light within a pixel, and its edges scatter; slopes there answer in
+        ways that random gains take for a scaling. A bench's beam is dim at the rim by design.
+        """
+        lit = self._pupils.flux[self._pupils.valid] >= _MIN_RELATIVE_FLUX
+        if not self._config.telescope.obscuration or 2 * lit.sum() < lit.size:
+            lit = np.ones_like(lit)
+        return np.tile(np.where(lit, 1.0, _MIN_SLOPE_WEIGHT), 2)
+
+    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+        """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
+        x = self._pupil.coordinates_m
+        surfaces = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
+        return surfaces, self._pupil.lit, self._pupil.pixel_m
+
+    def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
+        """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`; single precision."""
+        if registration.anamorphosis_angle:
+            # A slanted Gaussian has no factors along x and y.
+            at = self._nodes
+            surfaces = self._influence(width).surfaces(registration, self.sub_aperture_m, at, at)
+            return self._slopes(np.moveaxis(surfaces, 0, 2))
+        factors = self._factors(registration, width)
+        return self._slopes(np.einsum("ya,xa->yxa", factors.along_y[0], factors.along_x[0]))
+
+    def modal_matrix(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> NDArray[np.float64]:
+        """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
+        return self._slopes(mode_surfaces(self._factors(registration, width), m2c))
+
+    def modal_jacobian(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Modal matrix and its derivatives, see :class:`DifferentiableModel`."""
+        surfaces = mode_derivatives(self._factors(registration, width), m2c)
+        parts = self._slopes(surfaces.reshape(*surfaces.shape[:2], -1))
+        parts = parts.reshape(-1, 1 + N_DERIVATIVES, m2c.shape[1]).transpose(1, 0, 2)
+        return parts[0], parts[1:]
+
+    def zonal_jacobian(
+        self, registration: Registration, width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Zonal matrix and its derivatives, see :class:`DifferentiableModel`."""
+        factors = self._factors(registration, width)
+        x, y = factors.along_x, factors.along_y
+        pairs = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
+        parts = [self._slopes(np.einsum("ya,xa->yxa", y[j], x[i])) for i, j in pairs]
+        # By the place along x and y, and by the logarithm of the width along either.
+        derivatives = np.concatenate(
+            [factors.position, np.repeat(factors.log_width[:, :, None], self.n_act, 2)], axis=1
+        )
+        return parts[0], np.einsum("pka,ksa->psa", derivatives, np.stack(parts[1:]), optimize=True)
+
+    def with_pupil_shift(self, shift_x: float, shift_y: float) -> PyramidModel:
+        """The same air and the same mirror behind shifted images, see :class:`HasPupilShift`."""
+        position = shift_x, shift_y
+        if position not in self._shifted_models:
+            derivatives = np.array(position) / 100 * self._pupils.diameter_px / self._pupil.n_sub
+            pupils = replace(self._pupils, centres_px=self._pupils.centres_px + derivatives)
+            self._shifted_models[position] = self._variant_with(self._modulation, self.turbulence, pupils)
+        return self._shifted_models[position]
+
+    def variants(self) -> list[PyramidModel]:
+        """The sensor under stronger turbulence, with an oval modulation, and with misplaced images."""
+        if self._variants is None:
+            radius = self._pupils.modulation
+            self._variants = []
+            if self.turbulence:
+                stronger = self.turbulence * (1 + _STRENGTH_UNCERTAINTY)
+                self._variants.append(self._variant_with(self._modulation, stronger))
+            for angle in (0.0, np.pi / 4) if radius else ():
+                elliptic = ModulationPath.circle(radius, ellipse=_ELLIPSE, ellipse_angle=angle)
+                self._variants.append(self._variant_with(elliptic, self.turbulence))
+            for axis in range(2):
+                centres = self._pupils.centres_px.copy()
+                centres[:, axis] += _IMAGE_POSITION_ERROR_PX * _DIAGONALS
+                apart = replace(self._pupils, centres_px=centres)
+                self._variants.append(self._variant_with(self._modulation, self.turbulence, apart))
+        return list(self._variants)
+
+    # ------------------------------------------------------------------ construction
+    def _variant_with(
+        self, modulation: ModulationPath, turbulence: float, pupils: PyramidPupils | None = None
+    ) -> PyramidModel:
+        return PyramidModel(
+            self._config, pupils or self._pupils, modulation=modulation, turbulence=turbulence,
+            basis=self._modes,
+        )  # fmt: skip
+
+    def _turbulence_uncertainty(self) -> NDArray[np.float64]:
+        """What the states of the air and of the mirror that were seen leave of :func:`turbulence_registration_scatter`."""
+        if not self._pupils.n_effective or not (self.turbulence or self._pokes):
+            return np.zeros(5)
+        if self._turbulence_scatter is None:
+            x, optics = self._pupil.coordinates_m, self.optics()
+            screens = unit_screens(x.size, _OUTER_SCALE) * self.turbulence ** (5 / 6)
+            phases = np.repeat(screens[:, None], _N_SHAPES, axis=1)
+            if self._pokes:
+                phases += self._pokes.phases(screens.shape[0] * _N_SHAPES).reshape(phases.shape)
+            paths = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
+            paths *= 2 * self._config.devices.dm.stroke_m
+            self._turbulence_scatter = turbulence_registration_scatter(
+                optics, self._pupils, phases, self._draw_commands(len(screens)), paths,
+                lambda m2c: self.modal_jacobian(Registration(), m2c),
+            )  # fmt: skip
+        return np.asarray(self._turbulence_scatter / np.sqrt(self._pupils.n_effective))
+
+    def _basis(self) -> NDArray[np.float64]:
+        """The modes of a calibration ``(n_act, n_modes)``."""
+        if self._modes is None:
+            self._modes = build_basis(
+                self._config, *self.influence_functions(), self._config.devices.dm.limits.disabled
+            )
+        return self._modes
+
+    def _measured_pokes(self, scale: float) -> RandomPokes:
+        """The pokes that were measured; ``scale`` is the phase of a surface of full stroke in radians."""
+        m2c = self._basis()
+        surfaces, lit, _ = self.influence_functions()
+        # Random pokes are uniform: an rms of so much less than their largest.
+        max_amplitude = self._config.calibration.poke_command / np.abs(m2c).max(axis=0) / np.sqrt(3)
+        return RandomPokes.from_rms(
+            self._pupils.pokes, max_amplitude, scale * np.tensordot(m2c.T, surfaces, 1), lit
+        )
+
+    def _draw_commands(self, count: int) -> NDArray[np.float64]:
+        """Commands ``(count, n_act, k)`` of all modes of a basis at once, as a calibration's pokes are."""
+        m2c = self._basis()
+        return m2c @ np.random.default_rng(2).standard_normal((count, m2c.shape[1], _N_SHAPES))
+
+    def _compute_phase_derivatives(self) -> NDArray[np.float32]:
+        """The slopes' derivatives by the phase at the nodes ``(n_slopes, m * m)``."""
+        pupils, pupil = self._pupils, self._pupil
+        n, samples = len(pupil.coordinates_m), pupil.n_pix
+        shape = self._config.devices.wfs.region[:1:-1]
+        grid = next_fast_length(max(shape), samples)
+        window = GridRegion(pupils.centres_px, shape, grid, samples)
+        structure = None
+        if self.turbulence or self._pokes:
+            apart = sample_distances(n, pupil.pixel_m) / self._config.system.pupil_m
+            structure = np.zeros_like(apart)
+            if self.turbulence:
+                structure += structure_function(apart, 1 / self.turbulence, _OUTER_SCALE)
+        return slope_response(
+            pupil.amplitude, Prism(window.shifts(n), pupil.n_sub * samples), grid * samples,
+            pupils.corners_px - window.first, pupils.valid, self._modulation, structure,
+            nonuniform=None if self._pokes is None else self._pokes.nonuniform(),
+            interpolation=self._interpolation, samples=samples, local=pupils.normalisation == "local",
+        ).phase_derivatives  # fmt: skip
+
+    def optics(self) -> PyramidOptics:
+        """The sensor of the design, with the images where they were found."""
+        return PyramidOptics(
+            self._pupil.amplitude, float(self._pupil.n_sub), self._config.system.wavelength_m,
+            self._pupils.centres_px, self._config.devices.wfs.region[:1:-1], self._modulation,
+            samples=self._pupil.n_pix,
+        )  # fmt: skip
+
+    # ------------------------------------------------------------------ mirror
+    def _slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Slopes ``(n_slopes, k)`` of surfaces ``(m, m, k)`` on the nodes, in fractions of full stroke."""
+        # Few modes cost what it takes to read the response: two threads read one half each.
+        surface_matrix = surfaces.reshape(-1, surfaces.shape[2]).astype(np.float32, copy=False)
+        middle = len(self._response) // 2
+        lower_half = self._executor.submit(np.matmul, self._response[middle:], surface_matrix)
+        return np.concatenate([self._response[:middle] @ surface_matrix, lower_half.result()]).astype(
+            np.float64
+        )
+
+    def _factors(self, registration: Registration, width: float) -> GaussianFactors:
+        return gaussian_factors(
+            self._influence(width), registration, self.sub_aperture_m, self._nodes, self._nodes
+        )
+
+    def _influence(self, width: float) -> InfluenceFunctions:
+        return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)

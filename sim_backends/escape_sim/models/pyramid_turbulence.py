@@ -1,0 +1,281 @@
+"""Turbulence and random pokes in front of a pyramid during a calibration: their statistics, the turbulence strength estimated from the motion of the slopes, and the registration scatter that a finite number of turbulence states leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.pipeline.slopes.pyramid import slopes_of_image
+from escape_sim.models.pyramid_response import NonuniformPhase
+from escape_sim.optics.pyramid import PyramidOptics
+
+#: Strengths tried, as pupil diameters over r0; beyond the last the slopes tell them apart no more.
+_TRIAL_STRENGTHS = 2.0 ** np.arange(-1, 5, 0.5)
+#: What the slopes' rms, relatively, and the share that lasts may be off by in a run of seconds.
+_RMS_ERROR, _PERSISTENCE_ERROR = 0.05, 0.05
+#: Pairs of phase screens tried with each.
+_N_PAIRS = 6
+#: Side of the screens in pupils: the outer scale must fit in.
+_SCREEN_PUPILS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RandomPokes:
+    """Random pokes of many modes at once, new in every frame.
+
+    Parameters
+    ----------
+    modes_rad
+        Phase of every mode's usual poke ``(n_modes, n, n)`` in radians.
+    lit
+        Samples of the pupil that carry light ``(n, n)``.
+    """
+
+    modes_rad: NDArray[np.float64]
+    lit: NDArray[np.bool_]
+
+    @classmethod
+    def from_rms(
+        cls,
+        rms: float,
+        max_amplitude: NDArray[np.float64],
+        modes_rad: NDArray[np.float64],
+        lit: NDArray[np.bool_],
+    ) -> RandomPokes:
+        """Pokes of a given rms over all modes, each as strong as the others unless its actuators forbid.
+
+        Parameters
+        ----------
+        rms
+            Root of the sum of the modes' squared amplitudes.
+        most
+            Largest amplitude of every mode ``(n_modes,)``.
+        modes_rad
+            Phase ``(n_modes, n, n)`` of every mode at unit amplitude, in radians.
+        lit
+            As above.
+        """
+        lower, upper = 0.0, float(max_amplitude.max())
+        for _ in range(40):
+            level = (lower + upper) / 2
+            below = np.square(np.minimum(level, max_amplitude)).sum() < rms**2
+            lower, upper = (level, upper) if below else (lower, level)
+        amplitude = np.minimum(upper, max_amplitude)
+        amplitude *= rms / np.sqrt(np.square(amplitude).sum())
+        return cls(amplitude[:, None, None] * modes_rad, lit)
+
+    @property
+    def rms_rad(self) -> float:
+        """Rms phase over the pupil in radians, without piston."""
+        return float(np.sqrt(self.modes_rad[:, self.lit].var(axis=1).sum()))
+
+    def structure(self) -> NDArray[np.float64]:
+        """Structure function in square radians ``(2 n - 1, 2 n - 1)``, by the separation of two samples.
+
+        The mean over all pairs of lit samples so far apart; 0 where the pupil has none.
+        """
+        n = self.lit.shape[0]
+        size = (2 * n, 2 * n)
+        lit = np.fft.rfft2(self.lit.astype(float), size)
+        squares = np.fft.rfft2(np.square(self.modes_rad).sum(axis=0) * self.lit, size)
+        pair = sum(np.square(np.abs(np.fft.rfft2(mode * self.lit, size))) for mode in self.modes_rad)
+        total = np.fft.irfft2(2 * (np.conj(squares) * lit).real - 2 * pair, size)
+        pairs = np.fft.irfft2(np.square(np.abs(lit)), size)
+        mean = np.where(pairs > 0.5, np.maximum(total, 0) / np.maximum(pairs, 1), 0.0)
+        steps = np.arange(1 - n, n)
+        return np.asarray(mean[np.ix_(steps, steps)])
+
+    def nonuniform(self) -> NonuniformPhase:
+        """What a mean response needs of them: how they move in the mean, and where more.
+
+        Modes of high order live at the rim of a mirror, so pokes move the rim more than the middle. How
+        much a place moves is told by the mean square slope of the phase there.
+        """
+        squares = np.sum([np.square(np.gradient(mode)).sum(axis=0) for mode in self.modes_rad], axis=0)
+        return NonuniformPhase(self.structure(), np.where(self.lit, squares / squares[self.lit].mean(), 1.0))
+
+    def phases(self, count: int) -> NDArray[np.float64]:
+        """Random phases ``(count, n, n)`` in radians; always the same."""
+        draws = np.random.default_rng(1).standard_normal((count, len(self.modes_rad)))
+        return np.asarray(np.tensordot(draws, self.modes_rad, 1))
+
+
+def sample_distances(n: int, pixel_m: float) -> NDArray[np.float64]:
+    """Distances in metres of all pairs of samples ``(2 n - 1, 2 n - 1)``, by their separation."""
+    steps = np.arange(1 - n, n) * pixel_m
+    return np.asarray(np.hypot(steps[:, None], steps))
+
+
+def estimate_strength(
+    optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float, pokes: RandomPokes | None = None
+) -> float:
+    """Pupil diameters over r0 at the sensor's wavelength, from how the slopes moved.
+
+    There is no formula: frames under a few random phases of each strength are made and their slopes
+    compared; always the same phases, so that equal motions give equal strengths.
+
+    The slopes of a pyramid saturate: their rms rises with the turbulence at first, and falls again beyond
+    some ten r0 across the pupil. Beside random pokes, which are new in every frame, the share of the slopes'
+    variance that lasts rises where the rms hardly changes, and the rms falls where the share hardly
+    rises; both together tell the strength. Without pokes the rising rms does, up to where it turns.
+
+    Parameters
+    ----------
+    optics
+        The nominal sensor.
+    pupils
+        Geometry, with the motion measured.
+    outer_scale
+        Outer scale of the turbulence in pupil diameters.
+    pokes
+        What the mirror did meanwhile; ``None`` if it was still.
+
+    Returns
+    -------
+    float
+        Between 0 (no motion, or none that lasts) and the strongest that was tried.
+    """
+    if not pupils.motion:
+        return 0.0
+    screens = unit_screens(optics.amplitude.shape[0], outer_scale)
+    if pokes is None:
+        return _strength_from_rms(optics, pupils, screens)
+    return _strength_with_pokes(optics, pupils, screens, pokes) if pupils.persistent_fraction else 0.0
+
+
+def _strength_from_rms(optics: PyramidOptics, pupils: PyramidPupils, screens: NDArray[np.float64]) -> float:
+    """Strength by the slopes' rms, while it rises."""
+    values: list[float] = []
+    for ratio in _TRIAL_STRENGTHS:
+        values.append(float(np.sqrt(np.square(_slopes(optics, pupils, screens * ratio ** (5 / 6))).mean())))
+        if len(values) > 1 and values[-1] <= values[-2]:
+            values.pop()
+            break
+        if values[-1] > pupils.motion:
+            break
+    if pupils.motion <= values[0]:
+        # Weak turbulence moves slopes in proportion to the phase.
+        return float(_TRIAL_STRENGTHS[0] * (pupils.motion / values[0]) ** (6 / 5))
+    return float(2 ** np.interp(pupils.motion, values, np.log2(_TRIAL_STRENGTHS[: len(values)])))
+
+
+def _strength_with_pokes(
+    optics: PyramidOptics, pupils: PyramidPupils, screens: NDArray[np.float64], pokes: RandomPokes
+) -> float:
+    """Strength by the slopes' rms and by the share of their variance that lasts, beside pokes."""
+    halves = np.split(pokes.phases(2 * len(screens)), 2)
+    rms, persistence = [], []
+    for ratio in (0.0, *_TRIAL_STRENGTHS):
+        first, second = (_slopes(optics, pupils, screens * ratio ** (5 / 6) + half) for half in halves)
+        squares = np.mean(np.square([first, second]), axis=(1, 2))
+        rms.append(float(np.sqrt(squares.mean())))
+        persistence.append(float(np.mean(first * second) / np.sqrt(squares.prod())))
+    # Few pokes seem to last by chance; how much, those without turbulence tell.
+    persistence = [share - persistence[0] * (1 - share) for share in persistence]
+    if pupils.persistent_fraction <= persistence[1]:
+        # A share of the variance goes by the squares.
+        return float(_TRIAL_STRENGTHS[0] * (pupils.persistent_fraction / persistence[1]) ** (3 / 5))
+    rms, persistence = rms[1:], persistence[1:]
+    at = np.linspace(np.log2(_TRIAL_STRENGTHS[0]), np.log2(_TRIAL_STRENGTHS[-1]), 200)
+    by_rms, by_share = (
+        np.interp(at, np.log2(_TRIAL_STRENGTHS), values) for values in (np.log(rms), persistence)
+    )
+    chi_squared = np.square((by_rms - np.log(pupils.motion)) / _RMS_ERROR)
+    chi_squared += np.square((by_share - pupils.persistent_fraction) / _PERSISTENCE_ERROR)
+    return float(2 ** at[np.argmin(chi_squared)])
+
+
+def _slopes(optics: PyramidOptics, pupils: PyramidPupils, phases: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Slopes ``(count, n_slopes)`` about their mean under random phases ``(count, n, n)`` in radians."""
+    paths = (phases * (optics.wavelength_m / (2 * np.pi))).astype(np.float32)
+    slopes = np.array([slopes_of_image(optics.frame(path), pupils) for path in paths])
+    return np.asarray((slopes - slopes.mean(axis=0)) * np.sqrt(len(slopes) / (len(slopes) - 1)))
+
+
+def unit_screens(n: int, outer_scale: float) -> NDArray[np.float64]:
+    """Von Kármán phases ``(2 * _N_PAIRS, n, n)`` in radians with a pupil of one r0."""
+    size = _SCREEN_PUPILS * n
+    f = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.fftfreq(size))) * n
+    # 0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6), in pupil diameters.
+    amplitude = np.sqrt(0.0229) * (f**2 + outer_scale**-2) ** (-11 / 12) / _SCREEN_PUPILS
+    rng = np.random.default_rng(0)
+    screens = []
+    for _ in range(_N_PAIRS):
+        noise = rng.standard_normal((size, size)) + 1j * rng.standard_normal((size, size))
+        pair = np.fft.fft2(noise * amplitude)[:n, :n]
+        screens += [pair.real, pair.imag]
+    return np.stack(screens)
+
+
+#: Rms path of a shape in waves: small enough for differences to be derivatives.
+_STEP_WAVES = 0.01
+#: Share of the whole scatter that the air's is taken for at least: few states tell a covariance badly.
+_MIN_SHARE = 0.1
+
+Jacobian = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+def turbulence_registration_scatter(
+    optics: PyramidOptics,
+    pupils: PyramidPupils,
+    phases: NDArray[np.float64],
+    shapes: NDArray[np.float64],
+    influence_m: NDArray[np.float64],
+    jacobian: Jacobian,
+) -> NDArray[np.float64]:
+    """Standard deviation over states of the air of the registration that fits best ``(5,)``.
+
+    A pyramid answers differently under every wavefront: where this is steep a pixel is saturated, and
+    what it still sees lies a little aside. A model knows the mean only. Its registration therefore
+    errs by this much over the root of the number of states that a measurement averaged, however little
+    noise there was. Told by frames: differences of two with the mirror's shape up and down. Pokes are
+    new in every frame and average out as noise does, which the fit's own errors count. So each state is
+    fitted twice, under the pokes of every other shape, and what the two have in common is the air's.
+
+    Parameters
+    ----------
+    optics
+        The nominal sensor.
+    pupils
+        Its geometry.
+    phases
+        Random states ``(count, k, n, n)`` in radians: turbulence, with other pokes for every shape.
+    shapes
+        Commands ``(count, n_act, k)`` whose response is looked at under each state, of all modes of a
+        calibration: fine shapes tell the registration better than coarse ones.
+    influence_m
+        Optical path per unit command of each actuator ``(n_act, n, n)`` in metres.
+    jacobian
+        The model's matrix for shapes ``(n_act, k)``, and its derivatives by registration and width.
+    """
+    fits = []
+    for states, commands in zip(phases * (optics.wavelength_m / (2 * np.pi)), shapes, strict=True):
+        paths = np.tensordot(commands.T, influence_m, 1)
+        half_step_m = _STEP_WAVES * optics.wavelength_m / float(paths.std())
+        slopes = [
+            slopes_of_image(optics.frame((state + half_step_m * path).astype(np.float32)), pupils)
+            - slopes_of_image(optics.frame((state - half_step_m * path).astype(np.float32)), pupils)
+            for state, path in zip(states, paths, strict=True)
+        ]
+        unit, derivatives = jacobian(commands)
+        terms, measured = np.concatenate([unit[None], derivatives[:5]]), np.stack(slopes, axis=1)
+        fits.append([_fit_registration(terms[:, :, half::2], measured[:, half::2]) for half in range(2)])
+    deviations = np.array(fits) - np.mean(fits, axis=0)
+    freedom = len(deviations) - 1
+    common_variance = np.prod(deviations, axis=1).sum(axis=0) / freedom
+    total_variance = np.square(deviations.mean(axis=1)).sum(axis=0) / freedom
+    # Air and pupil have no preferred direction, and few states tell a variance badly.
+    for variance in (common_variance, total_variance):
+        variance[:2] = variance[:2].mean()
+    return np.asarray(np.sqrt(np.maximum(common_variance, _MIN_SHARE * total_variance)))
+
+
+def _fit_registration(terms: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Registration ``(5,)`` by matrix and derivatives ``(6, n_slopes, k)`` from slopes ``(n_slopes, k)``."""
+    design = terms.reshape(6, -1)
+    gain, *shifts = np.linalg.lstsq(design @ design.T, design @ slopes.ravel())[0]
+    return np.asarray(np.array(shifts) / gain)

@@ -1,0 +1,553 @@
+"""Fast analytic model of a Shack-Hartmann system: derivatives of the slopes by the optical path, averaged over spot motion and turbulence, applied to mirror surfaces. Holds the factory of the model `fast`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy.typing import DTypeLike, NDArray
+from scipy.special import ndtri
+
+from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.api.registration import Registration
+from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, require_kind
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.config.sensor import ShackHartmannSection
+from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
+from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, gaussian_factors, mode_surfaces
+from escape_sim.optics.pupil import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
+
+if TYPE_CHECKING:
+    from escape_hw.config.system import SystemConfig
+
+
+#: Steps (rows down, columns right) from a window to the lenslets whose light it sees.
+NEIGHBOURS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
+#: Shapes of the wavefront within a lenslet that turbulence is made of there; the rest is a thousandth.
+_N_SHAPES = 14
+#: Variance of a spot's motion along an axis for a lenslet as wide as r0, in (lambda / d)^2 (Fried 1975).
+_TILT_VARIANCE = 0.17
+#: Outer scale of the turbulence in pupil diameters.
+_OUTER_SCALE = 4.0
+#: Nodes of the average over spot motion, and the step of their lattice: neighbouring Fibonacci numbers.
+_N_NODES, _LATTICE_STEP = 34, 21
+#: Share of a full turn from one window's lattice to the next one's: the golden one, no multiple repeats.
+_GOLDEN_TURN = (np.sqrt(5) - 1) / 2
+#: Ways to see a wavefront: quarter turns, mirrored or not.
+_N_ORIENTATIONS = 8
+
+
+def slope_weights(
+    config: SystemConfig, grid: SubApertureGrid, pupil: PupilGeometry
+) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Mean derivative of each slope by the optical path on its lenslet and on the eight around it.
+
+    With ``E(u) = sum_p A_p exp(i phi_p) F(u, p)``, the light of all lenslets added as intensity and
+    ``s = sum u I / sum I`` over the window,
+    ``ds/dphi_p = -2 A_p Im sum_u (u - s) conj(E(u)) F(u, p) / sum I``.
+    Pixels below the threshold drop out of both sums, and the threshold is subtracted from those
+    above. Which pixels these are changes as the spot moves, so the derivative is averaged over a
+    Gaussian motion of the spots of ``grid.motion_px`` rms along each axis; without the average the
+    response would depend on how each lenslet happens to fall on the pixels. And it is averaged over what
+    turbulence there is within a lenslet (:func:`lenslet_turbulence`), which lifts the wings of the spots
+    above the threshold: without it more of them would seem cut off, and scalings come out too small.
+
+    Parameters
+    ----------
+    config
+        Design of sensor, camera and beam.
+    grid
+        The grid found on the camera.
+    pupil
+        The sampled pupil.
+
+    Returns
+    -------
+    dict
+        For each step in :data:`NEIGHBOURS`: ``(2, n_valid, p, p)`` in pixels per metre, x then y.
+    """
+    window_images = _WindowImages(config, grid, pupil)
+    shifts = grid.motion_px * gaussian_lattice() if grid.motion_px else np.zeros((1, 2))
+    blur = np.zeros((len(shifts), pupil.n_pix, pupil.n_pix))
+    if grid.motion_px and grid.turbulence_px:
+        blur = np.sqrt(_turbulence_strength(config, grid)) * lenslet_turbulence(pupil.n_pix)
+    out = {step: np.zeros((2, grid.n_valid, pupil.n_pix, pupil.n_pix)) for step in NEIGHBOURS}
+    for shift, phase in zip(shifts, blur, strict=True):
+        window_images.accumulate(out, shift, phase, 1 / len(shifts))
+    wave = 2 * np.pi / config.system.wavelength_m
+    return {step: block * wave for step, block in out.items()}
+
+
+def gaussian_lattice() -> NDArray[np.float64]:
+    """Places ``(n, 2)`` of equal weight whose mean stands for that over a round Gaussian of unit rms.
+
+    What pixels and threshold do to a slope repeats from pixel to pixel, and a grid of few nodes that lie
+    more than half a pixel apart takes the repetition for a constant: with five Gauss-Hermite nodes per
+    axis the response kept a pattern of 4 %, and slopes seemed to sample the wavefront up to 2.5 % of a
+    sub-aperture off. On a Fibonacci lattice (Sloan & Joe 1994), mapped to the Gaussian axis by axis, no
+    two nodes share a coordinate; it is shifted so that every node has its mirror image.
+    """
+    i = np.arange(_N_NODES)
+    paired = (i * _LATTICE_STEP + (_LATTICE_STEP - 1) // 2) % _N_NODES
+    places = ndtri((np.stack([i, paired], axis=1) + 0.5) / _N_NODES)
+    return np.asarray(places / places.std(axis=0))
+
+
+def lenslet_turbulence(samples: int) -> NDArray[np.float64]:
+    """Wavefronts within a square lenslet as wide as r0, without piston and tilt, in radians.
+
+    Kolmogorov turbulence of structure function ``6.88 (r / r0)^(5/3)``, one wavefront for each place of
+    :func:`gaussian_lattice`: its shapes are independent of one another and of the places, and opposite places
+    have wavefronts turned by half a turn, so that on the whole no side of the lenslet is preferred.
+
+    Parameters
+    ----------
+    samples
+        Across the lenslet.
+
+    Returns
+    -------
+    ndarray, ``(n_places, samples, samples)``
+    """
+    u = (np.arange(samples) - (samples - 1) / 2) / samples
+    x, y = (at.ravel() for at in np.meshgrid(u, u))
+    apart = np.hypot(x[:, None] - x, y[:, None] - y)
+    tilts = np.linalg.qr(np.stack([np.ones_like(x), x, y], axis=1))[0]
+    without_tilt = np.eye(x.size) - tilts @ tilts.T
+    power, shapes = np.linalg.eigh(without_tilt @ (-0.5 * 6.88 * apart ** (5 / 3)) @ without_tilt)
+    half = gaussian_lattice()[: _N_NODES // 2]
+    coefficients = np.random.default_rng(5).standard_normal((len(half), _N_SHAPES))
+    coefficients = np.linalg.qr(np.concatenate([half, coefficients], axis=1))[0][:, 2:] * np.sqrt(len(half))
+    wavefronts = (coefficients * np.sqrt(power[-_N_SHAPES:])) @ shapes[:, -_N_SHAPES:].T
+    first = wavefronts.reshape(-1, samples, samples)
+    return np.concatenate([first, first[::-1, ::-1, ::-1]])
+
+
+def _orientations(phase: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A wavefront ``(p, p)`` in all orientations that a square has ``(8, p, p)``; each is as likely."""
+    return np.stack(
+        [
+            np.rot90(above_threshold, turns)
+            for above_threshold in (phase, phase.T)
+            for turns in range(_N_ORIENTATIONS // 2)
+        ]
+    )
+
+
+def _turbulence_strength(config: SystemConfig, grid: SubApertureGrid) -> float:
+    """``(d / r0)^(5/3)`` of the turbulence on a lenslet, from how far the air moves its spot."""
+    sensor = config.sensor_as(ShackHartmannSection)
+    large = 1 - (1 / (_OUTER_SCALE * sensor.n_sub)) ** (1 / 3)
+    return float((grid.turbulence_px / sensor.spot_px) ** 2 / (_TILT_VARIANCE * large))
+
+
+class _WindowImages:
+    """Images of a window's nine lenslets on the window's pixels, for all windows at once."""
+
+    def __init__(self, config: SystemConfig, grid: SubApertureGrid, pupil: PupilGeometry) -> None:
+        sensor = config.sensor_as(ShackHartmannSection)
+        n, p, spot = pupil.n_sub, pupil.n_pix, sensor.spot_px
+        width, height = config.devices.wfs.region[2:]
+        boxes = subaperture_windows(grid.centres_px(), grid.pitch_px, (height, width)).astype(np.intp)
+        rows, columns = np.nonzero(grid.valid)
+        size = int((boxes[:, 1::2] - boxes[:, ::2]).max())
+        self._rows_at = boxes[:, 0, None] + np.arange(size)
+        self._columns_at = boxes[:, 2, None] + np.arange(size)
+        # All windows of a row begin at the same pixel row, all of a column at the same pixel column.
+        row_at, column_at = np.zeros((2, n, size), np.intp)
+        row_at[rows], column_at[columns] = self._rows_at, self._columns_at
+        in_y, in_x = self._rows_at < boxes[:, 1, None], self._columns_at < boxes[:, 3, None]
+        self._inside = in_y[:, :, None] & in_x[:, None, :]
+        blocks = pupil.amplitude.reshape(n, p, n, p).transpose(0, 2, 1, 3).astype(float)
+        light = np.square(blocks).sum(axis=(2, 3))
+        counts = sensor.threshold * (2**config.devices.wfs.bit_depth - 1)
+        # The threshold in the units of the intensities here, by the light of a bright sub-aperture.
+        self._threshold = (
+            counts / grid.counts * float(np.percentile(light[light > 0], 95)) if grid.counts else 0.0
+        )
+        self._samples = (np.arange(p) - (p - 1) / 2) / p
+        self._spot = spot
+        angle = 2 * np.pi * _GOLDEN_TURN * np.arange(len(rows))
+        #: Directions of the lattice's axes in each window ``(2, n_valid)``, and how it sees the wavefronts.
+        self._axes = np.stack([np.cos(angle), np.sin(angle)])
+        self._orientation = np.arange(len(rows)) % _N_ORIENTATIONS
+        # An average over motion is not worth double precision; a small-signal limit is.
+        self._real = np.dtype(np.float32 if grid.motion_px else np.float64)
+        self._complex = np.dtype(np.complex64 if grid.motion_px else np.complex128)
+        self._blocks, self._along = {}, {}
+        field = field_pixels(p, spot)
+        # The windows stay on the grid as it was found; the lenslets stand where the references,
+        # averaged over the whole run, put the lattice.
+        (y_first, y_pitch), (x_first, x_pitch) = _fit_lattice(grid)
+        for step in NEIGHBOURS:
+            i, j = rows + step[0], columns + step[1]
+            exists = (i >= 0) & (i < n) & (j >= 0) & (j < n)
+            i, j = np.clip(i, 0, n - 1), np.clip(j, 0, n - 1)
+            self._blocks[step] = (blocks[i, j] * exists[:, None, None]).astype(self._real)
+            self._along[step] = tuple(
+                self._transform(first + (np.arange(n) + by) * pitch, at, p, field)[number]
+                for first, pitch, by, at, number in (
+                    (y_first, y_pitch, step[0], row_at, rows),
+                    (x_first, x_pitch, step[1], column_at, columns),
+                )
+            )
+
+    def _transform(
+        self, centre: NDArray[np.floating], at: NDArray[np.intp], p: int, field: int
+    ) -> NDArray[np.complex128]:
+        """Fourier matrices ``(n_valid, p, size)``, zero where the lenslet's image does not reach."""
+        first = first_pixels(centre, field)
+        size = at.shape[1]
+        reach = (at >= first[:, None]) & (at < first[:, None] + field)
+        matrix = lenslet_transform(centre, at[:, 0], p, size, self._spot) * reach[:, None, :]
+        return matrix.astype(self._complex)
+
+    def accumulate(
+        self,
+        out: dict[tuple[int, int], NDArray[np.float64]],
+        shift: NDArray[np.float64],
+        phase: NDArray[np.float64],
+        share: float,
+    ) -> None:
+        """Add ``share`` times the derivatives, spots moved by some pixels ``(2,)`` and blurred by a phase.
+
+        Every window turns the move and mirrors the phase in its own way.
+        """
+        (cosine, sine), (along, across) = self._axes, shift
+        blur = np.exp(1j * _orientations(phase)).astype(self._complex)[self._orientation]
+        tilt = [
+            np.exp(2j * np.pi * d[:, None] * self._samples / self._spot).astype(self._complex).conj()
+            for d in (sine * along + cosine * across, cosine * along - sine * across)
+        ]
+        phasor = tilt[0][:, :, None] * tilt[1][:, None, :] * blur
+        fields = {}
+        image = np.zeros(self._inside.shape, self._real)
+        for step in NEIGHBOURS:
+            fy, fx = self._along[step]
+            amplitude = self._blocks[step] * phasor
+            e = np.matmul(np.matmul(fy.transpose(0, 2, 1), amplitude), fx)
+            image += e.real**2 + e.imag**2
+            fields[step] = (amplitude, e)
+        counted = np.where(self._inside, np.maximum(image - self._threshold, 0.0), 0.0)
+        total = np.maximum(counted.sum(axis=(1, 2)), 1e-30)
+        above_threshold = self._inside & (image > self._threshold)
+        x, y = self._columns_at[:, None, :], self._rows_at[:, :, None]
+        for axis, at in enumerate((x, y)):
+            middle = (counted * at).sum(axis=(1, 2)) / total
+            moment_arm = (
+                (at - middle[:, None, None]) * above_threshold * (share / total)[:, None, None]
+            ).astype(self._real)
+            for step, (amplitude, e) in fields.items():
+                fy, fx = self._along[step]
+                back_propagated = np.matmul(np.matmul(fy, moment_arm * e.conj()), fx.transpose(0, 2, 1))
+                out[step][axis] += -2 * np.imag(amplitude * back_propagated)
+
+
+def _fit_lattice(grid: SubApertureGrid) -> tuple[tuple[float, float], tuple[float, float]]:
+    """First centre and pitch of the lenslets along rows and along columns, references included."""
+    rows, columns = np.nonzero(grid.valid)
+    out = []
+    for axis, number in ((1, rows), (0, columns)):
+        pitch, first = np.polyfit(number, grid.references_px[:, axis].astype(float), 1)
+        out.append((grid.origin_px[axis] + float(first), grid.pitch_px + float(pitch)))
+    return out[0], out[1]
+
+
+#: Nodes across a lenslet that carry a surface as smooth as an influence function: with 6, what is
+#: lost of a Gaussian two lenslets wide is 1e-8 of its slope.
+NODES = 6
+#: Lenslets whose light a window sees, per axis.
+_LENSLETS_ACROSS = 3
+
+
+class SlopeOperator:
+    """Slopes of surfaces given on a few nodes per lenslet.
+
+    A window sees its own lenslet and the eight around it, so each slope is a weighted sum over
+    ``3 x 3`` lenslets of ``NODES x NODES`` nodes.
+
+    Parameters
+    ----------
+    weights
+        ``(2, n_valid, p, p)`` for each step (rows down, columns right) to a lenslet around: slopes
+        per unit of surface on each pupil sample, x then y.
+    valid
+        Lenslets with a window ``(n_sub, n_sub)``.
+    sub_aperture_m
+        Size of a sub-aperture in metres.
+    """
+
+    def __init__(
+        self,
+        weights: dict[tuple[int, int], NDArray[np.float64]],
+        valid: NDArray[np.bool_],
+        sub_aperture_m: float,
+    ) -> None:
+        rows, columns = np.nonzero(valid)
+        n_sub = len(valid)
+        p = next(iter(weights.values())).shape[-1]
+        nodes, interpolation = _lenslet_nodes(p)
+        k = nodes.size
+        table = np.zeros((rows.size, 2, _LENSLETS_ACROSS, k, _LENSLETS_ACROSS, k))
+        for (down, right), block in weights.items():
+            table[:, :, down + 1, :, right + 1, :] = (interpolation.T @ block @ interpolation).transpose(
+                1, 0, 2, 3
+            )
+        self._table = table.reshape(rows.size, 2, _LENSLETS_ACROSS * k, _LENSLETS_ACROSS * k)
+        # Lenslets beyond the edge exist on the grid of nodes, with weights of zero.
+        lattice = np.arange(-1, n_sub + 1) - (n_sub - 1) / 2
+        self.nodes_m = ((lattice[:, None] + nodes) * sub_aperture_m).ravel()
+        self._first_y, self._first_x = (rows * k).astype(np.int64), (columns * k).astype(np.int64)
+        self._tables_by_dtype: dict[str, NDArray[np.floating]] = {}
+
+    @property
+    def n_slopes(self) -> int:
+        """Number of slopes, all x and then all y."""
+        return 2 * len(self._table)
+
+    def slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Slopes ``(n_slopes, n)`` of surfaces ``(n_nodes, n_nodes, n)`` on the nodes.
+
+        Every node is weighted once per window, so this is the way for a few surfaces.
+        """
+        out = np.zeros((2, len(self._table), surfaces.shape[2]), surfaces.dtype)
+        _apply_to_surfaces(self._weights(surfaces.dtype), self._first_y, self._first_x, surfaces, out)
+        return out.reshape(self.n_slopes, -1)
+
+    def zonal(self, factors: GaussianFactors, *, derivatives: bool = False) -> NDArray[np.floating]:
+        """Slopes of all influence functions, made from their factors without forming surfaces.
+
+        Returns
+        -------
+        ndarray, ``(n, n_slopes, n_act)``
+            ``n`` is 1, or 5 with derivatives: the slopes, then their derivatives by the place along x
+            and y and by the logarithm of the width along x and y.
+        """
+        x, y = factors.along_x, factors.along_y
+        kinds = 3 if derivatives else 1
+        side = np.ascontiguousarray(x[:kinds].transpose(1, 0, 2)).reshape(x.shape[1], -1)
+        out = np.zeros((5 if derivatives else 1, 2, len(self._table), x.shape[2]), x.dtype)
+        _apply_to_factors(self._weights(x.dtype), self._first_y, self._first_x, side, y, out)
+        return out.reshape(len(out), self.n_slopes, -1)
+
+    def _weights(self, dtype: DTypeLike) -> NDArray[np.floating]:
+        kind = np.dtype(dtype).str
+        if kind not in self._tables_by_dtype:
+            self._tables_by_dtype[kind] = np.ascontiguousarray(self._table, dtype=np.dtype(kind))
+        return self._tables_by_dtype[kind]
+
+
+def _lenslet_nodes(p: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Nodes within a lenslet ``(k,)`` of unit size, and the map ``(p, k)`` from them to the samples."""
+    samples = (np.arange(p) - (p - 1) / 2) / p
+    if p <= NODES:
+        return samples, np.eye(p)
+    nodes = np.polynomial.legendre.leggauss(NODES)[0] / 2
+    interpolation = np.ones((p, NODES))
+    for j in range(NODES):
+        for i in range(NODES):
+            if i != j:
+                interpolation[:, j] *= (samples - nodes[i]) / (nodes[j] - nodes[i])
+    return nodes, interpolation
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _apply_to_surfaces(table, first_y, first_x, surfaces, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Weighted sums of surfaces ``(n_y, n_x, n)`` into ``out (2, n_valid, n)``."""
+    size, n = table.shape[2], surfaces.shape[2]
+    for s in range(table.shape[0]):
+        for q in range(size):
+            row = surfaces[first_y[s] + q]
+            for r in range(size):
+                along_x, along_y = table[s, 0, q, r], table[s, 1, q, r]
+                at = row[first_x[s] + r]
+                for m in range(n):
+                    out[0, s, m] += along_x * at[m]
+                    out[1, s, m] += along_y * at[m]
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _apply_to_factors(table, first_y, first_x, side, y, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Sums over both factors; ``side (n_x, kinds * n_act)``, ``y (3, n_y, n_act)``."""
+    size, n_act = table.shape[2], y.shape[2]
+    # Products this small stay on one thread in any linear-algebra library.
+    lines = np.empty((2 * size, side.shape[1]), side.dtype)
+    for s in range(table.shape[0]):
+        np.dot(table[s].reshape(2 * size, size), side[first_x[s] : first_x[s] + size], lines)
+        for axis in range(2):
+            for q in range(size):
+                line, row = lines[axis * size + q], first_y[s] + q
+                for a in range(n_act):
+                    out[0, axis, s, a] += y[0, row, a] * line[a]
+                if out.shape[0] > 1:
+                    for a in range(n_act):
+                        out[1, axis, s, a] += y[0, row, a] * line[n_act + a]
+                        out[2, axis, s, a] += y[1, row, a] * line[a]
+                        out[3, axis, s, a] += y[0, row, a] * line[2 * n_act + a]
+                        out[4, axis, s, a] += y[2, row, a] * line[a]
+
+
+#: Relative doubt about the spots' motion: blur within the lenslets counts as motion too.
+_MOTION_UNCERTAINTY = 0.25
+#: Up to this many modes, their surfaces are quicker made than the slopes of all actuators.
+_MAX_DIRECT_MODES = 12
+
+
+def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticModel:
+    """Entry point ``fast``; without a grid, the nominal one of the design."""
+    if config.sensor.kind == "pyramid":
+        from escape_sim.models.pyramid import PyramidModel, nominal_pupils
+
+        return PyramidModel(
+            config, nominal_pupils(config) if grid is None else require_kind(grid, PyramidPupils)
+        )
+    return ShackHartmannModel(
+        config, nominal_grid(config) if grid is None else require_kind(grid, SubApertureGrid)
+    )
+
+
+def nominal_grid(config: SystemConfig) -> SubApertureGrid:
+    """The design's grid, centred on the camera region, valid where the design beam is bright enough."""
+    pupil = pupil_geometry(config)
+    n, p = pupil.n_sub, pupil.n_pix
+    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
+    flux /= np.percentile(flux[flux > 0], 95)
+    valid = flux >= config.sensor.min_flux
+    pitch = config.sensor_as(ShackHartmannSection).pitch_px
+    width, height = config.devices.wfs.region[2:]
+    origin = ((width - 1) / 2 - pitch * (n - 1) / 2, (height - 1) / 2 - pitch * (n - 1) / 2)
+    references = np.zeros((int(valid.sum()), 2), np.float32)
+    return SubApertureGrid(pitch, origin, valid, references, flux.astype(np.float32), 0.0)
+
+
+class ShackHartmannModel:
+    """Small-signal slopes of a diffractive Shack-Hartmann sensor behind a Gaussian-actuator mirror.
+
+    The centre of gravity of a spot is a smooth function of the phase on its lenslet; its first
+    derivative at a flat wavefront is a fixed weight map per lenslet, so a matrix is one small
+    product per sub-aperture and no frame is ever rendered.
+
+    Parameters
+    ----------
+    config
+        The design: sensor, mirror and beam. Its ``twin`` section is not read.
+    grid
+        The grid found on the camera.
+    """
+
+    name = "fast"
+
+    def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
+        self._pupil = pupil_geometry(config)
+        if grid.valid.shape != (self._pupil.n_sub, self._pupil.n_sub):
+            raise ValueError(
+                f"the grid has {grid.valid.shape} lenslets, "
+                f"the design {self._pupil.n_sub} x {self._pupil.n_sub}"
+            )
+        self._positions = actuator_positions(config)
+        self._pitch = pitch_on_pupil(config)
+        self._coupling = config.devices.dm.coupling
+        self._opd_per_command_m = 2 * config.devices.dm.stroke_m
+        self._config, self._grid = config, grid
+        self._variants: list[ShackHartmannModel] | None = None
+        weights = slope_weights(config, grid, self._pupil)
+        self._slopes = SlopeOperator(weights, grid.valid, self._pupil.sub_aperture_m)
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        return len(self._positions)
+
+    @property
+    def sub_aperture_m(self) -> float:
+        """Size of a sub-aperture on the pupil in metres."""
+        return self._pupil.sub_aperture_m
+
+    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+        """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
+        # Half the sampling is ample for shapes as smooth as these.
+        pupil = PupilGeometry(
+            self._pupil.n_sub, self._pupil.n_pix // 2, self._pupil.sub_aperture_m,
+            self._pupil.coordinates_m.reshape(-1, 2).mean(axis=1), self._pupil.amplitude[::2, ::2],
+        )  # fmt: skip
+        x = pupil.coordinates_m
+        surfaces = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
+        r2 = x[:, None] ** 2 + x[None, :] ** 2
+        radius = self._pupil.n_sub * self._pupil.sub_aperture_m / 2
+        return surfaces, r2 <= radius**2, pupil.pixel_m
+
+    def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
+        """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
+        if registration.anamorphosis_angle:
+            # A slanted Gaussian has no factors along x and y.
+            at = self._slopes.nodes_m
+            surfaces = self._influence(width).surfaces(registration, self.sub_aperture_m, at, at)
+            return np.asarray(
+                self._slopes.slopes(np.moveaxis(surfaces, 0, 2).copy()) * self._opd_per_command_m
+            )
+        factors = self._factors(registration, width, np.float64)
+        return np.asarray(self._slopes.zonal(factors)[0] * self._opd_per_command_m)
+
+    def zonal_jacobian(
+        self, registration: Registration, width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Zonal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
+        factors = self._factors(registration, width, np.float32)
+        parts = self._slopes.zonal(factors, derivatives=True) * np.float32(self._opd_per_command_m)
+        out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
+        for p, ((along_x, along_y), (width_x, width_y)) in enumerate(
+            zip(factors.position, factors.log_width, strict=True)
+        ):
+            out[p] = parts[1] * along_x + parts[2] * along_y
+            if width_x:
+                out[p] += parts[3] * width_x
+            if width_y:
+                out[p] += parts[4] * width_y
+        return parts[0].astype(float), out
+
+    def modal_matrix(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> NDArray[np.float64]:
+        """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
+        factors = self._factors(registration, width, np.float32)
+        if m2c.shape[1] <= _MAX_DIRECT_MODES:
+            return np.asarray(
+                self._slopes.slopes(mode_surfaces(factors, m2c)) * self._opd_per_command_m, dtype=float
+            )
+        return np.asarray(self._slopes.zonal(factors)[0] @ (m2c * self._opd_per_command_m))
+
+    def modal_jacobian(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Modal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
+        factors = self._factors(registration, width, np.float32)
+        parts = self._slopes.zonal(factors, derivatives=True)
+        modes = (m2c * self._opd_per_command_m).astype(np.float32)
+        out = np.zeros((N_DERIVATIVES, parts.shape[1], m2c.shape[1]))
+        for p in range(N_DERIVATIVES):
+            for part, share in zip(parts[1:3], factors.position[p], strict=True):
+                if share.any():
+                    out[p] += part @ (share[:, None] * modes)
+        for part, shares in zip(parts[3:], factors.log_width.T, strict=True):
+            by_width = part @ modes
+            for p in np.flatnonzero(shares).tolist():
+                out[p] += by_width * shares[p]
+        return np.asarray(parts[0] @ modes, dtype=float), out
+
+    def variants(self) -> list[ShackHartmannModel]:
+        """The same sensor with spots that move by a quarter more than the slopes say."""
+        if self._variants is None:
+            grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_UNCERTAINTY))
+            self._variants = [ShackHartmannModel(self._config, grid)] if grid.motion_px else []
+        return list(self._variants)
+
+    def _factors(self, registration: Registration, width: float, dtype: DTypeLike) -> GaussianFactors:
+        at = self._slopes.nodes_m
+        return gaussian_factors(self._influence(width), registration, self.sub_aperture_m, at, at, dtype)
+
+    def _influence(self, width: float) -> InfluenceFunctions:
+        return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)

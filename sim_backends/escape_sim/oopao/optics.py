@@ -1,0 +1,354 @@
+"""OOPAO as the twin's Shack-Hartmann and pyramid optics, and the resampling of its lenslet images to the camera's pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
+from escape_sim.oopao.library import make_lenslets, make_pyramid, make_source, oopao, quiet
+from escape_sim.optics.fourier_filter import next_fast_length
+from escape_sim.optics.modulation import ModulationPath
+from escape_sim.optics.pyramid import GridRegion, Prism
+from escape_sim.optics.shack_hartmann import field_pixels, first_pixels
+
+if TYPE_CHECKING:
+    from escape_hw.api.sensor import SubApertureGrid
+
+
+#: OOPAO's pixels per lambda/d here: critical sampling of an intensity.
+SAMPLING = 2
+
+
+def trigonometric_interpolation(at: NDArray[np.float64], period: int) -> NDArray[np.float64]:
+    """Matrix that reads a band-limited periodic signal between its samples.
+
+    An image of ``period / 2`` pupil samples holds frequencies below ``period / 2`` only, so
+    ``period`` samples determine it everywhere and the reading is exact.
+
+    Parameters
+    ----------
+    at
+        Positions, in samples, any shape.
+    period
+        Number of samples, even.
+
+    Returns
+    -------
+    ndarray, ``(*at.shape, period)``
+    """
+    top = period // 2 - 1
+    phase = 2 * np.pi / period * (at[..., None] - np.arange(period))
+    harmonics = np.arange(1, top + 1)
+    return np.asarray((1 + 2 * np.cos(phase[..., None] * harmonics).sum(axis=-1)) / period)
+
+
+def camera_pixel_matrix(offset_px: NDArray[np.float64], n_pix: int, spot_px: float) -> NDArray[np.float64]:
+    """Matrix from OOPAO's samples of a lenslet's image to camera pixels, along one axis.
+
+    Parameters
+    ----------
+    offset_px
+        Pixels relative to the lenslet's centre, any shape.
+    n_pix
+        Pupil samples across a lenslet.
+    spot_px
+        lambda/d in camera pixels.
+
+    Returns
+    -------
+    ndarray, ``(*offset_px.shape, SAMPLING * n_pix)``
+        Scaled so that a whole field holds the light of the lenslet.
+    """
+    period = SAMPLING * n_pix
+    at = (period - 1) / 2 + offset_px * SAMPLING / spot_px
+    return trigonometric_interpolation(at, period) * SAMPLING / spot_px
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowMoments:
+    """Weights on OOPAO's samples of what each window sees of one lenslet.
+
+    Parameters
+    ----------
+    lenslet
+        Number of that lenslet among the lit ones ``(n_valid,)``; any where the weights are 0.
+    along_x, along_y
+        Weights of the window's sum and of its first moment about its own lenslet's centre,
+        ``(n_valid, samples, 2)``.
+    """
+
+    lenslet: NDArray[np.intp]
+    along_x: NDArray[np.float64]
+    along_y: NDArray[np.float64]
+
+
+def window_moments(
+    grid: SubApertureGrid, lit: NDArray[np.bool_], shape: tuple[int, int], n_pix: int, spot_px: float
+) -> list[WindowMoments]:
+    """Weights of every valid window on its own lenslet and on the eight around it.
+
+    Parameters
+    ----------
+    grid
+        The sub-aperture grid.
+    lit
+        Lenslets that carry light, in whose order OOPAO delivers images ``(n_sub, n_sub)``.
+    shape
+        Camera region (rows, columns).
+    n_pix
+        Pupil samples across a lenslet.
+    spot_px
+        lambda/d in camera pixels.
+    """
+    n_sub = lit.shape[0]
+    number = np.where(lit, np.cumsum(lit).reshape(lit.shape) - 1, -1)
+    rows, columns = np.nonzero(grid.valid)
+    top, end, left, right = subaperture_windows(grid.centres_px(), grid.pitch_px, shape).T
+
+    def along(
+        origin: float,
+        own_index: NDArray[np.intp],
+        low: NDArray[np.int32],
+        high: NDArray[np.int32],
+        offset: int,
+    ) -> NDArray[np.float64]:
+        centres = np.asarray(origin + np.arange(n_sub) * grid.pitch_px, dtype=np.float64)
+        other = np.clip(own_index + offset, 0, n_sub - 1)
+        size = field_pixels(n_pix, spot_px)
+        first = first_pixels(centres, size)[other]
+        pixels = low[:, None] + np.arange(int((high - low).max()))
+        matrix = camera_pixel_matrix(pixels - centres[other, None], n_pix, spot_px)
+        visible = (pixels < high[:, None]) & (pixels >= first[:, None]) & (pixels < first[:, None] + size)
+        matrix[~visible] = 0.0
+        moment_arm = (pixels - centres[own_index, None])[..., None]
+        return np.stack([matrix.sum(axis=1), (moment_arm * matrix).sum(axis=1)], axis=2)
+
+    out = []
+    for down in (-1, 0, 1):
+        for aside in (-1, 0, 1):
+            i, j = rows + down, columns + aside
+            inside = (i >= 0) & (i < n_sub) & (j >= 0) & (j < n_sub)
+            lenslet = np.where(inside, number[np.clip(i, 0, n_sub - 1), np.clip(j, 0, n_sub - 1)], -1)
+            x = along(grid.origin_px[0], columns, left, right, aside)
+            y = along(grid.origin_px[1], rows, top, end, down)
+            x[lenslet < 0] = 0.0
+            out.append(WindowMoments(np.maximum(lenslet, 0), x, y))
+    return out
+
+
+class OOPAOShackHartmann:
+    """The interface of ``ShackHartmannOptics`` with OOPAO doing the propagation.
+
+    OOPAO's detector has a whole number of pixels per lenslet and a pixel scale of lambda/d over a
+    whole number, which is not what the bench's camera has. Each lenslet is therefore computed by
+    OOPAO at two pixels per lambda/d over its full field and then read off at the camera's pixels by
+    trigonometric interpolation, which is exact. What OOPAO does by itself is the pupil, the
+    field and its diffraction by the lenslets.
+
+    Parameters
+    ----------
+    n_sub, n_pix, wavelength_m, pitch_px, spot_px, origin_px, shape, amplitude
+        As for ``ShackHartmannOptics``; ``n_pix`` must be even.
+
+    Raises
+    ------
+    ConfigError
+        OOPAO is not installed.
+    """
+
+    def __init__(
+        self,
+        n_sub: int,
+        n_pix: int,
+        wavelength_m: float,
+        pitch_px: float,
+        spot_px: float,
+        origin_px: tuple[float, float],
+        shape: tuple[int, int],
+        amplitude: NDArray[np.float32],
+    ) -> None:
+        n = n_sub * n_pix
+        if amplitude.shape != (n, n):
+            raise ValueError(
+                f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})"
+            )
+        if n_pix % 2:
+            raise ValueError(f"{n_pix} samples per lenslet; OOPAO centres its spots on an even number only")
+        self.shape = shape
+        self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
+        # Only angles count, so the size of the pupil is free: one metre per lenslet.
+        self._light = make_source(self.amplitude, float(n_sub), wavelength_m)
+        self._sensor = make_lenslets(self._light, n_sub, SAMPLING * n_pix)
+        self._data = self._sensor.sh_data["src_0"]
+        self._lit = np.argwhere(self._data.valid_subapertures)
+
+        field = field_pixels(n_pix, spot_px)
+        self._field = field
+        line = np.arange(n_sub) * pitch_px
+        self._first: list[NDArray[np.intp]] = []
+        self._read: list[NDArray[np.float64]] = []
+        for start, length in zip(origin_px, shape[::-1], strict=True):
+            centres = np.asarray(start + line, dtype=np.float64)
+            first = first_pixels(centres, field)
+            pixels = first[:, None] + np.arange(field) - centres[:, None]
+            self._first.append(first)
+            self._read.append(camera_pixel_matrix(pixels, n_pix, spot_px))
+            self._require_inside(first, length)
+
+    def _require_inside(self, first: NDArray[np.intp], length: int) -> None:
+        axis = self._lit[:, 1] if len(self._first) == 1 else self._lit[:, 0]
+        used = first[axis]
+        if used.min() < 0 or used.max() + self._field > length:
+            raise ValueError(
+                f"lit lenslets fall outside the region of {self.shape[1]} x {self.shape[0]} pixels; "
+                "enlarge the camera region or move the grid's origin"
+            )
+
+    def frame(
+        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """Intensity on the camera.
+
+        Parameters
+        ----------
+        opd_m
+            Optical path difference ``(n, n)`` in metres.
+        image
+            Where to put the result; added to, so clear it first. A new array by default.
+
+        Returns
+        -------
+        ndarray of float32, ``(rows, columns)``
+            Sums (but for light beyond the field of a lenslet) to the sum of ``amplitude ** 2``.
+        """
+        if opd_m.shape != self.amplitude.shape:
+            raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
+        out = np.zeros(self.shape, np.float32) if image is None else image
+        spots = self._spots(opd_m)
+        x0, y0 = self._first
+        read_x, read_y = self._read
+        size = self._field
+        for (i, j), spot in zip(self._lit, spots, strict=True):
+            # OOPAO lays the image of a lenslet down with x along its rows.
+            out[y0[i] : y0[i] + size, x0[j] : x0[j] + size] += read_y[i] @ spot.T @ read_x[j].T
+        return out
+
+    def _spots(self, opd_m: NDArray[np.float32]) -> NDArray[np.float64]:
+        """OOPAO's images of the lit lenslets ``(n_lit, period, period)``."""
+        light = self._light
+        with quiet():
+            # '**' starts a new propagation; '*' alone would add to the last one.
+            light.source**light.telescope * oopao().OPD_map(np.asarray(opd_m, dtype=float)) * self._sensor
+            return np.asarray(self._sensor.maps_intensity) / light.photons_per_unit
+
+
+#: OOPAO's faces, numbered from the lower right on clockwise, in our order.
+_FACES = (2, 3, 1, 0)
+
+
+class OOPAOPyramid:
+    """The interface of ``PyramidOptics`` with OOPAO doing the propagation.
+
+    Parameters
+    ----------
+    amplitude, diameter_px, wavelength_m, centres_px, shape, modulation, rooftop, samples, grid_px
+        As for ``PyramidOptics``. OOPAO's grid holds two pupils side by side, so ``grid_px`` is at
+        least twice the pupil map's side.
+    diameter_m
+        Side of the pupil map in metres, for a mirror of OOPAO's; angles alone do not need it.
+
+    Raises
+    ------
+    ConfigError
+        OOPAO is not installed.
+    ValueError
+        The geometry does not fit together.
+    """
+
+    def __init__(
+        self,
+        amplitude: NDArray[np.float32],
+        diameter_px: float,
+        wavelength_m: float,
+        centres_px: NDArray[np.float64],
+        shape: tuple[int, int],
+        modulation: ModulationPath,
+        *,
+        rooftop: float = 0.0,
+        samples: int = 1,
+        grid_px: int | None = None,
+        diameter_m: float = 1.0,
+    ) -> None:
+        n = amplitude.shape[0]
+        if amplitude.shape != (n, n) or n % (2 * samples):
+            raise ValueError(
+                f"amplitude has shape {amplitude.shape}; it must be square, with a side of "
+                f"a multiple of {2 * samples} samples"
+            )
+        side = n // samples
+        min_grid = max(2 * side, max(shape) if grid_px is None else grid_px)
+        grid = next_fast_length(min_grid, samples) if grid_px is None else min_grid
+        if grid % 2 or (grid_px is not None and grid != grid_px):
+            raise ValueError(f"a grid of {grid_px} pixels; OOPAO needs an even number from {2 * side} on")
+        self.shape = shape
+        self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
+        # OOPAO's unit of tilt is one wave between the centres of the outermost samples.
+        self._unit = (n - 1) / (diameter_px * samples)
+        self._region_on_camera = GridRegion(np.asarray(centres_px, dtype=float), shape, grid, 1)
+        shifts = self._region_on_camera.shifts(side)
+        separation = (grid - 2 * side) // 4 * 2
+        self.light = make_source(self.amplitude, diameter_m, wavelength_m)
+        roof = Prism(shifts, diameter_px, rooftop).roof_height * np.sqrt(2) / samples
+        edge = (grid - 2 * side - separation) // 2
+        self.sensor = make_pyramid(self.light, side, separation, edge, roof)
+        nominal = (side + separation) / 2 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
+        image_offsets = (shifts - (grid - side) / 2 - nominal)[np.argsort(_FACES)]
+        with quiet():
+            self.sensor.apply_shift_wfs(list(image_offsets[:, 0]), list(-image_offsets[:, 1]))
+        self.modulation = modulation
+
+    @property
+    def modulation(self) -> ModulationPath:
+        """Path of the image over the pyramid; may be set between frames."""
+        return self._modulation
+
+    @modulation.setter
+    def modulation(self, modulation: ModulationPath) -> None:
+        self._modulation = modulation
+        tilts = modulation.points * self._unit
+        with quiet():
+            self.sensor.user_modulation_path = tilts.tolist()
+            # It divides by the number of points in the field and once more in the weighted sum.
+            self.sensor.weight_vector = modulation.weights * len(tilts) ** 2
+            self.sensor.modulation = float(np.hypot(*tilts.T).max())
+
+    def frame(
+        self, opd_m: NDArray[np.floating], image: NDArray[np.floating] | None = None
+    ) -> NDArray[np.floating]:
+        """Intensity on the camera, averaged over the modulation.
+
+        Parameters
+        ----------
+        opd_m
+            Optical path difference ``(n, n)`` in metres.
+        image
+            Where to put the result; added to, so clear it first. A new array by default.
+
+        Returns
+        -------
+        ndarray, ``(rows, columns)``, float32 by default
+            Sums (but for light beside the region) to the sum of ``amplitude ** 2``.
+        """
+        if opd_m.shape != self.amplitude.shape:
+            raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
+        out: NDArray[np.floating] = np.zeros(self.shape, np.float32) if image is None else image
+        light = self.light
+        with quiet():
+            # '**' starts a new propagation; '*' alone would add to the last one.
+            light.source**light.telescope * oopao().OPD_map(np.asarray(opd_m, dtype=float)) * self.sensor
+            self._region_on_camera.add(np.asarray(self.sensor.cam.frame) / light.photons_per_unit, out)
+        return out

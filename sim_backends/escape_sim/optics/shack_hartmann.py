@@ -1,0 +1,191 @@
+"""Diffractive Shack-Hartmann optics: one matrix Fourier transform per lenslet."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+# Taylor coefficients of sin(x) and cos(x) for |x| <= pi/2: error below 6e-8, the precision of
+# single-precision arithmetic itself.
+_S3, _S5, _S7, _S9, _S11 = (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
+_C2, _C4, _C6, _C8, _C10, _C12 = (-1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600)
+_F = np.float32
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def pupil_field(opd, per_wave, amplitude, field):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Complex field ``amplitude exp(2 i pi opd per_wave)``; fills ``field (n, 2)`` (real, imaginary)."""
+    for k in range(opd.size):
+        turn = opd[k] * per_wave
+        turn -= np.rint(turn)
+        x = turn * _F(math.pi)
+        x2 = x * x
+        s = x * (_F(1) + x2 * (_F(_S3) + x2 * (_F(_S5) + x2 * (_F(_S7) + x2 * (_F(_S9) + x2 * _F(_S11))))))
+        c = _F(1) + x2 * (
+            _F(_C2) + x2 * (_F(_C4) + x2 * (_F(_C6) + x2 * (_F(_C8) + x2 * (_F(_C10) + x2 * _F(_C12)))))
+        )
+        field[k, 0] = amplitude[k] * (_F(1) - _F(2) * s * s)
+        field[k, 1] = amplitude[k] * (_F(2) * s * c)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _add_intensities(spots, lit, y0, x0, image):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the intensity of ``spots (rows, field, columns, field, 2)`` to the image."""
+    f = spots.shape[1]
+    for i in range(spots.shape[0]):
+        for v in range(f):
+            row = y0[i] + v
+            for j in range(spots.shape[2]):
+                if lit[i, j]:
+                    left = x0[j]
+                    for u in range(f):
+                        re = spots[i, v, j, u, 0]
+                        im = spots[i, v, j, u, 1]
+                        image[row, left + u] += re * re + im * im
+
+
+def field_pixels(n_pix: int, spot_px: float) -> int:
+    """Pixels rendered per lenslet: one alias period of its samples, so that no light counts twice."""
+    return int(n_pix * spot_px)
+
+
+def first_pixels(centres_px: NDArray[np.floating], field: int) -> NDArray[np.intp]:
+    """First of the ``field`` pixels around each lenslet centre along one axis."""
+    return np.asarray(np.floor(centres_px - field / 2 + 1), dtype=np.intp)
+
+
+def lenslet_transform(
+    centres_px: NDArray[np.floating], first_px: NDArray[np.intp], n_pix: int, field: int, spot_px: float
+) -> NDArray[np.complex128]:
+    """Fourier matrices from the pupil samples of a lenslet to its camera pixels, along one axis.
+
+    Parameters
+    ----------
+    centres_px
+        Lenslet centres along the axis in camera pixels ``(n_sub,)``.
+    first_px
+        First pixel rendered for each lenslet ``(n_sub,)``.
+    n_pix
+        Pupil samples across a lenslet.
+    field
+        Pixels rendered per lenslet.
+    spot_px
+        lambda/d in camera pixels.
+
+    Returns
+    -------
+    ndarray of complex, ``(n_sub, n_pix, field)``
+        Scaled so that a whole alias period of the image holds the power of the pupil.
+    """
+    pixels = first_px[:, None] + np.arange(field)[None, :] - centres_px[:, None]
+    samples = (np.arange(n_pix) - (n_pix - 1) / 2) / n_pix
+    # The minus sign makes a positive slope of the path move the spot to higher pixels, as in OOPAO.
+    phase = -2j * np.pi * samples[None, :, None] * pixels[:, None, :] / spot_px
+    return np.asarray(np.exp(phase) / np.sqrt(n_pix * spot_px), dtype=np.complex128)
+
+
+class ShackHartmannOptics:
+    """Shack-Hartmann sensor on a camera whose pixels need not match the lenslets.
+
+    Every lenslet forms its own image on the ``field`` pixels around it; images of neighbours add
+    as intensities. A positive slope of the optical path along x moves spots to higher columns.
+
+    Parameters
+    ----------
+    n_sub
+        Lenslets across the grid.
+    n_pix
+        Pupil samples across a lenslet.
+    wavelength_m
+        Wavelength in metres.
+    pitch_px
+        Lenslet pitch in camera pixels.
+    spot_px
+        lambda/d in camera pixels.
+    origin_px
+        Centre (x, y) of lenslet (0, 0) in pixels.
+    shape
+        Camera region (rows, columns).
+    amplitude
+        Pupil amplitude ``(n_sub * n_pix, n_sub * n_pix)``; lenslets without light are skipped.
+    """
+
+    def __init__(
+        self,
+        n_sub: int,
+        n_pix: int,
+        wavelength_m: float,
+        pitch_px: float,
+        spot_px: float,
+        origin_px: tuple[float, float],
+        shape: tuple[int, int],
+        amplitude: NDArray[np.float32],
+    ) -> None:
+        n = n_sub * n_pix
+        if amplitude.shape != (n, n):
+            raise ValueError(
+                f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})"
+            )
+        field = field_pixels(n_pix, spot_px)
+        line = np.arange(n_sub) * pitch_px
+        x, y = origin_px[0] + line, origin_px[1] + line
+        x0, y0 = first_pixels(x, field), first_pixels(y, field)
+        light = amplitude.reshape(n_sub, n_pix, n_sub, n_pix).any(axis=(1, 3))
+        rows, cols = np.nonzero(light)
+        inside = (
+            (y0[rows] >= 0)
+            & (x0[cols] >= 0)
+            & (y0[rows] + field <= shape[0])
+            & (x0[cols] + field <= shape[1])
+        )
+        if not inside.all():
+            raise ValueError(
+                f"{int((~inside).sum())} lit lenslets fall outside the region "
+                f"of {shape[1]} x {shape[0]} pixels; enlarge the camera region or move the grid's origin"
+            )
+        self.shape = shape
+        self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
+        self._per_wave = np.float32(1 / wavelength_m)
+        self._lit, self._x0, self._y0 = light, x0, y0
+        self._along_x = lenslet_transform(x, x0, n_pix, field, spot_px).astype(np.complex64)
+        along_y = lenslet_transform(y, y0, n_pix, field, spot_px).astype(np.complex64)
+        self._along_y = np.ascontiguousarray(along_y.transpose(0, 2, 1))
+        self._field = np.empty((n, n), np.complex64)
+        self._half = np.empty((n, n_sub, field), np.complex64)
+        self._spots = np.empty((n_sub, field, n_sub * field), np.complex64)
+        self._n_sub, self._n_pix, self._size = n_sub, n_pix, field
+
+    def frame(
+        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """Intensity on the camera.
+
+        Parameters
+        ----------
+        opd_m
+            Optical path difference ``(n, n)`` in metres.
+        image
+            Where to put the result; added to, so clear it first. A new array by default.
+
+        Returns
+        -------
+        ndarray of float32, ``(rows, columns)``
+            Sums (but for light beyond the field of a lenslet) to the sum of ``amplitude ** 2``.
+        """
+        out = np.zeros(self.shape, np.float32) if image is None else image
+        opd = np.ascontiguousarray(opd_m, dtype=np.float32)
+        n, k, p, f = opd.shape[0], self._n_sub, self._n_pix, self._size
+        pupil_field(
+            opd.ravel(), self._per_wave, self.amplitude.ravel(), self._field.view(np.float32).reshape(-1, 2)
+        )
+        # Columns first, one product per lenslet column; then rows, one product per lenslet row.
+        columns = self._field.reshape(n, k, p).transpose(1, 0, 2)
+        np.matmul(columns, self._along_x, out=self._half.transpose(1, 0, 2))
+        np.matmul(self._along_y, self._half.reshape(k, p, k * f), out=self._spots)
+        _add_intensities(
+            self._spots.view(np.float32).reshape(k, f, k, f, 2), self._lit, self._y0, self._x0, out
+        )
+        return out
