@@ -14,9 +14,9 @@ They are loaded when first used, so that importing the package stays cheap.
 from __future__ import annotations
 
 import importlib
-import warnings
 from typing import TYPE_CHECKING, Any
 
+from escape_hw.deprecation import renamed_attributes
 from escape_hw.version import __version__
 
 if TYPE_CHECKING:
@@ -171,18 +171,13 @@ __all__ = [
 ]
 
 
-#: Names of version 0.1.0 -> present names; they will go with version 0.3.0.
+#: Names of version 0.1.0 -> present names.
 _RENAMED = {"Measured": "Estimate", "closed_loop": "close_loop"}
 
 
 def __getattr__(name: str) -> Any:
     if name in _RENAMED:
-        warnings.warn(
-            f"escape_hw.{name} is called escape_hw.{_RENAMED[name]} since version 0.2.0",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        name = _RENAMED[name]
+        return renamed_attributes(__name__, _RENAMED)(name)
     home = _PUBLIC_MODULES.get(name)
     if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

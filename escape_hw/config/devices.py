@@ -89,7 +89,7 @@ class StageConfig(Section):
         20, ge=4, le=1000, description="fewest points of a turn; the clock's 50 us times this is the shortest"
     )
     max_points: int = Field(4096, ge=64, le=262144, description="most points of a wave table")
-    correct: Literal["recorder", "table", "none"] = Field(
+    correction_source: Literal["recorder", "table", "none"] = Field(
         "recorder",
         description="what makes the circle round: positions recorded at every start, the table of "
         "'corrections', or nothing",
@@ -99,7 +99,7 @@ class StageConfig(Section):
         description="frequency (hertz), amplitude of x and of y relative to what was asked, lag of x and of "
         "y (degrees), as 'escape modulator start' reports them",
     )
-    round_within: float = Field(
+    circle_tolerance: float = Field(
         0.02, gt=0, le=0.5, description="largest error of radius and roundness that counts as corrected"
     )
     trigger_line: int = Field(1, ge=0, le=3, description="output that triggers the camera; 0: none")
@@ -118,9 +118,9 @@ class StageConfig(Section):
             violations.append(
                 RuleViolation("min_points", self.min_points, f"max_points is {self.max_points}")
             )
-        if self.correct == "table" and not self.corrections:
+        if self.correction_source == "table" and not self.corrections:
             text = "needs stage.corrections; 'recorder' measures them"
-            violations.append(RuleViolation("correct", self.correct, text))
+            violations.append(RuleViolation("correction_source", self.correction_source, text))
         raise_violations(violations)
         return self
 

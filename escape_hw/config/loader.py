@@ -16,9 +16,11 @@ from pydantic_core import ErrorDetails
 from escape_hw.config import key_tree
 from escape_hw.config.bundled import find_system
 from escape_hw.config.key_tree import KeyPath
+from escape_hw.config.renamed import present_key, update_document, update_override
 from escape_hw.config.section import RULE_ERROR
 from escape_hw.config.system import SystemConfig
 from escape_hw.config.toml_text import format_value, key_lines, line_of
+from escape_hw.deprecation import warn_renamed
 from escape_hw.errors import ConfigError
 
 #: Longest value that is quoted in a message.
@@ -265,7 +267,12 @@ def load_text(
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError("\n".join([_syntax_line(error, text, source), *lines])) from None
-    return _validate(document, key_lines(text), source, changes, lines)
+    places = key_lines(text)
+    for key, message in update_document(document):
+        warn_renamed(f"{source}:{places.get(tuple(key.split('.')), 1)}  {message}")
+    # A line counts for the present name of its key.
+    places = {present_key(path): line for path, line in places.items()} | places
+    return _validate(document, places, source, changes, lines)
 
 
 def _validate(
@@ -298,9 +305,14 @@ def _parse_changes(
     changes, lines = [], []
     for text in overrides:
         try:
-            changes.append(parse_override(text))
+            override = parse_override(text)
         except ConfigError as error:
             lines.append(str(error))
+            continue
+        path, value, renamings = update_override(override.path, override.value)
+        for _, message in renamings:
+            warn_renamed(f"{override.origin}  {message}")
+        changes.append(Override(path, value, override.origin))
     if seed is not None:
         changes.append(Override(("system", "seed"), seed, "--seed"))
     if mode is not None:

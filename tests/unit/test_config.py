@@ -202,7 +202,7 @@ WRONG = {
         'kind = "kl"',
         'kind = "kl"\nfile = "modes.fits"',
         "modes.fits",
-        "basis.file: \"modes.fits\"  is not read with kind = 'kl'; remove it",
+        "basis.file: \"modes.fits\"  is not used with kind = 'kl'; remove it",
     ),
     "kind without basis file": (
         'kind = "kl"',

@@ -27,7 +27,7 @@ from escape_hw.errors import ConfigError
         ('stage.axes=["1","1"]', "two different axes are needed"),
         ("stage.axis_gain=[1.0,0.05]", "less than a tenth of normal"),
         ("stage.min_points=100", ""),
-        ('stage.correct="table"', "needs stage.corrections; 'recorder' measures them"),
+        ('stage.correction_source="table"', "needs stage.corrections; 'recorder' measures them"),
         ("stage.corrections=[[303.0,0.01,1.0,0.0,0.0]]", "out of range"),
         ("stage.trigger_line=4", "out of range"),
         ("wire.port=0", "out of range"),
@@ -54,7 +54,7 @@ def test_the_tilt_follows_from_the_beam():
     assert modulator.rad_per_lambda_d == pytest.approx(47.04e-6, rel=1e-3)
     again = load_text(load_text(wide, "bench.toml").to_toml(), "bench.toml")
     assert again.devices.modulator == modulator
-    with pytest.raises(ConfigError, match=r"a beam of 0\.003 m has 0\.000106 .* leave one out"):
+    with pytest.raises(ConfigError, match=r"beam_m = 0\.003 gives 0\.000106 .* leave one out"):
         load_system("razor-pywfs", overrides=["devices.modulator.beam_m=3e-3"])
 
 

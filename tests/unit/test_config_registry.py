@@ -128,7 +128,7 @@ def test_a_broken_model_is_named_with_what_is_expected() -> None:
 
 @pytest.mark.parametrize("factory", [3, lambda name: name])
 def test_what_is_no_factory_is_not_registered(monkeypatch: pytest.MonkeyPatch, factory: object) -> None:
-    monkeypatch.setattr(registry, "_OWN", {})
+    monkeypatch.setattr(registry, "_REGISTERED", {})
     with pytest.raises(ConfigError, match=r"'bench-mirror' is broken: .* factory\(name, config, shared"):
         registry.register_device("bench-mirror", factory)  # type: ignore[arg-type]
 
@@ -164,7 +164,7 @@ def test_nothing_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_OWN", {})
+    monkeypatch.setattr(registry, "_REGISTERED", {})
     with pytest.raises(ConfigError, match="no device driver 'bench-mirror' is installed"):
         registry.device_factory("bench-mirror")
     for number in (1, 2):
