@@ -1,4 +1,4 @@
-"""Files written by version 0.1.0 stay readable: products, run folders, and the state of an interrupted run."""
+"""Files written by version 0.1.0 stay readable: products, run folders, interrupted runs."""
 
 from __future__ import annotations
 
