@@ -212,7 +212,7 @@ def test_the_wrong_controller_is_left_alone(emulator, override, says):
 def test_limits_are_the_controllers_own(emulator):
     with driver(emulator, "devices.modulator.max_tilt_rad=0.05") as stage:
         assert stage.info.max_tilt_rad == pytest.approx(1e-3)
-        with pytest.raises(SettingRejected, match=r"it does 0 to 0\.001 rad"):
+        with pytest.raises(SettingRejected, match=r"the range is 0 to 0\.001 rad"):
             stage.check(Modulation(1.1e-3, 300.0))
         with pytest.raises(SettingRejected, match=r"it does up to 1000 Hz"):
             stage.check(Modulation(1e-4, 1500.0))
