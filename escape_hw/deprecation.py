@@ -26,7 +26,7 @@ def warn_renamed(message: str) -> None:
 
     Python hides deprecation warnings that are attributed to a library.
     """
-    level, frame = 1, sys._getframe()
+    level, frame = 1, sys._getframe()  # noqa: SLF001
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _PACKAGES:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, RenamedWarning, stacklevel=level)

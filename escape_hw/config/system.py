@@ -336,7 +336,8 @@ class SystemConfig(Section):
         width, height = self.devices.wfs.region[2:]
         for number in self.sensor.pupils_outside(width, height):
             centre = list(self.sensor.pupils_px[number])
-            text = f"the region of {width} x {height} pixels cuts off part of this image of {self.sensor.n_sub} pixels"
+            n = self.sensor.n_sub
+            text = f"the region of {width} x {height} pixels cuts off part of this image of {n} pixels"
             yield RuleViolation("sensor.pupils_px", centre, text)
         moved = "applies to lenslets; use twin.pyramid.centre_offsets_px to move pupil images"
         if twin.wfs.pitch_px is not None:

@@ -97,7 +97,7 @@ def test_one_device_is_built_alone():
     stage = build_device("modulator", config, TipTiltModulator)
     assert isinstance(stage, PiModulator)
     assert not stage.is_open
-    with pytest.raises(ConfigError, match="makes a PiModulator, not a PhaseScreen"):
+    with pytest.raises(ConfigError, match="creates a PiModulator, not a PhaseScreen"):
         build_device("modulator", config, PhaseScreen)
     with pytest.raises(ConfigError, match=r"'razor-shwfs' has no driver for devices\.modulator"):
         build_device("modulator", load_system("razor-shwfs"), TipTiltModulator)

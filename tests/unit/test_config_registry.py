@@ -103,12 +103,12 @@ def test_what_cannot_be_loaded_says_what_to_do(name: str, message: str) -> None:
     [
         (
             "plug-mirror",
-            "makes a str, not a DeformableMirror; plug_mirror:make must return one",
+            "creates a str, not a DeformableMirror; plug_mirror:make must return one",
         ),
-        ("plug-forgets", "makes a NoneType, not a DeformableMirror; plug_mirror:forgets must return one"),
+        ("plug-forgets", "creates a NoneType, not a DeformableMirror; plug_mirror:forgets must return one"),
         (
             "plug-fails",
-            r"cannot be made: plug_mirror:fails failed with AttributeError: .*no_such_key.* line",
+            r"cannot be created: plug_mirror:fails failed with AttributeError: .*no_such_key.* line",
         ),
     ],
 )
@@ -122,7 +122,7 @@ def test_what_makes_no_mirror_is_named_with_what_is_expected(name: str, message:
 def test_a_broken_model_is_named_with_what_is_expected() -> None:
     with pytest.raises(ConfigError, match=r"takes \(config\).*called as factory\(config, grid\)"):
         registry.model_factory("plug-model")
-    with pytest.raises(ConfigError, match="'plug-none' makes a SystemConfig, not a SyntheticModel; plug_mi"):
+    with pytest.raises(ConfigError, match="'plug-none' creates a SystemConfig, not a SyntheticModel; plug_mi"):
         registry.model_factory("plug-none")(load_system("razor-shwfs"), None)
 
 
