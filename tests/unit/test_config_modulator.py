@@ -24,7 +24,7 @@ from escape_hw.errors import ConfigError
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ('stage.axes=["1","1"]', "two different axes are needed"),
+        ('stage.axes=["1","1"]', "the two axes must differ"),
         ("stage.axis_gain=[1.0,0.05]", "less than a tenth of normal"),
         ("stage.min_points=100", ""),
         ('stage.correction_source="table"', "needs stage.corrections; 'recorder' measures them"),

@@ -146,7 +146,7 @@ def test_a_name_offered_by_two_packages_is_refused(monkeypatch: pytest.MonkeyPat
     one = EntryPoint("twin", "package_one.devices:make", registry.DEVICES)
     two = EntryPoint("twin", "package_two:make", registry.DEVICES)
     monkeypatch.setattr(importlib.metadata, "entry_points", entries(one, two))
-    with pytest.raises(ConfigError, match=r"'twin' is offered twice: .*package_one.* and .*package_two"):
+    with pytest.raises(ConfigError, match=r"'twin' is provided twice: .*package_one.* and .*package_two"):
         registry.device_factory("twin")
 
 
@@ -175,7 +175,7 @@ def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPat
     assert "bench-mirror" not in registry.available(registry.MODELS)
     with pytest.raises(ConfigError, match="did you mean 'bench-mirror'"):
         registry.device_factory("bench-miror")
-    with pytest.raises(ConfigError, match="'sim-alpao' is offered by an installed package"):
+    with pytest.raises(ConfigError, match="'sim-alpao' is provided by an installed package"):
         registry.register_device("sim-alpao", factory)
 
 

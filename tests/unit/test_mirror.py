@@ -219,7 +219,7 @@ def test_a_layout_that_contradicts_the_actuators_is_refused() -> None:
         def info(self) -> DMInfo:
             return replace(super().info, layout=np.ones((5, 5), dtype=bool))
 
-    with pytest.raises(DeviceError, match="25 places for 21 actuators"):
+    with pytest.raises(DeviceError, match="25 positions for 21 actuators"):
         Odd().open()
 
 
