@@ -25,7 +25,7 @@ PATTERN = rf"^((circle|square)-[1-9][0-9]{{0,2}}|rings-({'|'.join(map(str, RINGS
 def _rows(layout: str) -> list[list[bool]]:
     kind, n = _parse(layout)
     if kind == "rings":
-        raise ValueError(f"layout {layout!r} has rings and no grid")
+        raise ValueError(f"layout {layout!r} is on rings, not on a grid")
     # In half pitches, so that coordinates are integers for even n too.
     axis = range(1 - n, n, 2)
     return [[kind == "square" or x * x + y * y < n * n for x in axis] for y in axis]

@@ -25,7 +25,7 @@ from escape_hw.errors import ConfigError
     ("change", "says"),
     [
         ('stage.axes=["1","1"]', "the two axes must differ"),
-        ("stage.axis_gain=[1.0,0.05]", "less than a tenth of normal"),
+        ("stage.axis_gain=[1.0,0.05]", "the magnitude must be at least 0.1"),
         ("stage.min_points=100", ""),
         ('stage.correction_source="table"', "needs stage.corrections; 'recorder' measures them"),
         ("stage.corrections=[[303.0,0.01,1.0,0.0,0.0]]", "out of range"),

@@ -130,7 +130,7 @@ def test_a_procedure_may_report_while_it_clears_up() -> None:
 def test_a_procedure_that_ignores_the_abort_is_closed_after_its_grace(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(module, "GRACE_S", 0.05)
+    monkeypatch.setattr(module, "ABORT_GRACE_S", 0.05)
     log: list[str] = []
 
     def deaf() -> Procedure[None]:
@@ -156,7 +156,7 @@ def test_a_procedure_that_ignores_the_abort_is_closed_after_its_grace(
 def test_a_procedure_that_refuses_even_to_be_closed_does_not_hang_the_runner(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(module, "GRACE_S", 0.0)
+    monkeypatch.setattr(module, "ABORT_GRACE_S", 0.0)
     refusals = 0
 
     def immortal() -> Procedure[None]:
