@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.mirror import DeformableMirror
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import DeviceError
 from escape_hw.safety.limits import MirrorLimits
 
@@ -71,6 +72,7 @@ class ShellHealth:
     owner: str = ""
 
 
+@renamed_members(go="go_to", glance="observe_health")
 class AdaptiveSecondary(DeformableMirror):
     """A deformable mirror with measured positions, a health record and states.
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.device import Device
 from escape_hw.api.representation import short_repr
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import DeviceError, FrameTimeout, SettingRejected
 
 
@@ -97,6 +98,7 @@ class FrameStatus:
     timeouts: int = 0
 
 
+@renamed_members(tap="callback")
 class Camera(Device):
     """A camera. ``start`` and ``stop`` may be repeated; ``next_frame`` starts it when needed.
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from escape_hw.api.device import Device
 from escape_hw.api.representation import short_repr
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import CommandRejected, DeviceError, SettingRejected
 from escape_hw.safety.guard import CommandGuard, GuardReport
 from escape_hw.safety.limits import MirrorLimits, nearest_pairs, neighbour_pairs
@@ -67,6 +68,9 @@ class SendReport:
     __repr__ = short_repr
 
 
+@renamed_members(
+    allowed_share="largest_legal_scale", obeys="is_legal", tap="callback", flattened_count="flatten_count"
+)
 class DeformableMirror(Device):
     """A deformable mirror. Commands are float64 ``(n_act,)``, fractions of full stroke.
 

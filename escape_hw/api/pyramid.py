@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.representation import short_repr
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.deprecation import renamed_members
 
 #: Names of the four pupil images in order of their index, ``2 * lower + right``.
 IMAGES = ("upper left", "upper right", "lower left", "lower right")
@@ -18,6 +19,7 @@ IMAGES = ("upper left", "upper right", "lower left", "lower right")
 _INNER_RADIUS = 0.9
 
 
+@renamed_members(looks="n_effective", steady="persistent_fraction")
 @dataclass(frozen=True, slots=True, eq=False)
 class PyramidPupils(SensorGeometry):
     """The four pupil images on the camera.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.representation import short_repr
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import IncompatibleProduct
 
 #: Ratio of the rms spot motion and blur to the rms of the centres of gravity, which the window, the
@@ -17,6 +18,7 @@ from escape_hw.errors import IncompatibleProduct
 SPOT_MOTION_FACTOR = 1.2
 
 
+@renamed_members(with_motion="with_slope_statistics", short_look="short_run_note")
 class SensorGeometry(abc.ABC):
     """Geometry of a sensor of any kind, an immutable dataclass.
 
@@ -128,6 +130,7 @@ class SlopeFunction(Protocol):
         ...
 
 
+@renamed_members(air_px="turbulence_px")
 @dataclass(frozen=True, slots=True, eq=False)
 class SubApertureGrid(SensorGeometry):
     """The lenslet grid of a Shack-Hartmann sensor on the camera.

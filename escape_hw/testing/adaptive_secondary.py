@@ -18,6 +18,7 @@ from escape_hw.testing.checks import (
     Factory,
     assert_refused,
     check,
+    checks_in,
     checks_up_to,
     open_device,
     replace_hook,
@@ -96,7 +97,9 @@ def check_secondary_measures_every_actuator(factory: Factory) -> None:
         assert far < 10, f"a position is {far:.3g} full strokes; are they in metres or microns?"
         positions += 0.25
         again = mirror.measured_positions()
-        assert not np.array_equal(again, positions, equal_nan=True), "the mirror returned its own array instead of a copy"
+        assert not np.array_equal(again, positions, equal_nan=True), (
+            "the mirror returned its own array instead of a copy"
+        )
 
 
 @check(READS)
@@ -144,7 +147,9 @@ def check_secondary_recovers_only_from_faults(factory: Factory) -> None:
             with _reporting_fault(mirror):
                 assert_refused(mirror, DeviceError, "recovery from a fault that persists", mirror.recover)
             assert asked, "recover() did not call the driver"
-        assert mirror.state is state, f"recover() changed the state from {state} to {mirror.state} without a fault"
+        assert mirror.state is state, (
+            f"recover() changed the state from {state} to {mirror.state} without a fault"
+        )
 
 
 @check(NORMAL)
@@ -166,18 +171,7 @@ def check_secondary_rests_when_closed(factory: Factory) -> None:
             assert steps[-1:] == [last], f"close() with leave_set = {leave_set} went to {steps}"
 
 
-SECONDARY_CHECKS: tuple[Check, ...] = (
-    *MIRROR_CHECKS,
-    check_secondary_reaches_every_state,
-    check_secondary_follows_commands_only_when_running,
-    check_secondary_is_flat_after_rest,
-    check_secondary_refuses_fault_as_target,
-    check_secondary_measures_every_actuator,
-    check_secondary_reports_health,
-    check_secondary_latches_faults,
-    check_secondary_recovers_only_from_faults,
-    check_secondary_rests_when_closed,
-)
+SECONDARY_CHECKS = (*MIRROR_CHECKS, *checks_in(globals()))
 
 
 def secondary_checks(max_level: int = 3) -> list[Check]:

@@ -19,6 +19,7 @@ from escape_hw.testing.checks import (
     Factory,
     assert_refused,
     check,
+    checks_in,
     checks_up_to,
     open_device,
 )
@@ -185,18 +186,6 @@ def _assert_times_out(camera: Camera) -> None:
     assert counted == timeouts, f"status says {counted} time-outs; there were {timeouts}"
     after = camera.next_frame(generous_timeout_s(camera)).index
     assert after > last, f"after a time-out the index went from {last} to {after}"
-
-
-FRAME_CHECKS: tuple[Check, ...] = (
-    check_camera_frames_are_well_formed,
-    check_camera_frames_are_not_overwritten,
-    check_camera_index_and_time_rise,
-    check_camera_rate_is_as_stated,
-    check_camera_counts_add_up,
-    check_camera_refuses_timeouts,
-    check_camera_raises_timeout,
-    check_camera_polls_without_waiting,
-)
 
 
 @check(READS)
@@ -386,21 +375,7 @@ def _trial_settings(camera: Camera) -> list[CameraSettings]:
     return [now, _half_region(camera), longer]
 
 
-CAMERA_CHECKS: tuple[Check, ...] = (
-    *COMMON_CHECKS,
-    check_camera_info_is_complete,
-    check_camera_settings_are_achievable,
-    check_camera_check_is_a_fixed_point,
-    check_camera_check_changes_nothing,
-    check_camera_refuses_regions_off_the_sensor,
-    check_camera_refuses_meaningless_settings,
-    check_camera_configure_reports_actual_settings,
-    check_camera_configures_while_running,
-    check_camera_start_and_stop_repeat,
-    check_camera_restart_resets_counters,
-    check_camera_closes_while_running,
-    *FRAME_CHECKS,
-)
+CAMERA_CHECKS = (*COMMON_CHECKS, *checks_in(globals()))
 
 
 def camera_checks(max_level: int = 3) -> list[Check]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar, cast
 
@@ -47,6 +47,15 @@ def check(level: int) -> Callable[[Callable[[Factory], None]], Check]:
         return decorated
 
     return decorate
+
+
+def checks_in(namespace: Mapping[str, object]) -> tuple[Check, ...]:
+    """The checks defined in a module so far, in order; ``namespace`` is its ``globals()``."""
+    return tuple(
+        cast(Check, one)
+        for name, one in namespace.items()
+        if name.startswith("check_") and getattr(one, "__module__", "") == namespace["__name__"]
+    )
 
 
 def checks_up_to(checks: tuple[Check, ...], max_level: int) -> list[Check]:

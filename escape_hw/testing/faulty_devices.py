@@ -97,8 +97,8 @@ class FaultyCamera(Camera):
     drop_every
         Frames with an index divisible by this number are lost.
     repeat
-        Indices of frames that are delivered twice, as by some drivers after an overrun; ``next_frame`` rejects
-        the copy.
+        Indices of frames that are delivered twice, as by some drivers after an overrun; ``next_frame``
+        rejects the copy.
     stall_from
         Index from which every call times out.
     lost_from

@@ -22,6 +22,7 @@ from escape_hw.testing.checks import (
     Factory,
     assert_refused,
     check,
+    checks_in,
     checks_up_to,
     open_device,
     replace_hook,
@@ -245,18 +246,6 @@ def _drive_to_limit(dm: DeformableMirror) -> NDArray[np.float64]:
     return dm.shape
 
 
-SAFETY_CHECKS: tuple[Check, ...] = (
-    check_mirror_obeys_its_limits,
-    check_mirror_reports_clipping,
-    check_mirror_failed_transfer_keeps_shape,
-    check_mirror_flattens,
-    check_mirror_flat_can_be_set,
-    check_mirror_ramps_to_flat,
-    check_mirror_is_flat_when_closed,
-    check_mirror_closes_when_lost,
-)
-
-
 @check(READS)
 def check_mirror_info_is_complete(factory: Factory) -> None:
     """Identity and geometry are complete and consistent."""
@@ -274,7 +263,9 @@ def check_mirror_info_is_complete(factory: Factory) -> None:
 
 def _require_geometry(info: DMInfo) -> None:
     positions = info.positions_m
-    assert positions.shape == (info.n_act, 2), f"positions_m has shape {positions.shape} for {info.n_act} actuators"
+    assert positions.shape == (info.n_act, 2), (
+        f"positions_m has shape {positions.shape} for {info.n_act} actuators"
+    )
     assert np.isfinite(positions).all(), "positions_m has values that are not finite"
     assert len(np.unique(positions, axis=0)) == info.n_act, "two actuators have the same position"
     if info.layout is None:
@@ -299,7 +290,9 @@ def check_mirror_refuses_not_finite(factory: Factory) -> None:
             command = np.zeros(n_act)
             command[index] = value
             refusal = _assert_rejected(dm, command, f"a command with {value} at actuator {index}")
-            assert f"actuator {index} " in f"{refusal} ", f"the message does not give index {index}: {refusal}"
+            assert f"actuator {index} " in f"{refusal} ", (
+                f"the message does not give index {index}: {refusal}"
+            )
 
 
 @check(READS)
@@ -423,19 +416,7 @@ def check_mirror_times_its_sends(factory: Factory) -> None:
             assert before <= sent_ns <= after, f"sent_ns is {sent_ns}, outside {before} to {after} ns"
 
 
-MIRROR_CHECKS: tuple[Check, ...] = (
-    *COMMON_CHECKS,
-    check_mirror_info_is_complete,
-    check_mirror_refuses_not_finite,
-    check_mirror_refuses_wrong_shape,
-    check_mirror_refuses_wrong_type,
-    check_mirror_sends_legal_commands_unchanged,
-    check_mirror_takes_any_real_array,
-    check_mirror_shares_no_memory,
-    check_mirror_counts,
-    check_mirror_times_its_sends,
-    *SAFETY_CHECKS,
-)
+MIRROR_CHECKS = (*COMMON_CHECKS, *checks_in(globals()))
 
 
 def mirror_checks(max_level: int = 3) -> list[Check]:

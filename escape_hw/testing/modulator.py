@@ -14,6 +14,7 @@ from escape_hw.testing.checks import (
     Factory,
     assert_refused,
     check,
+    checks_in,
     checks_up_to,
     open_device,
     replace_hook,
@@ -86,9 +87,7 @@ def check_modulator_reports_actual_modulation(factory: Factory) -> None:
         answer, now = modulator.modulate(want), modulator.modulation
         assert answer == now, f"modulate() returned {answer}, but modulation is {now}"
         off = abs(answer.frequency_hz / checked.frequency_hz - 1)
-        assert off < 0.01, (
-            f"check() returned {checked.frequency_hz} Hz, modulate() {answer.frequency_hz} Hz"
-        )
+        assert off < 0.01, f"check() returned {checked.frequency_hz} Hz, modulate() {answer.frequency_hz} Hz"
         still = modulator.modulate(replace(want, radius_rad=0.0))
         assert still.radius_rad == 0.0, f"radius 0 requested, got {still.radius_rad} rad"
 
@@ -140,16 +139,7 @@ def check_modulator_status_moves_nothing(factory: Factory) -> None:
         assert not modulator.is_open, "status() opened a closed stage"
 
 
-MODULATOR_CHECKS: tuple[Check, ...] = (
-    *COMMON_CHECKS,
-    check_modulator_info,
-    check_modulator_check_changes_nothing,
-    check_modulator_refuses_meaningless,
-    check_modulator_reports_actual_modulation,
-    check_modulator_parks,
-    check_modulator_is_parked_when_closed,
-    check_modulator_status_moves_nothing,
-)
+MODULATOR_CHECKS = (*COMMON_CHECKS, *checks_in(globals()))
 
 
 def modulator_checks(max_level: int = 3) -> list[Check]:

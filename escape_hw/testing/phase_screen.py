@@ -17,6 +17,7 @@ from escape_hw.testing.checks import (
     Factory,
     assert_refused,
     check,
+    checks_in,
     checks_up_to,
     open_device,
 )
@@ -101,14 +102,7 @@ def check_screen_reaches_every_screen(factory: Factory) -> None:
             screen.set(screen=before.screen)
 
 
-SCREEN_CHECKS: tuple[Check, ...] = (
-    *COMMON_CHECKS,
-    check_screen_info,
-    check_screen_state_is_valid,
-    check_screen_refuses_meaningless,
-    check_screen_set_changes_only_given_fields,
-    check_screen_reaches_every_screen,
-)
+SCREEN_CHECKS = (*COMMON_CHECKS, *checks_in(globals()))
 
 
 def screen_checks(max_level: int = 3) -> list[Check]:

@@ -123,7 +123,9 @@ class SyntheticCamera(Camera):
 
     def _check(self, want: CameraSettings) -> CameraSettings:
         if not 1 <= want.frame_rate_hz <= 2000:
-            raise SettingRejected(self.name, f"frame_rate_hz is {want.frame_rate_hz}; the range is 1 to 2000 Hz")
+            raise SettingRejected(
+                self.name, f"frame_rate_hz is {want.frame_rate_hz}; the range is 1 to 2000 Hz"
+            )
         period_us = round(1e6 / want.frame_rate_hz)
         exposure_us = min(max(1, round(want.exposure_s * 1e6)), period_us)
         region, step = want.region, self._STEP_PX
@@ -190,7 +192,9 @@ class QuantisedModulator(TipTiltModulator):
     def _check(self, want: Modulation) -> Modulation:
         steps = round(1 / (want.frequency_hz * self.STEP_S))
         if not 4 <= steps <= 100_000:
-            raise SettingRejected(self.name, f"frequency_hz is {want.frequency_hz}; the range is 0.2 to 5000 Hz")
+            raise SettingRejected(
+                self.name, f"frequency_hz is {want.frequency_hz}; the range is 0.2 to 5000 Hz"
+            )
         return replace(want, frequency_hz=1 / (steps * self.STEP_S))
 
     def _modulate(self, modulation: Modulation) -> None:

@@ -1,4 +1,4 @@
-"""Keys, values and names of version 0.1.0 are accepted with a deprecation warning."""
+"""Names, configuration keys and values of version 0.1.0 are accepted with a deprecation warning."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import escape_hw
+from escape_hw.api.adaptive_secondary import ShellState
 from escape_hw.calibration.acquisition.checkpoint import _require_same_run
 from escape_hw.cli.app import app
 from escape_hw.config.bundled import bundled_systems, bundled_text
@@ -20,6 +21,7 @@ from escape_hw.config.renamed import RENAMED_KEYS, RENAMED_VALUES, present_value
 from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import ConfigError, IncompatibleProduct
+from escape_hw.testing.reference_devices import IdealSecondary, RecordingMirror
 
 SYSTEMS = Path(__file__).parents[1] / "data" / "0.1.0" / "systems"
 
@@ -176,6 +178,19 @@ def test_the_command_line_says_it_in_one_line(tmp_path: Path) -> None:
         f"deprecated: {file}:{file.read_text().count(chr(10))}  tracking.worth is called "
         "tracking.exchange_threshold since version 0.2.0; version 0.3.0 removes the old name"
     ]
+
+
+def test_old_attributes_and_methods_warn_and_lead_to_the_new_ones() -> None:
+    mirror = RecordingMirror()
+    with pytest.warns(RenamedWarning, match=r"DeformableMirror\.tap is called DeformableMirror\.callback"):
+        mirror.tap = print
+    assert mirror.callback is print
+    with mirror, pytest.warns(RenamedWarning, match=r"DeformableMirror\.obeys") as record:
+        assert mirror.obeys(mirror.flat)
+    assert record[0].filename == __file__
+    secondary = IdealSecondary()
+    with secondary, pytest.warns(RenamedWarning, match=r"go is called AdaptiveSecondary\.go_to"):
+        secondary.go(ShellState.RESTED)
 
 
 def test_old_public_names_warn_and_lead_to_the_new_ones() -> None:
