@@ -1,4 +1,8 @@
-"""Tracker on a drifting bench, compared with a loop that uses the true registration and one that is never updated; with its figure. (Keep the usage text of the script below this line.)"""
+"""Tracker on a drifting bench.
+
+Compared with a loop that uses the true registration and one that is never updated; with its figure. (Keep the
+usage text of the script below this line.)
+"""
 
 from __future__ import annotations
 
