@@ -85,9 +85,7 @@ class StageConfig(Section):
     )
     auto_zero_s: float = Field(180.0, gt=0, le=3600, description="longest wait for auto-zero, seconds")
     settle_s: float = Field(5.0, gt=0, le=600, description="longest wait for an axis on target, seconds")
-    min_points: int = Field(
-        20, ge=4, le=1000, description="smallest number of points per turn, 50 us each"
-    )
+    min_points: int = Field(20, ge=4, le=1000, description="smallest number of points per turn, 50 us each")
     max_points: int = Field(4096, ge=64, le=262144, description="largest number of points of a wave table")
     correction_source: Literal["recorder", "table", "none"] = Field(
         "recorder",
@@ -103,8 +101,12 @@ class StageConfig(Section):
         0.02, gt=0, le=0.5, description="largest relative error of radius and roundness after correction"
     )
     trigger_line: int = Field(1, ge=0, le=3, description="output that triggers the camera; 0: none")
-    trigger_mode: int = Field(4, ge=0, le=99, description="number of the controller's mode 'generator trigger'")
-    trigger_point: int = Field(1, ge=1, le=262144, description="point of the turn at the rising edge of the pulse")
+    trigger_mode: int = Field(
+        4, ge=0, le=99, description="number of the controller's mode 'generator trigger'"
+    )
+    trigger_point: int = Field(
+        1, ge=1, le=262144, description="point of the turn at the rising edge of the pulse"
+    )
 
     @model_validator(mode="after")
     def _rules(self) -> Self:
@@ -137,9 +139,7 @@ class DeviceConfig(Section):
         "", description="driver of the real device (entry point in escape.devices); empty: none"
     )
     sim_driver: str = Field("", description="twin of the device (entry point in escape.devices)")
-    mode: Mode | None = Field(
-        None, description="'sim' or 'hardware' for this device; absent: as system.mode"
-    )
+    mode: Mode | None = Field(None, description="'sim' or 'hardware' for this device; absent: as system.mode")
     serial: str = Field("", description="serial number; a device with another one is not opened")
     options: dict[str, str | int | float | bool] = Field(
         default_factory=dict, description="settings specific to the driver"
@@ -189,7 +189,9 @@ class MirrorConfig(DeviceConfig):
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
     )
     coupling: float = Field(
-        ge=0.01, le=0.9, description="nominal influence function at the adjacent actuator, fraction of its peak"
+        ge=0.01,
+        le=0.9,
+        description="nominal influence function at the adjacent actuator, fraction of its peak",
     )
     stroke_m: float = Field(gt=0, le=1e-3, description="metres of surface at the actuator for a command of 1")
     limits: LimitsConfig = Field(default_factory=LimitsConfig, description="limits of every command")
@@ -223,7 +225,13 @@ class MirrorConfig(DeviceConfig):
         """
         positions_m = self.positions() * self.pitch_m
         return DMInfo(
-            model, serial or self.serial, self.n_act, self.actuator_map(), positions_m, self.stroke_m, simulated
+            model,
+            serial or self.serial,
+            self.n_act,
+            self.actuator_map(),
+            positions_m,
+            self.stroke_m,
+            simulated,
         )
 
     @model_validator(mode="after")
@@ -284,8 +292,8 @@ class ScienceConfig(CameraConfig):
     psf_px: float = Field(ge=0.5, le=100, description="lambda/D in camera pixels")
     model_psf: Literal["measured", "design"] = Field(
         "measured",
-        description="reference of Strehl ratios: an image 'measured' without turbulence, or computed from the "
-        "'design' where the turbulence cannot be removed",
+        description="reference of Strehl ratios: an image 'measured' without turbulence, or computed from "
+        "the 'design' where the turbulence cannot be removed",
     )
 
 

@@ -93,7 +93,9 @@ def _translate(detail: ErrorDetails) -> list[ConfigProblem]:
     path, field, existing = place.path, place.field, place.existing
     if kind == RULE_ERROR:
         return [
-            ConfigProblem((*path, *violation.key.split(".")), format_short(violation.value), violation.message)
+            ConfigProblem(
+                (*path, *violation.key.split(".")), format_short(violation.value), violation.message
+            )
             for violation in detail["ctx"]["violations"]
         ]
     if kind == "extra_forbidden":

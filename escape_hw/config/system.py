@@ -1,4 +1,4 @@
-"""Complete configuration of a system: sections [system], [telescope], [basis], [loop], [calibration], [tracking], [server] and rules between sections."""
+"""Complete configuration of a system, its general sections, and rules between sections."""
 
 from __future__ import annotations
 
