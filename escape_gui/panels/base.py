@@ -18,15 +18,7 @@ from escape_hw.remote.state import DeviceHealth, Phase, State
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Context:
-    """What a panel works with beside its data.
-
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
-    session
-        Requests go through ``session.requests``, which is ``None`` in replay.
-    """
+    """What a panel works with beside its data."""
 
     theme: Theme
     session: Session
@@ -71,11 +63,6 @@ class Panel(QWidget):
 
     A subclass sets the class attributes, puts its widgets into :attr:`body` and overrides
     :meth:`on_state`, :meth:`on_sample`, :meth:`clear` and :meth:`export_arrays`.
-
-    Parameters
-    ----------
-    context
-        Theme and session.
     """
 
     #: One lower-case word: the dock's name, the help page's, the part of a file name.

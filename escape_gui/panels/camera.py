@@ -94,7 +94,6 @@ class CameraPanel(Panel):
 
     # ------------------------------------------------------------ news
     def tick(self, source: DataSource) -> None:
-        """Outlines appear when the sensor was found."""
         geometry = source.geometry()
         if geometry is not self._geometry:
             self._geometry = geometry
@@ -103,7 +102,6 @@ class CameraPanel(Panel):
             self.quiver.set_geometry(geometry)
 
     def on_state(self, state: State) -> None:
-        """Saturation, counted by the server over all frames."""
         light = state.light
         peak, saturated = f"{100 * light.peak:3.0f} %", f"{100 * light.saturated:5.2f} %"
         if not has_frames(state):
@@ -111,7 +109,6 @@ class CameraPanel(Panel):
         self.saturation.setText(f"peak {peak}   saturated {saturated}")
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """A frame or slopes."""
         if stream == "slopes":
             self._slopes = sample.data
             self._show_slopes()
@@ -154,7 +151,6 @@ class CameraPanel(Panel):
 
     # ------------------------------------------------------------ views
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Little room belongs to the picture alone."""
         super().resizeEvent(event)
         self._update_visibility()
 
@@ -181,7 +177,6 @@ class CameraPanel(Panel):
             self._reference = self._frame.astype(np.float32)
 
     def clear(self) -> None:
-        """Another source: nothing kept is comparable."""
         self._frame = self._reference = self._slopes = None
         self._geometry = Geometry()
         self._valid = np.zeros((0, 0), bool)
@@ -191,7 +186,6 @@ class CameraPanel(Panel):
         self.signed.clear()
 
     def apply_theme(self) -> None:
-        """Colours of what lies over the picture."""
         theme = self.context.theme
         self.saturation.setFont(theme.font(0.9, mono=True))
         self.histogram.setFixedHeight(theme.pixels(92))
@@ -200,7 +194,6 @@ class CameraPanel(Panel):
         self._outlines.setPen(pg.mkPen(colour, width=1))
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """Frame and slopes as last seen."""
         parts = []
         if self._frame is not None:
             parts.append(ExportArray("frame", self._frame, "count"))

@@ -64,7 +64,6 @@ class DevicesPanel(Panel):
         self.body.addWidget(area)
 
     def on_state(self, state: State) -> None:
-        """Bring the rows up to date."""
         names = [device.name for device in state.devices]
         if names != list(self._rows):
             self.clear()
@@ -76,7 +75,6 @@ class DevicesPanel(Panel):
         self.show_placeholder(not names)
 
     def clear(self) -> None:
-        """Remove the rows."""
         for row in self._rows.values():
             self._column.removeWidget(row)
             row.hide()

@@ -57,19 +57,16 @@ class GainsPanel(Panel):
         self.setFocusProxy(self.rounds)
 
     def on_state(self, state: State) -> None:
-        """Follow what the server holds."""
         self._running = state.procedure is not None
         self.context.session.library.request(state.products)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """The gains are measured."""
         self._live[stream] = sample.data
         method = str(sample.meta.get("method", ""))
         self._label = METHOD_LABELS.get(method, method) or self._label
         self._dirty = True
 
     def tick(self, source: DataSource) -> None:
-        """Draw when anything is new."""
         loaded = self.context.session.library.loaded
         if loaded is not self._loaded:
             self._loaded, self._dirty = loaded, True
@@ -106,16 +103,13 @@ class GainsPanel(Panel):
         self._legend.setText("<br>".join(lines))
 
     def clear(self) -> None:
-        """Forget the gains of another source."""
         self._live.clear()
         self._curves = {}
 
     def apply_theme(self) -> None:
-        """The legend's signs have the curves' colours."""
         self._update_legend()
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """A table for every curve."""
         heads = ("mode", "gain", "sigma", "smooth", "smooth_sigma")
         return tuple(
             ExportArray(

@@ -64,13 +64,11 @@ class LatencyPanel(Panel):
         self._counts: NDArray[Any] | None = None
 
     def on_state(self, state: State) -> None:
-        """Numbers of the last second."""
         for name, readout in self.readouts.items():
             value = getattr(state.latency, name)
             readout.show_value(f"{value:.0f}" if np.isfinite(value) else "–")
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """Counts of all frames since the loop was closed."""
         self._counts = sample.data
         for plot, curve, counts in zip(self.plots, self._curves, sample.data, strict=True):
             used = np.flatnonzero(counts)
@@ -86,11 +84,9 @@ class LatencyPanel(Panel):
             plot.setXRange(float(few[0]) * 0.95, float(few[1]) * 1.05)
 
     def clear(self) -> None:
-        """Another loop."""
         self._counts = None
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """Counts by bin."""
         if self._counts is None:
             return ()
         used = np.flatnonzero(self._counts.sum(axis=0))

@@ -63,7 +63,6 @@ class LogPanel(Panel):
         self.apply_theme()
 
     def tick(self, source: DataSource) -> None:
-        """New lines, all at once."""
         new = source.log_after(self._number)
         if new:
             self._number = new[-1].number
@@ -107,12 +106,10 @@ class LogPanel(Panel):
         QGuiApplication.clipboard().setText(self.text.toPlainText())
 
     def clear(self) -> None:
-        """Another server counts from the beginning."""
         self._lines.clear()
         self._number = -1
         self.text.clear()
 
     def apply_theme(self) -> None:
-        """Lines stand in columns and carry the theme's colours."""
         self.text.setFont(self.context.theme.font(0.9, mono=True))
         self._refilter()

@@ -128,7 +128,6 @@ class LoopPanel(Panel):
 
     # ------------------------------------------------------------ news
     def on_state(self, state: State) -> None:
-        """Current values; the form follows them until it is edited."""
         self._loop = loop = state.loop
         self.show_placeholder(
             state.phase in (Phase.STARTING, Phase.STOPPED), None if is_measured(state) else NO_SERVER_TEXT
@@ -163,7 +162,6 @@ class LoopPanel(Panel):
             self.matrix.setCurrentIndex(len(matrices) - 1)
 
     def tick(self, source: DataSource) -> None:
-        """Buttons are possible or say why not."""
         session = self.context.session
         now = RequestContext(source.state, source.connected, session.live, session.may_write)
         why = reason_no_write(now)
@@ -256,12 +254,10 @@ class LoopPanel(Panel):
         self.message.setText(reason)
 
     def clear(self) -> None:
-        """Another source: nothing is edited."""
         self._is_edited, self._checked_edit = False, None
         self.message.setText("")
 
     def apply_theme(self) -> None:
-        """Numbers stand in columns."""
         mono = self.context.theme.font(mono=True)
         for label in self.current.values():
             label.setFont(mono)

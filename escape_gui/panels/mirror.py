@@ -78,7 +78,6 @@ class MirrorPanel(Panel):
         self.apply_theme()
 
     def tick(self, source: DataSource) -> None:
-        """Places come with the geometry."""
         geometry = source.geometry()
         if geometry is not self._geometry:
             self._geometry = geometry
@@ -87,7 +86,6 @@ class MirrorPanel(Panel):
             self._update_image()
 
     def on_state(self, state: State) -> None:
-        """Numbers that the server takes over every frame."""
         mirror = state.mirror
         values = {
             "rms": f"{mirror.rms:.4f}",
@@ -98,7 +96,6 @@ class MirrorPanel(Panel):
             self.readouts[name].show_value(text if is_measured(state) else UNKNOWN_VALUE)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """Another command, or where the actuators are."""
         key = COMMAND if stream == "commands" else MEASURED
         new = key not in self._values
         self._values[key] = sample.data
@@ -125,7 +122,6 @@ class MirrorPanel(Panel):
         button.setVisible(MEASURED in self._values)
 
     def clear(self) -> None:
-        """Another source has another mirror."""
         self._values.clear()
         self._geometry = Geometry()
         self._map = ActuatorImage(self._geometry)
@@ -134,10 +130,8 @@ class MirrorPanel(Panel):
         self.picture.clear()
 
     def apply_theme(self) -> None:
-        """Numbers stand in columns."""
         self.scale.setFont(self.context.theme.font(0.9, mono=True))
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """Command and positions as last seen."""
         units = {COMMAND: "stroke", MEASURED: "m"}
         return tuple(ExportArray(key, np.asarray(data), units[key]) for key, data in self._values.items())

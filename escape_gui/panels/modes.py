@@ -130,14 +130,12 @@ class ModesPanel(Panel):
 
     # ------------------------------------------------------------ data
     def on_state(self, state: State) -> None:
-        """Follow what the server holds; once a measurement has ended, its product stands for it."""
         running = state.procedure is not None
         self._dirty |= running != self._running
         self._running = running
         self.context.session.library.request(state.products)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """The matrix grows."""
         self._dirty = True
         if stream == "valid":
             self._valid = sample.data > 0
@@ -149,7 +147,6 @@ class ModesPanel(Panel):
             self._user_selected = False
 
     def tick(self, source: DataSource) -> None:
-        """Draw when anything is new."""
         loaded = self.context.session.library.loaded
         if loaded is not self._loaded:
             self._loaded, self._dirty = loaded, True
@@ -243,14 +240,12 @@ class ModesPanel(Panel):
         self._next_button.setEnabled(page + 1 < pages)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Escape closes the detail."""
         if event.key() == Qt.Key.Key_Escape and self.detail.isVisible():
             self.detail.hide()
         else:
             super().keyPressEvent(event)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Beside each other where there is room, else below each other."""
         super().resizeEvent(event)
         wide = self.width() >= self.context.theme.pixels(_SIDE_BY_SIDE_WIDTH)
         way = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
@@ -259,18 +254,15 @@ class ModesPanel(Panel):
             self.splitter.setSizes([_SPLITTER_SIZES[0], _SPLITTER_SIZES[1]])
 
     def clear(self) -> None:
-        """Forget the matrix of another source."""
         self._live.clear()
         self._user_selected = False
         self.matrix_selector.clear()
         self.detail.hide()
 
     def apply_theme(self) -> None:
-        """Numbers keep their own letters."""
         self._status_label.setFont(self.context.theme.font(mono=True))
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """The matrix in the mosaic, and its errors."""
         matrix = self.matrices.get(str(self.matrix_selector.currentData()))
         if matrix is None:
             return ()

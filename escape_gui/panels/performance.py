@@ -63,7 +63,6 @@ class PerformancePanel(Panel):
         self._last_state_s = time.monotonic()
 
     def on_state(self, state: State) -> None:
-        """Another point of each curve."""
         loop, now = state.loop, time.monotonic()
         if loop.closed:
             self.show_placeholder(False)
@@ -86,7 +85,6 @@ class PerformancePanel(Panel):
         self.readouts["residual"].show_value("–" if np.isnan(residual) else f"{residual:.1f}")
 
     def tick(self, source: DataSource) -> None:
-        """The charts move on even when nothing comes."""
         if self.shows_placeholder:
             return
         now = time.monotonic()
@@ -94,12 +92,10 @@ class PerformancePanel(Panel):
         self.residual.show_history(self._history["residual"], now)
 
     def clear(self) -> None:
-        """Another source."""
         for history in self._history.values():
             history.clear()
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """One table of both curves; seconds before now."""
         if self.shows_placeholder:
             return ()
         times, strehl = self._history["strehl"].arrays

@@ -132,7 +132,6 @@ class ProcedurePanel(Panel):
 
     # ------------------------------------------------------------ data
     def tick(self, source: DataSource) -> None:
-        """Once the server says what it offers, make the list."""
         if not self._entries and source.connected and (found := source.procedures()):
             self._entries = {one.name: one for one in found}
             for one in found:
@@ -147,7 +146,6 @@ class ProcedurePanel(Panel):
         self._enable()
 
     def on_state(self, state: State) -> None:
-        """Progress, products to choose from, and how the last one ended."""
         self._state = state
         self.form.set_matrix_choices(form_text.matrices(state.products))
         running = state.procedure
@@ -166,7 +164,6 @@ class ProcedurePanel(Panel):
             self._show_ended(state.last)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """The matrix that is being measured tells which mode is known worst."""
         self._matrix[stream] = sample.data
 
     def _metrics_text(self, metrics: Mapping[str, float]) -> str:
@@ -190,7 +187,6 @@ class ProcedurePanel(Panel):
         return self._ended.products.get(name, "") if self._ended is not None else ""
 
     def clear(self) -> None:
-        """Forget what another server offered."""
         self._entries, self._plan, self._ended = {}, None, None
         self._documents.clear()
         self._matrix.clear()
@@ -298,13 +294,11 @@ class ProcedurePanel(Panel):
             QDesktopServices.openUrl(QUrl.fromLocalFile(path))
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Words wrap anew."""
         super().resizeEvent(event)
         for label in (self._description, self.plan, self.progress, self._metrics):
             _fit_height(label)
 
     def apply_theme(self) -> None:
-        """Numbers in letters that do not jitter."""
         theme = self.context.theme
         for label in (self.progress, self._metrics, self.numbers):
             label.setFont(theme.font(0.95, mono=True))

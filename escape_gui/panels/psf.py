@@ -79,7 +79,6 @@ class PsfPanel(Panel):
         self._update_model_caption()
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """Another image, or the model."""
         self._images[stream] = sample.data
         self._update_model_caption()
         self.pictures[stream].show_array(sample.data)
@@ -109,7 +108,6 @@ class PsfPanel(Panel):
         return self._radial(light) / total if total > 0 else np.zeros(0)
 
     def clear(self) -> None:
-        """Another source."""
         self._images.clear()
         self._profiles.clear()
         self._update_model_caption()
@@ -118,7 +116,6 @@ class PsfPanel(Panel):
             self._curves[key].setData([], [])
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """Both images and their profiles."""
         images = [ExportArray(key, data, "count") for key, data in self._images.items()]
         profiles = [
             ExportArray(f"{key}_profile", data, "share per pixel") for key, data in self._profiles.items()

@@ -104,7 +104,6 @@ class SprintPanel(Panel):
             self._document, self._dirty = last.document, True
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """Another iteration, or another second of tracking."""
         self._data[stream] = sample.data
         self._dirty = True
         if self._running:
@@ -113,7 +112,6 @@ class SprintPanel(Panel):
             self.tabs.setCurrentIndex(1)
 
     def tick(self, source: DataSource) -> None:
-        """Draw when anything is new."""
         if not self._dirty:
             return
         self._dirty = False
@@ -154,7 +152,6 @@ class SprintPanel(Panel):
         self._notes.setStyleSheet(f"color: {colour};")
 
     def clear(self) -> None:
-        """Forget the fit of another source."""
         self._data.clear()
         self._history, self._document, self._last_result_id = None, {}, -1
         self.plot.show_convergence(None)
@@ -162,14 +159,12 @@ class SprintPanel(Panel):
         self.tabs.setCurrentIndex(0)
 
     def apply_theme(self) -> None:
-        """Signs in the curves' colours, numbers in letters that do not jitter."""
         theme = self.context.theme
         for k, (sign, value) in enumerate(zip(self._markers, self._values, strict=True)):
             sign.setStyleSheet(f"color: {theme.series(k).name()};")
             value.setFont(theme.font(mono=True))
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """Parameters by iteration in the paper's units, and the track."""
         found = []
         if self._history is not None:
             table = np.column_stack([self._history.iterations, self._history.step_norm, self._history.values])

@@ -13,13 +13,7 @@ _STEPS, _STEP_MS = 60, 150
 
 
 class PlaybackBar(QToolBar):
-    """Shown while a recording is open that has a course: iterations, rounds, a track.
-
-    Parameters
-    ----------
-    session
-        Its source is moved through when it is a recording.
-    """
+    """Shown while a recording is open that has a course: iterations, rounds, a track."""
 
     def __init__(self, session: Session) -> None:
         super().__init__("Recording")

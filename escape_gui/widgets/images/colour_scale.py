@@ -29,8 +29,6 @@ class ColourScale(QWidget):
 
     Parameters
     ----------
-    theme
-        Colours and fonts.
     name
         The colour map.
     """
@@ -68,7 +66,6 @@ class ColourScale(QWidget):
         self.apply_theme()
 
     def apply_theme(self) -> None:
-        """Follow the palette."""
         text = self._theme.colour("text")
         self._plot.setBackground(self._theme.colour("panel"))
         axis = self._plot.getAxis("right")

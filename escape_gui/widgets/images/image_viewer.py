@@ -37,8 +37,6 @@ class ImageViewer(QWidget):
 
     Parameters
     ----------
-    theme
-        Colours.
     name
         What it shows, for screen readers.
     maps
@@ -153,7 +151,6 @@ class ImageViewer(QWidget):
         return (low, high) if high > low else (low - 0.5, low + 0.5)
 
     def clear(self) -> None:
-        """Show nothing."""
         self.data = None
         self.image.clear()
         self._marks.hide()
@@ -207,7 +204,6 @@ class ImageViewer(QWidget):
         self.cursor_changed.emit(f"x {column:4d}  y {row:4d}  {text:>8} {self.unit}".rstrip())
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Keys of pictures, see :mod:`escape_gui.window.help_pages`."""
         key = Qt.Key(event.key())
         if key in _CURSOR_STEPS and self.data is not None:
             rows, columns = self.data.shape
@@ -232,7 +228,6 @@ class ImageViewer(QWidget):
             super().keyPressEvent(event)
 
     def focusOutEvent(self, event: Any) -> None:
-        """Without the focus no cross."""
         self._cross.hide()
         super().focusOutEvent(event)
 
@@ -246,8 +241,6 @@ class ImageToolbar(QWidget):
 
     Parameters
     ----------
-    theme
-        Fonts.
     picture
         Its picture.
     logarithmic

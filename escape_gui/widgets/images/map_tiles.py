@@ -57,12 +57,10 @@ class MapImage(QWidget):
         self.update()
 
     def sizeHint(self) -> QSize:
-        """As large as its pixels, at least."""
         rows, columns = self._pixels.shape[:2]
         return QSize(columns, rows)
 
     def paintEvent(self, event: QPaintEvent) -> None:
-        """Draw it in the middle."""
         rows, columns = self._pixels.shape[:2]
         if not rows:
             return
@@ -74,13 +72,7 @@ class MapImage(QWidget):
 
 
 class MapTiles(QWidget):
-    """One mode as several matrices see it.
-
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
-    """
+    """One mode as several matrices see it."""
 
     def __init__(self, theme: Theme) -> None:
         super().__init__()
@@ -98,7 +90,6 @@ class MapTiles(QWidget):
         return tuple(one.title for one in self._tiles)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Arrange them anew."""
         super().resizeEvent(event)
         self._arrange()
 
@@ -144,7 +135,6 @@ class MapTiles(QWidget):
         return f"<b>{tile.title}</b><br><span style='color:{muted}'>{tile.note}<br>colours {scale}</span>"
 
     def apply_theme(self) -> None:
-        """Follow the palette."""
         for _, title, _ in self._tile_widgets:
             title.setFont(self._theme.font(0.9))
         self.show_tiles(self._tiles)

@@ -37,11 +37,6 @@ class ModeMosaic(QWidget):
     """Mode maps, page by page.
 
     The arrow keys move the chosen mode, Page Up and Page Down turn pages.
-
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
     """
 
     #: A :class:`MosaicPixel`, or ``None`` outside of the maps.
@@ -201,7 +196,6 @@ class ModeMosaic(QWidget):
         )
 
     def apply_theme(self) -> None:
-        """Follow the palette."""
         self._accent = self._theme.colour("accent")
         self._view.setBackground(self._theme.colour("panel"))
         self._arrange()
@@ -230,7 +224,6 @@ class ModeMosaic(QWidget):
             self.choose(spot.mode)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Arrow keys choose, Page Up and Page Down turn."""
         steps = {
             Qt.Key.Key_Right: 1,
             Qt.Key.Key_Left: -1,
@@ -248,6 +241,5 @@ class ModeMosaic(QWidget):
             super().keyPressEvent(event)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Lay the modes out again."""
         super().resizeEvent(event)
         self._arrange()

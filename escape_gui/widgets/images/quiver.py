@@ -18,13 +18,7 @@ _PER_PIXEL = 0.8
 
 
 class Quiver(pg.PlotCurveItem):  # type: ignore[misc]
-    """Arrows at the sub-apertures' centres; a dot of the shaft's width marks where each begins.
-
-    Parameters
-    ----------
-    theme
-        Colours.
-    """
+    """Arrows at the sub-apertures' centres; a dot of the shaft's width marks where each begins."""
 
     def __init__(self, theme: Theme) -> None:
         super().__init__()
@@ -55,7 +49,6 @@ class Quiver(pg.PlotCurveItem):  # type: ignore[misc]
         self.setData(x, y, connect="pairs")
 
     def apply_theme(self) -> None:
-        """Take the theme's colours."""
         self.setPen(pg.mkPen(self._theme.series(0), width=1))
 
 

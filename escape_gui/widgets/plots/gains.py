@@ -18,13 +18,7 @@ _EARLIER_ROUNDS_ALPHA = 0.45
 
 
 class GainsPlot(QWidget):
-    """Raw points with error bars, their smooth course, and a line at 1 on each axis.
-
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
-    """
+    """Raw points with error bars, their smooth course, and a line at 1 on each axis."""
 
     def __init__(self, theme: Theme) -> None:
         super().__init__()

@@ -36,8 +36,6 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
 
     Parameters
     ----------
-    theme
-        Colours and fonts.
     name
         What it shows, for screen readers.
     x, y
@@ -84,7 +82,6 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         return pg.mkPen(self._theme.series(number), width=1, style=dash)
 
     def apply_theme(self) -> None:
-        """Take the theme's colours and fonts."""
         colours = self._theme.colours
         self.setBackground(colours.field)
         small = self._theme.font(0.85)
@@ -134,7 +131,6 @@ def add_plot(grid: pg.GraphicsLayoutWidget, row: int = 0) -> pg.PlotItem:
 
 
 def clear(grid: pg.GraphicsLayoutWidget) -> None:
-    """Take the plots out of a grid, with the menus that they leave behind."""
     for item in tuple(grid.ci.items):
         if isinstance(item, pg.PlotItem):
             item.ctrlMenu.deleteLater()

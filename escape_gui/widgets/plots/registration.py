@@ -15,13 +15,7 @@ LEFT_AXIS_WIDTH = 66
 
 
 class ConvergencePlot(QWidget):
-    """Step norm above; below, all parameters on one axis, or each kind in its own unit.
-
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
-    """
+    """Step norm above; below, all parameters on one axis, or each kind in its own unit."""
 
     def __init__(self, theme: Theme) -> None:
         super().__init__()
@@ -111,13 +105,7 @@ class ConvergencePlot(QWidget):
 
 
 class DriftPlot(QWidget):
-    """Change of shift, rotation and scaling since the first look, with their errors.
-
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
-    """
+    """Change of shift, rotation and scaling since the first look, with their errors."""
 
     def __init__(self, theme: Theme) -> None:
         super().__init__()

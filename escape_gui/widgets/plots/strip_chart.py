@@ -33,7 +33,6 @@ class TimeSeriesBuffer:
         self._end += 1
 
     def clear(self) -> None:
-        """Forget everything."""
         self._end = 0
 
     @property
@@ -48,8 +47,6 @@ class StripChart(Plot):
 
     Parameters
     ----------
-    theme
-        Colours and fonts.
     name
         What it shows.
     y
