@@ -37,7 +37,7 @@ class UpdateTimer(QObject):
         self.frozen = False
         #: Reason by name of the panel; cleared when the source changes.
         self.failed_panels: dict[str, str] = {}
-        session.changed.connect(self.failed_panels.clear)
+        session.changed.connect(self._reset_failures)
         self._timer = QTimer(self)
         self._timer.setTimerType(Qt.TimerType.PreciseTimer)
         self._timer.timeout.connect(self.tick)
@@ -72,6 +72,9 @@ class UpdateTimer(QObject):
             panel.show_placeholder(
                 True, f"Panel failed: {reason}\n\nThe log has the details. Other panels are not affected."
             )
+
+    def _reset_failures(self) -> None:
+        self.failed_panels.clear()
 
 
 def is_on_screen(panel: Panel) -> bool:
