@@ -252,6 +252,8 @@ class LocalServer:
                 self.process.wait(_EXIT_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 log.warning(
-                    "server %d did not exit within %g s; leaving it running", self.process.pid, _EXIT_TIMEOUT_S
+                    "server %d did not exit within %g s; leaving it running",
+                    self.process.pid,
+                    _EXIT_TIMEOUT_S,
                 )
         self._stderr.close()

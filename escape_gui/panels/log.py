@@ -45,9 +45,7 @@ class LogPanel(Panel):
         self.level.currentIndexChanged.connect(self._refilter)
         self.copy_button = QPushButton("Copy")
         self.copy_button.setToolTip("Copy the lines shown")
-        self.copy_button.clicked.connect(
-            lambda: QGuiApplication.clipboard().setText(self.text.toPlainText())
-        )
+        self.copy_button.clicked.connect(lambda: QGuiApplication.clipboard().setText(self.text.toPlainText()))
         self.text = QPlainTextEdit()
         self.text.setReadOnly(True)
         self.text.setMaximumBlockCount(MAX_LINES)

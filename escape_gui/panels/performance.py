@@ -73,9 +73,7 @@ class PerformancePanel(Panel):
         sigma = "" if loop.strehl_sigma is None else f" ± {100 * loop.strehl_sigma:.1f}"
         self.readouts["strehl"].show_value("–" if np.isnan(strehl) else f"{strehl:.1f}{sigma}")
         has_reference = any(stream.name == "model_psf" for stream in state.streams)
-        self.reference_missing_label.setVisible(
-            loop.closed and bool(np.isnan(strehl)) and not has_reference
-        )
+        self.reference_missing_label.setVisible(loop.closed and bool(np.isnan(strehl)) and not has_reference)
         self.readouts["residual"].show_value("–" if np.isnan(residual) else f"{residual:.1f}")
 
     def tick(self, source: DataSource) -> None:

@@ -25,7 +25,9 @@ PHASES: dict[Phase, Level] = {
 #: Fraction of saturated pixels from which the indicator shows a warning and an error.
 SATURATION_WARNING, SATURATION_ERROR = 0.001, 0.01
 #: Banner before the first connection.
-NOT_CONNECTED_TEXT = "NOT CONNECTED · start a server with 'escape serve SYSTEM', or open a recorded run (File)"
+NOT_CONNECTED_TEXT = (
+    "NOT CONNECTED · start a server with 'escape serve SYSTEM', or open a recorded run (File)"
+)
 
 
 class ConnectionBanner(QLabel):
