@@ -20,7 +20,7 @@ _MONO = ("JetBrains Mono", "Noto Sans Mono", "DejaVu Sans Mono", "Liberation Mon
 
 @dataclass(frozen=True, slots=True)
 class Palette:
-    """Colours of a theme. Every text colour has a contrast of at least 4.5 : 1 on the surfaces it is used on."""
+    """Colours of a theme. Text has a contrast of at least 4.5 : 1 on every surface that it is used on."""
 
     #: Surfaces from back to front: window, panel, plots and fields, buttons.
     window: str

@@ -57,7 +57,7 @@ def measure(name: str, size: tuple[int, int], sets: list[dict[str, Sample]]) -> 
     session, source = Session(), ScriptedSource()
     window = MainWindow(session, Settings(workspace=name))
     window.resize(*size)
-    session.use(source, ScriptedControl())
+    session.set_source(source, ScriptedControl())
     window.show()
     qt.processEvents()
     _push(source, sets[0])

@@ -62,7 +62,7 @@ class LiveSource:
         return self.connection.state
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
-        """Newest entry of a stream unless it is number ``after``; of a remote server, the last one fetched."""
+        """Newest entry of a stream unless its index is ``after``; for a remote server, the last fetched."""
         if self.is_local:
             return self.connection.latest(stream, after)
         self._requested_s[stream] = time.monotonic()

@@ -144,7 +144,7 @@ class EmptySource:
 
 
 class Session(QObject):
-    """The data source of a window and the sender of its requests; both change when another source is opened."""
+    """Data source of a window and sender of its requests; both change when another source is opened."""
 
     #: The source was replaced; panels clear their content.
     changed = Signal()

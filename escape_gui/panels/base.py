@@ -147,7 +147,7 @@ class Panel(QWidget):
         self.show_placeholder(bool(self.placeholder))
 
     def show_placeholder(self, placeholder: bool, why: str | None = None) -> None:
-        """Show the placeholder, with the text ``why`` instead of :attr:`placeholder` if given, or the content."""
+        """Show the placeholder (``why`` replaces its text) or the content."""
         if why is not None:
             self._placeholder_label.setText(why)
         elif placeholder:

@@ -121,7 +121,7 @@ class Exporter:
         self._notifications, self._on_saved = notifications, on_saved
 
     def panel(self, kind: str, panel: Panel | None) -> None:
-        """Ask for a path and save a panel as ``png``, ``csv`` or ``fits``; ``None``: no panel has the focus."""
+        """Ask for a path and save a panel, if one has the focus, as ``png``, ``csv`` or ``fits``."""
         if panel is None:
             why = "Click a panel first, or use the ⤓ in its title."
             self._notifications.show_message(Level.WARNING, "Which panel?", why)

@@ -13,7 +13,7 @@ import pytest
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 
 import shiboken6
-from gui_windows import dispose, settle, shown
+from gui_windows import dispose, settle, show_window
 from PySide6.QtCore import QTimer
 from PySide6.QtWidgets import QApplication
 from scripted import ScriptedControl, ScriptedSource
@@ -101,7 +101,7 @@ def make_window(session: Session, tmp_path: Path) -> Iterator[Callable[..., Main
     made: list[MainWindow] = []
 
     def make(panels: Sequence[type[Panel]] = PANELS, settings: Settings | None = None) -> MainWindow:
-        made.append(shown(session, tmp_path / "gui.json", panels, settings))
+        made.append(show_window(session, tmp_path / "gui.json", panels, settings))
         for dock in made[-1].docks.values() if len(panels) == 1 else ():
             dock.show()
         made[-1].update_timer.tick(force=True)
@@ -116,7 +116,7 @@ def make_window(session: Session, tmp_path: Path) -> Iterator[Callable[..., Main
 @pytest.fixture
 def window(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
     """The whole window."""
-    window = shown(session, tmp_path / "gui.json")
+    window = show_window(session, tmp_path / "gui.json")
     yield window
     dispose(window)
 
@@ -124,6 +124,6 @@ def window(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
 @pytest.fixture
 def small_window(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
     """A window of three panels, for what does not concern the others."""
-    window = shown(session, tmp_path / "gui.json", (DevicesPanel, CameraPanel, LogPanel))
+    window = show_window(session, tmp_path / "gui.json", (DevicesPanel, CameraPanel, LogPanel))
     yield window
     dispose(window)

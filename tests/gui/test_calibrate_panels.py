@@ -9,7 +9,7 @@ from pathlib import Path
 import fake_results as fake
 import numpy as np
 import pytest
-from gui_windows import dispose, shown
+from gui_windows import dispose, show_window
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
@@ -36,7 +36,7 @@ from escape_hw.remote.state import (
     ProductEntry,
 )
 
-OFFERS = (
+PROCEDURES = (
     ProcedureEntry(
         name="escape",
         title="ESCAPE",
@@ -67,7 +67,7 @@ RUNNING = ActiveRun(
 @pytest.fixture
 def source() -> ScriptedSource:
     source = ScriptedSource()
-    source.offers = OFFERS
+    source.offers = PROCEDURES
     source.change(phase=Phase.IDLE, products=())
     return source
 
@@ -75,7 +75,7 @@ def source() -> ScriptedSource:
 @pytest.fixture
 def calibrate(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
     kinds = (ProcedurePanel, ModesPanel, SprintPanel, GainsPanel)
-    window = shown(session, tmp_path / "gui.json", kinds, Settings(workspace="calibrate"))
+    window = show_window(session, tmp_path / "gui.json", kinds, Settings(workspace="calibrate"))
     window.resize(1600, 1000)
     for dock in window.docks.values():
         dock.show()
@@ -121,12 +121,12 @@ def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
     look(calibrate)
     assert not panel.shows_placeholder
     assert panel.matrix_selector.currentData() == LIVE_LABEL
-    assert panel.matrix_selector.currentText() == "DO-CRIME, as measured now"
+    assert panel.matrix_selector.currentText() == "DO-CRIME, live"
     pale = contrast(panel)
     measure(source, 1.0)
     look(calibrate)
     assert contrast(panel) > 2 * pale
-    panel.fade.setChecked(False)
+    panel.weight_by_snr.setChecked(False)
     assert contrast(panel) > 2 * pale
 
 
@@ -156,15 +156,16 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     until(lambda: mosaic.mode == 4, calibrate)
     assert panel.detail.isVisible()
     assert panel.detail.titles == (
-        "push-pull", "DO-CRIME", "ESCAPE", "ESCAPE − push-pull", "Error of DO-CRIME", "SNR of DO-CRIME",
+        "push-pull", "DO-CRIME", "ESCAPE", "ESCAPE − push-pull", "Standard error of DO-CRIME",
+        "SNR of DO-CRIME",
     )  # fmt: skip
-    assert panel._words.text().startswith("mode 5  rms slope")
+    assert panel._status_label.text().startswith("mode 5  rms slope")
     mosaic.setFocus()
     QTest.keyClick(mosaic, Qt.Key.Key_Right)
     assert mosaic.mode == 5
     QTest.keyClick(mosaic, Qt.Key.Key_Escape)
     assert not panel.detail.isVisible()
-    names = [array.name for array in panel.shown()]
+    names = [array.name for array in panel.export_arrays()]
     assert names == ["matrix", "sigma"]
 
 
@@ -203,7 +204,7 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     source.push("registration_sigma", np.full(5, np.nan))
     source.push("step_norm", norm[:6])
     look(calibrate)
-    assert panel._indicator.word == "running, 6 iterations"
+    assert panel._indicator.text == "running, 6 iterations"
     source.push("registration", path * TO_STREAM_UNITS)
     source.push("registration_sigma", estimate.sigma * TO_STREAM_UNITS)
     source.push("step_norm", norm)
@@ -211,17 +212,17 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     ended = FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document)
     source.change(phase=Phase.IDLE, procedure=None, last=ended)
     look(calibrate)
-    assert panel._indicator.word == "converged, 18 iterations"
+    assert panel._indicator.text == "converged, 18 iterations"
     assert "±" in panel._values[0].text()
     assert "tangential_scaling is consistent with zero" in panel._notes.text()
     # Runs that fit no registration leave the verdict as it is, gains that did not converge among them.
     for k, name, told in ((4, "push-pull", None), (5, "gains", False)):
         source.change(last=FinishedRun(id=k, name=name, finish=Finish.ABORTED, document={"converged": told}))
         look(calibrate)
-        assert panel._indicator.word == "converged, 18 iterations"
+        assert panel._indicator.text == "converged, 18 iterations"
     press(panel.units)
     assert panel.plot.physical
-    table = panel.shown()[0].data
+    table = panel.export_arrays()[0].data
     np.testing.assert_allclose(table[:, 2:], path, rtol=1e-6)
 
 
@@ -233,7 +234,7 @@ def test_a_drift_is_followed(calibrate, source):
     source.push("registration_track", track)
     look(calibrate)
     assert panel.tabs.currentIndex() == 1
-    np.testing.assert_allclose(panel.shown()[-1].data[-1, 1], 2.9)
+    np.testing.assert_allclose(panel.export_arrays()[-1].data[-1, 1], 2.9)
 
 
 def test_gains_appear_round_by_round(calibrate, source):
@@ -248,7 +249,7 @@ def test_gains_appear_round_by_round(calibrate, source):
     assert "median 0.700" in panel._legend.text()
     assert "2 rounds" in panel._legend.text()
     press_box(panel)
-    assert panel.shown()[0].data.shape == (20, 5)
+    assert panel.export_arrays()[0].data.shape == (20, 5)
 
 
 def press_box(panel: GainsPanel) -> None:
@@ -268,7 +269,7 @@ def test_from_the_form_to_the_start(calibrate, source, control):
     arguments = {"frames": 200, "pokes": "shaped"}
     assert ("check", {"procedure": "escape", "arguments": arguments}) in control.asked
     assert "frames" in panel.plan.text()
-    assert "% of the stroke" in panel.plan.text()
+    assert "% of stroke" in panel.plan.text()
     press(panel.start)
     until(lambda: any(verb == "start" for verb, _ in control.asked), calibrate)
     assert ("start", {"args": ("escape",), **arguments}) in control.asked
@@ -300,7 +301,7 @@ def test_a_procedure_is_watched_halted_and_stopped(calibrate, source, control):
     panel = calibrate.panels["procedure"]
     look(calibrate)
     assert not panel.abort.isEnabled()
-    assert "no procedure runs" in panel.abort.toolTip()
+    assert "no procedure is running" in panel.abort.toolTip()
     measure(source, 1.0)
     source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
     look(calibrate)
@@ -309,12 +310,12 @@ def test_a_procedure_is_watched_halted_and_stopped(calibrate, source, control):
     assert panel.progress.text() == "DO-CRIME: 610 of 1000 frames, 4:12 min left"
     assert "worst mode 1: SNR" in panel._metrics.text()
     assert panel.bar.value() == 610
-    assert "a procedure runs" in panel.start.toolTip()
+    assert "a procedure is running" in panel.start.toolTip()
     press(panel.pause)
     until(lambda: ("pause", {}) in control.asked, calibrate)
     source.change(procedure=RUNNING.model_copy(update={"paused": True}))
     look(calibrate)
-    assert panel.pause.text() == "Go on"
+    assert panel.pause.text() == "Resume"
     press(panel.pause)
     until(lambda: ("resume", {}) in control.asked, calibrate)
     press(panel.abort)

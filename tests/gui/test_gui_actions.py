@@ -36,8 +36,8 @@ class Stage:
 
     def refused(self, name: str) -> None:
         """What was chosen is no recording, and a note says so."""
-        self.bot.waitUntil(lambda: bool(self.window.notifications.notes), timeout=5000)
-        assert name in self.window.notifications.notes[-1].text
+        self.bot.waitUntil(lambda: bool(self.window.notifications.notifications), timeout=5000)
+        assert name in self.window.notifications.notifications[-1].text
 
     def saved(self, ending: str) -> Path:
         """One file was saved."""
@@ -146,7 +146,7 @@ def test_every_action_does_what_it_says(
     SETTINGS.get(action.name, lambda _: None)(source)
     if action.name == "reset_layout":
         window.docks["log"].close()
-    window.panels["camera"].picture.setFocus()
+    window.panels["camera"].image_view.setFocus()
     window.refresh()
     entry = window.actions_by_name[action.name]
     assert entry.isEnabled(), entry.toolTip()
@@ -159,10 +159,10 @@ def test_every_action_does_what_it_says(
 @pytest.mark.parametrize(
     ("names", "state", "reason"),
     [
-        (("abort", "pause"), {}, "no procedure runs"),
+        (("abort", "pause"), {}, "no procedure is running"),
         (("take_control",), {}, "you have control"),
         (("give_back",), {"lease": None}, "you do not have control"),
-        (("clear_fault",), {}, "there is no fault"),
+        (("clear_fault",), {}, "no active fault"),
         (("record", "pause"), {"lease": None}, "take control first"),
         (("record",), {"lease": SOMEBODY}, "ben on control has control"),
     ],
@@ -188,10 +188,10 @@ def test_without_a_server_nothing_can_be_asked(small_window: MainWindow, source:
     asking = [one for one in ACTIONS if one.menu == "&Loop"]
     source.connected = False
     window.refresh()
-    assert all("does not answer" in window.actions_by_name[one.name].toolTip() for one in asking)
+    assert all("server not responding" in window.actions_by_name[one.name].toolTip() for one in asking)
     window.context.session.set_source(source, None)
     window.refresh()
-    assert all("replayed" in window.actions_by_name[one.name].toolTip() for one in asking)
+    assert all("replay of a recorded run" in window.actions_by_name[one.name].toolTip() for one in asking)
     assert not any(window.actions_by_name[one.name].isEnabled() for one in asking)
 
 

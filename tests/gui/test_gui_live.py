@@ -58,9 +58,9 @@ class Network:
 def network(monkeypatch: pytest.MonkeyPatch) -> Network:
     network = Network()
     monkeypatch.setattr(live, "connect", network.connect)
-    monkeypatch.setattr(live, "_DEAD_S", 0.3)
+    monkeypatch.setattr(live, "_RECONNECT_AFTER_S", 0.3)
     monkeypatch.setattr(live, "_RETRY_S", 0.02)
-    monkeypatch.setattr(live, "_HERE_S", 0.02)
+    monkeypatch.setattr(live, "_LOCAL_PERIOD_S", 0.02)
     return network
 
 

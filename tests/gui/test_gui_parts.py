@@ -17,7 +17,7 @@ from escape_gui.app import require_display
 from escape_gui.client.session import RequestSender
 from escape_gui.settings import Settings, load_settings, save_settings
 from escape_gui.theme import PALETTES, SCALES, Palette, Theme, contrast
-from escape_gui.views.images import GAP, ActuatorImage, RadialProfile, mask_from_rows, slope_map_pair
+from escape_gui.views.images import MAP_GAP, ActuatorImage, RadialProfile, mask_from_rows, slope_map_pair
 from escape_gui.views.loop_form import LoopSettingsEdit
 from escape_gui.widgets.images.quiver import outline_points
 from escape_gui.widgets.plots.strip_chart import TimeSeriesBuffer
@@ -168,9 +168,9 @@ def test_slopes_become_two_maps() -> None:
     valid = disc(5)
     n = int(valid.sum())
     maps = slope_map_pair(np.arange(2.0 * n), valid)
-    assert maps.shape == (5, 10 + GAP)
+    assert maps.shape == (5, 10 + MAP_GAP)
     assert maps[:, :5][valid].tolist() == list(range(n))
-    assert maps[:, 5 + GAP :][valid].tolist() == list(range(n, 2 * n))
+    assert maps[:, 5 + MAP_GAP :][valid].tolist() == list(range(n, 2 * n))
     assert int(np.isfinite(maps).sum()) == 2 * n
 
 
@@ -183,18 +183,18 @@ def test_actuators_on_a_grid_have_a_square_each() -> None:
     chart = ActuatorImage(Geometry(layout=rows_of(mask)))
     values = np.arange(chart.n_act, dtype=float)
     assert chart.n_act == int(mask.sum())
-    picture = chart.picture(values)
-    assert picture[mask].tolist() == values.tolist()
-    assert np.isnan(picture[~mask]).all()
+    image = chart.to_image(values)
+    assert image[mask].tolist() == values.tolist()
+    assert np.isnan(image[~mask]).all()
 
 
 def test_actuators_without_a_grid_stand_at_their_places() -> None:
     places = secondary().places_m
     chart = ActuatorImage(Geometry(places_m=places))
-    picture = chart.picture(np.array([x for x, _ in places]))
+    image = chart.to_image(np.array([x for x, _ in places]))
     # Values rise to the right as the places do, and every actuator is to be seen.
-    rows, columns = np.nonzero(np.isfinite(picture))
-    assert np.corrcoef(columns, picture[rows, columns])[0, 1] > 0.99
+    rows, columns = np.nonzero(np.isfinite(image))
+    assert np.corrcoef(columns, image[rows, columns])[0, 1] > 0.99
     assert set(np.unique(chart.numbers)) == {-1, *range(len(places))}
 
 

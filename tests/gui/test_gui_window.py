@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from gui_windows import dispose, settle, shown
+from gui_windows import dispose, settle, show_window
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtWidgets import (
     QAbstractButton,
@@ -94,18 +94,18 @@ def test_the_band_says_what_it_is(small_window: MainWindow, source: ScriptedSour
     source.connected = False
     window.refresh()
     assert connection_banner.text().startswith("NOT CONNECTED")
-    assert window.notifications.notes[-1].title == "Server lost"
+    assert window.notifications.notifications[-1].title == "Server lost"
     window.context.session.set_source(source, None)
     window.refresh()
     assert connection_banner.text().startswith("REPLAY")
 
 
 def test_light_is_unknown_until_frames_come(small_window: MainWindow, source: ScriptedSource) -> None:
-    light = small_window.header.light
-    assert (light.level, light.word) == (Level.GOOD, "saturated 0.04 %")
+    indicator = small_window.header.saturation
+    assert (indicator.level, indicator.text) == (Level.GOOD, "saturated 0.04 %")
     source.change(rates=FrameCounters())
     small_window.refresh()
-    assert (light.level, light.word) == (Level.NEUTRAL, "saturated –")
+    assert (indicator.level, indicator.text) == (Level.NEUTRAL, "saturated –")
 
 
 def test_a_fault_stays_until_it_is_cleared(
@@ -118,7 +118,7 @@ def test_a_fault_stays_until_it_is_cleared(
     assert window.fault_banner.isVisible()
     assert "no frames for 0.5 s" in window.fault_banner._text.text()
     assert "cable" in window.fault_banner._text.text()
-    assert window.notifications.notes[-1].title == "Fault, mirror made safe"
+    assert window.notifications.notifications[-1].title == "Fault, mirror made safe"
     source.change(fault=None)
     window.refresh()
     assert not window.fault_banner.isVisible()
@@ -129,10 +129,10 @@ def test_the_end_of_a_run_is_told(small_window: MainWindow, source: ScriptedSour
         last=FinishedRun(id=1, name="escape", finish=Finish.FAILED, message="too dark", folder="/runs/2")
     )
     small_window.refresh()
-    note = small_window.notifications.notes[-1]
+    note = small_window.notifications.notifications[-1]
     assert (note.title, note.text) == ("escape failed", "too dark\n/runs/2")
     note.close_button.click()
-    assert small_window.notifications.notes == []
+    assert small_window.notifications.notifications == []
 
 
 def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: ScriptedSource) -> None:
@@ -183,7 +183,7 @@ def test_a_note_covers_nothing(
     notifications.show_message(Level.ERROR, "Not saved", "the disk is full, " * 40 + "\n/runs/2")
     notifications.show_message(Level.GOOD, "Saved", "/runs/3")
     qapp.processEvents()
-    bad, good = notifications.notes
+    bad, good = notifications.notifications
     assert good.isVisible()
     assert not bad.isVisible()
     assert {name: dock.geometry() for name, dock in window.docks.items()} == where
@@ -191,7 +191,7 @@ def test_a_note_covers_nothing(
     assert window.width() == 1280
     assert "/runs/2" in bad.toolTip()
     # What informs goes by itself; what is bad comes back and stays.
-    qtbot.waitUntil(lambda: notifications.notes == [bad], timeout=60_000)
+    qtbot.waitUntil(lambda: notifications.notifications == [bad], timeout=60_000)
     qapp.processEvents()
     assert bad.isVisible()
     assert bad.close_button.mapTo(window, QPoint(0, 0)).x() < window.width()
@@ -200,9 +200,9 @@ def test_a_note_covers_nothing(
 def test_a_refused_request_is_told(small_window: MainWindow, control: ScriptedControl, qtbot: QtBot) -> None:
     control.refuse = "ben has control since 20:00"
     small_window.actions_by_name["give_back"].trigger()
-    qtbot.waitUntil(lambda: bool(small_window.notifications.notes))
-    note = small_window.notifications.notes[-1]
-    assert (note.title, note.text) == ("Could not give control back", "ben has control since 20:00")
+    qtbot.waitUntil(lambda: bool(small_window.notifications.notifications))
+    note = small_window.notifications.notifications[-1]
+    assert (note.title, note.text) == ("Could not release control", "ben has control since 20:00")
 
 
 def test_hidden_panels_cost_nothing(window: MainWindow, source: ScriptedSource) -> None:
@@ -249,11 +249,11 @@ def test_a_broken_panel_does_not_stop_the_others(
 def test_frozen_panels_hold_but_the_band_goes_on(small_window: MainWindow, source: ScriptedSource) -> None:
     window = small_window
     window.toggle_freeze()
-    before = window.panels["camera"].picture.data
+    before = window.panels["camera"].image_view.data
     source.push_all(2)
     source.change(rates=source.state.rates.model_copy(update={"frame_hz": 123.4}))
     window.update_timer.tick(force=True)
-    assert window.panels["camera"].picture.data is before
+    assert window.panels["camera"].image_view.data is before
     assert window.header.readouts["rate"].text == "123.4"
 
 
@@ -263,7 +263,7 @@ def test_layout_and_look_are_remembered(make_window: MakeWindow, tmp_path: Path)
     window.docks["log"].close()
     window.show_workspace("align")
     window.toggle_theme()
-    window.step_font_scale(+1)
+    window.context.theme.step_scale(+1)
     window.close()
     settings, warnings = load_settings(settings_path)
     assert warnings == ()
@@ -308,7 +308,7 @@ def test_nothing_of_the_band_is_cut_off(make_window: MakeWindow, scale: float) -
     window.resize(round(1280 * max(scale, 1)), 800)
     QApplication.processEvents()
     header = window.header
-    for widget in (*header.readouts.values(), header.phase, header.loop, header.light, header.control):
+    for widget in (*header.readouts.values(), header.phase, header.loop, header.saturation, header.control):
         assert widget.width() >= widget.sizeHint().width()
         assert widget.geometry().right() < header.open_button.geometry().left()
 
@@ -317,15 +317,15 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
     session = Session()
     quiet: DataSource = EmptySource()
     assert not quiet.connected
-    window = shown(session, tmp_path / "gui.json")
+    window = show_window(session, tmp_path / "gui.json")
     assert window.panels["camera"].shows_placeholder
     header = window.header
     assert "escape serve SYSTEM" in header.connection_banner.text()
-    assert "old" not in header.connection_banner.text()
+    assert "stale" not in header.connection_banner.text()
     assert {one.text for one in header.readouts.values()} == {"–"}
-    for loop_indicator in (header.phase, header.loop, header.light, header.control):
+    for loop_indicator in (header.phase, header.loop, header.saturation, header.control):
         assert loop_indicator.level is Level.NEUTRAL
-        assert loop_indicator.word.endswith("–")
+        assert loop_indicator.text.endswith("–")
     assert "escape serve SYSTEM" in window.panels["loop"]._placeholder_label.text()
     dispose(window)
     session.close()

@@ -69,7 +69,7 @@ def test_a_run_is_shown_by_every_panel(empty, folder):
         empty.docks[panel.name].show()
     empty.update_timer.tick(force=True)
     sprint, gains = empty.panels["sprint"], empty.panels["gains"]
-    assert sprint._indicator.word == "converged, 18 iterations"
+    assert sprint._indicator.text == "converged, 18 iterations"
     assert list(gains._curves) == ["ESCAPE", "DO-CRIME"]
     assert not empty.panels["psf"].shows_placeholder
 
@@ -84,7 +84,7 @@ def test_what_a_recording_does_not_know_is_no_zero(empty, folder):
         until(lambda: True, empty)
     header, panels = empty.header, empty.panels
     assert {one.text for one in header.readouts.values()} == {"–"}
-    assert (header.light.level, header.light.word) == (Level.NEUTRAL, "saturated –")
+    assert (header.saturation.level, header.saturation.text) == (Level.NEUTRAL, "saturated –")
     assert panels["camera"].saturation.text() == "peak –   saturated –"
     assert {one.text for one in panels["mirror"].readouts.values()} == {"–"}
 
@@ -96,15 +96,15 @@ def test_nothing_can_be_commanded_and_the_reason_is_told(empty, folder):
     procedure = empty.panels["procedure"]
     for button in (procedure.check, procedure.start, procedure.pause, procedure.abort):
         assert not button.isEnabled()
-        assert "replayed" in button.toolTip()
-    assert "recording" in procedure._description.text()
+        assert "replay of a recorded run" in button.toolTip()
+    assert "recorded run" in procedure._description.text()
     assert procedure.outcome.text() == "Done: A run"
 
 
 def test_the_slider_goes_through_the_run(empty, folder):
     empty.replay.open(folder)
     until(lambda: is_open(empty), empty)
-    sprint, playback_bar = empty.panels["sprint"], empty.replay.playback_bar
+    sprint, playback_bar = empty.panels["sprint"], empty.playback_bar
     until(lambda: sprint._history is not None and len(sprint._history.values) == 18, empty)
     assert playback_bar.isVisible()
     playback_bar.slider.setValue(playback_bar.slider.maximum() // 2)
@@ -143,9 +143,9 @@ def test_a_bench_keeps_its_window(small_window, folder, monkeypatch):
     """The safety buttons of a window on a bench must go on working."""
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(folder))
     small_window.actions_by_name["open_run"].trigger()
-    until(lambda: bool(small_window.replay.replay_windows), small_window)
+    until(lambda: bool(small_window.replay_windows), small_window)
     assert not is_open(small_window)
-    (other,) = small_window.replay.replay_windows
+    (other,) = small_window.replay_windows
     assert is_open(other)
     assert other.isVisible()
     assert np.array_equal(

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.screenshots, pytest.mark.timeout(1800)]
 
 def picture(operator: Operator, name: str) -> None:
     """Save the window with few colours: a page of pictures loads quickly."""
-    for note in tuple(operator.window.notifications.notes):
+    for note in tuple(operator.window.notifications.notifications):
         note.close_button.click()
     operator.settle(1.0)
     FIGURES.mkdir(exist_ok=True)
@@ -48,7 +48,7 @@ def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         before = source.source.state.last.id
         operator.press(operator.procedure.start)
         operator.until(
-            lambda: panels["modes"].matrix_selector.currentData() == "as measured now", "maps fill in"
+            lambda: panels["modes"].matrix_selector.currentData() == "live", "maps fill in"
         )
         picture(operator, "measuring")
         operator.until(lambda: operator.ended(before), "it ends")

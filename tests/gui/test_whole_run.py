@@ -14,13 +14,13 @@ from escape_hw.io.fits.matrix import load_matrix
 from escape_hw.remote.state import Finish, FinishedRun
 
 
-def planted(ended: FinishedRun) -> Registration:
+def injected(ended: FinishedRun) -> Registration:
     return Registration(**ended.document["planted"])
 
 
 def recovered(ended: FinishedRun) -> None:
-    """The registration is the planted one, within five of its standard errors."""
-    truth = planted(ended).to_dict()
+    """The registration is the injected one, within five of its standard errors."""
+    truth = injected(ended).to_dict()
     for name in PARAMETERS:
         found = ended.document["registration"][name]
         assert abs(found["value"] - truth[name]) < 5 * found["sigma"], name
@@ -36,7 +36,7 @@ def calibrated(operator: Operator, ended: FinishedRun) -> None:
     assert operator.seen["live_modes"]
     assert any(operator.seen["abort"])
     operator.until(lambda: {"DO-CRIME", "ESCAPE"} <= set(modes.matrices), "products are shown")
-    assert sprint._indicator.word.startswith("converged")
+    assert sprint._indicator.text.startswith("converged")
     product = load_matrix(ended.products["im"])
     operator.until(lambda: modes.matrix_selector.currentText() == "ESCAPE", "the newest is in front")
     np.testing.assert_array_equal(modes.matrices["ESCAPE"].data, product.matrix.data)

@@ -98,7 +98,7 @@ class Operator:
 
     def _watch(self) -> bool:
         panels, seen = self.window.panels, self.seen
-        if panels["modes"].matrix_selector.currentData() == "as measured now":
+        if panels["modes"].matrix_selector.currentData() == "live":
             seen["live_modes"].append(panels["modes"].mosaic.n_modes)
         if (course := panels["sprint"]._history) is not None:
             seen["iterations"].append(len(course.values))
@@ -116,7 +116,7 @@ def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Ope
         os.environ["XDG_RUNTIME_DIR"] = served.environment["XDG_RUNTIME_DIR"]
         session = Session()
         window = MainWindow(session, Settings(**{"workspace": "calibrate", **settings}), None)
-        desk = WindowController(window, session, serving.SYSTEM, None)
+        controller = WindowController(window, session, serving.SYSTEM, None)
         window.resize(1280, 800)
         window.update_timer.start()
         window.show()
@@ -126,5 +126,5 @@ def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Ope
             dispose(window)
             session.close()
             session.deleteLater()
-            desk.close()
-            desk.deleteLater()
+            controller.close()
+            controller.deleteLater()

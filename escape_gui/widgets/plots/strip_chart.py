@@ -1,4 +1,4 @@
-"""The last minutes of a number."""
+"""Strip chart: a quantity over the last minutes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,7 @@ from escape_gui.widgets.plots.plot import Plot
 
 
 class TimeSeriesBuffer:
-    """Times and values in memory of fixed size; what is older than that is forgotten.
-
-    Parameters
-    ----------
-    size
-        Entries kept.
-    """
+    """Times and values of the last ``size`` entries."""
 
     def __init__(self, size: int) -> None:
         self._times = np.full(2 * size, np.nan)
@@ -24,7 +18,7 @@ class TimeSeriesBuffer:
         self._size, self._end = size, 0
 
     def add(self, time: float, value: float) -> None:
-        """Add an entry; times in seconds, rising."""
+        """Add an entry; times in seconds, increasing."""
         if self._end == self._times.size:
             for buffer in (self._times, self._values):
                 buffer[: self._size] = buffer[self._size :]
@@ -37,24 +31,24 @@ class TimeSeriesBuffer:
 
     @property
     def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times and values, oldest first; views, not to be kept."""
+        """Times and values ``(n,)``, oldest first; views that the next :meth:`add` may overwrite."""
         part = slice(max(self._end - self._size, 0), self._end)
         return self._times[part], self._values[part]
 
 
 class StripChart(Plot):
-    """One number over the last ``span_s`` seconds, now at the right.
+    """A quantity over the last ``span_s`` seconds.
 
     Parameters
     ----------
     name
-        What it shows.
+        Accessible name.
     y
         Label with unit.
     span_s
-        Seconds shown.
+        Time span, seconds.
     number
-        Colour of the curve.
+        Number of the curve's colour.
     """
 
     def __init__(self, theme: Theme, name: str, y: str, span_s: float = 120.0, number: int = 0) -> None:
@@ -66,7 +60,7 @@ class StripChart(Plot):
         self.pin_left_axis()
 
     def show_history(self, history: TimeSeriesBuffer, now: float) -> None:
-        """Draw it."""
+        """Show the entries up to the time ``now``."""
         times, values = history.arrays
         recent = times > now - self.span_s
         self._line.setData(times[recent] - now, values[recent])
