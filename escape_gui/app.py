@@ -66,17 +66,7 @@ def qt_application() -> QApplication:
 
 
 class WindowController(QObject):
-    """Connects a window to a server, and stops the server if the window started it.
-
-    Parameters
-    ----------
-    window, session
-        The window and its session.
-    address
-        Server to attach to.
-    local_server
-        The server that was started for this window, if any.
-    """
+    """Connects a window to the server at an address, and stops ``local_server`` if the window started one."""
 
     def __init__(
         self, window: MainWindow, session: Session, address: str, local_server: LocalServer | None

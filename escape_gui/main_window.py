@@ -238,7 +238,6 @@ class MainWindow(QMainWindow):
         self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
 
     def reset_layout(self) -> None:
-        """Restore the default arrangement of this workspace."""
         self._settings.layouts.pop(self.workspace.name, None)
         self._apply_layout()
 
@@ -301,7 +300,6 @@ class MainWindow(QMainWindow):
         self.context.session.ask("take control", lambda server: server.acquire(take_over=held))
 
     def toggle_pause(self) -> None:
-        """Pause the procedure, or resume it."""
         running = self.context.session.source.state.procedure
         if running is not None and running.paused:
             self.context.session.ask("resume", lambda server: server.resume())
@@ -309,14 +307,12 @@ class MainWindow(QMainWindow):
             self.context.session.ask("pause", lambda server: server.pause())
 
     def toggle_recording(self) -> None:
-        """Start or stop the recording of telemetry."""
         on = not self.context.session.source.state.telemetry.recording
         self.context.session.ask(
             "record telemetry" if on else "stop recording", lambda server: server.record(on)
         )
 
     def toggle_theme(self) -> None:
-        """Change between the dark and the light palette."""
         self.context.theme.set_palette("light" if self.context.theme.palette_name == "dark" else "dark")
 
     def toggle_freeze(self) -> None:
@@ -325,7 +321,6 @@ class MainWindow(QMainWindow):
         self._set_status("frozen", "Panels frozen (X to resume)" if self.update_timer.frozen else "")
 
     def toggle_keyboard_table(self) -> None:
-        """Show or hide the keyboard shortcuts."""
         if self.overlay.isVisible():
             self.overlay.hide()
         else:

@@ -102,7 +102,6 @@ class Theme(QObject):
 
     @property
     def colours(self) -> Palette:
-        """The palette in use."""
         return PALETTES[self.palette_name]
 
     def colour(self, name: str) -> QColor:
@@ -115,7 +114,6 @@ class Theme(QObject):
         return QColor(names[number % len(names)])
 
     def set_palette(self, palette_name: PaletteName) -> None:
-        """Change the palette."""
         if palette_name != self.palette_name:
             self.palette_name = palette_name
             self.apply()

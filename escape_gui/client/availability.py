@@ -10,23 +10,15 @@ from escape_hw.remote.state import Phase, State
 
 @dataclass(frozen=True, slots=True)
 class RequestContext:
-    """Facts that decide whether an action is available.
+    """Facts that decide whether an action is available."""
 
-    Parameters
-    ----------
-    state
-        Newest state.
-    connected
-        The server responded recently.
-    live
-        The source is a server, not a recorded run.
-    may_write
-        This client holds the lease.
-    """
-
+    #: Newest state.
     state: State
+    #: The server responded recently.
     connected: bool
+    #: The source is a server, not a recorded run.
     live: bool
+    #: This client holds the lease.
     may_write: bool
 
 

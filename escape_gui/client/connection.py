@@ -36,13 +36,7 @@ class LiveSource:
 
     Slow requests (geometry, procedures, streams of a remote server) are made by :meth:`fetch` in a thread;
     the other methods return the last result.
-
-    Parameters
-    ----------
-    connection
-        Connection to the server.
-    is_local
-        The server runs on this computer and its streams are in shared memory.
+    The streams of a local server are read from shared memory (``is_local``).
     """
 
     def __init__(self, connection: Connection, *, is_local: bool) -> None:
@@ -54,7 +48,6 @@ class LiveSource:
 
     @property
     def connected(self) -> bool:
-        """Whether the server responded recently."""
         return self.connection.connected
 
     @property
@@ -107,10 +100,7 @@ class LiveSource:
 class ServerAttachment(QObject):
     """Connects to a server, and reconnects when it is lost, in a thread.
 
-    Parameters
-    ----------
-    address
-        Name of a system served on this computer, or ``tcp://host:port``.
+    The address is the name of a system served on this computer, or ``tcp://host:port``.
     """
 
     #: A new connection, as :class:`LiveSource`.
@@ -133,7 +123,6 @@ class ServerAttachment(QObject):
         self._thread.start()
 
     def discard(self, old: LiveSource) -> None:
-        """Close a connection that is no longer used."""
         self._jobs.put(old.connection.close)
 
     def close(self) -> None:
@@ -206,15 +195,10 @@ _MAX_ERROR_LINES = 6
 
 
 class LocalServer:
-    """A process that serves a system with simulated devices.
+    """A process that serves a system (name or file) with simulated devices.
 
     It runs in its own process session: it survives if the window is killed, and the next window for the
     system attaches to it.
-
-    Parameters
-    ----------
-    system
-        Name or file of the system.
     """
 
     def __init__(self, system: str) -> None:

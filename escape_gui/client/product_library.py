@@ -34,18 +34,12 @@ _METHOD_ORDER = (
 
 @dataclass(frozen=True, slots=True)
 class LoadedProducts:
-    """Products read so far; replaced by a new object at every change.
+    """Products read so far; replaced by a new object at every change."""
 
-    Parameters
-    ----------
-    matrices, gains
-        By label; matrices in the order of ``_METHOD_ORDER``.
-    errors
-        Reason by name of a product that could not be read.
-    """
-
+    #: By label; matrices in the order of ``_METHOD_ORDER``.
     matrices: dict[str, InteractionMatrix] = field(default_factory=dict)
     gains: dict[str, GainCurve] = field(default_factory=dict)
+    #: Reason by name of a product that could not be read.
     errors: dict[str, str] = field(default_factory=dict)
 
 
@@ -71,7 +65,6 @@ class ProductLibrary:
 
     @property
     def is_reading(self) -> bool:
-        """Whether a product is being read."""
         with self._lock:
             return any(not one.done() for one in self._futures.values())
 
@@ -86,7 +79,6 @@ class ProductLibrary:
             return self._loaded
 
     def close(self) -> None:
-        """Stop the thread."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 

@@ -24,11 +24,6 @@ class RequestSender(QObject):
     """Sends requests from worker threads and delivers the answers in the window's thread.
 
     Safety requests have a thread of their own, so that none waits for a slow request.
-
-    Parameters
-    ----------
-    control
-        Connection to the server.
     """
 
     #: Name of the request, and why it failed.
@@ -195,7 +190,6 @@ class Session(QObject):
         return RequestContext(self.source.state, self.source.connected, self.live, self.may_write)
 
     def close(self) -> None:
-        """Stop the worker threads."""
         self._close_requests()
         self.library.close()
         self.source = EmptySource()

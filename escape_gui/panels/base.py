@@ -37,23 +37,15 @@ class _PanelStack(QStackedLayout):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportArray:
-    """An array that a panel shows, for export.
+    """An array that a panel shows, for export."""
 
-    Parameters
-    ----------
-    name
-        One word; name of the FITS extension and part of the file name.
-    data
-        One or two dimensions.
-    unit
-        Unit of the values.
-    columns
-        Headings of the columns of a table; empty for images.
-    """
-
+    #: One word; name of the FITS extension and part of the file name.
     name: str
+    #: One or two dimensions.
     data: NDArray[Any]
+    #: Unit of the values.
     unit: str = ""
+    #: Headings of the columns of a table; empty for images.
     columns: tuple[str, ...] = ()
 
 

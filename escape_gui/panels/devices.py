@@ -84,7 +84,6 @@ class _DeviceRow(QFrame):
         self._apply_theme()
 
     def show_device(self, device: DeviceState) -> None:
-        """Update the row."""
         role = ROLES.get(device.name, device.name)
         self._name.setText(role)
         self._indicator.set_status(HEALTH_LEVELS[device.health], device.health.value)

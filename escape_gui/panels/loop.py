@@ -158,7 +158,6 @@ class LoopPanel(Panel):
     # ------------------------------------------------------------ edit, check, apply
     @property
     def edit(self) -> LoopSettingsEdit:
-        """Values of the form."""
         return LoopSettingsEdit(
             self.matrix.currentText(), round(self.gain.value(), 6), round(self.leak.value(), 6),
             self.dropped_modes.value(),
@@ -189,7 +188,6 @@ class LoopPanel(Panel):
         self.message.setText("\n".join(errors) or f"Apply: {edit.describe_changes(self._loop)}")
 
     def apply(self) -> None:
-        """Send the checked changes."""
         requests, edit = self.context.session.requests, self._checked_edit
         if requests is None or edit is None:
             return
@@ -200,7 +198,6 @@ class LoopPanel(Panel):
         )
 
     def close_loop(self) -> None:
-        """Close the loop with the values of the form."""
         requests, edit = self.context.session.requests, self.edit
         if requests is None:
             return

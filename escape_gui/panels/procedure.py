@@ -181,7 +181,6 @@ class ProcedurePanel(Panel):
     # ------------------------------------------------------------ form
     @property
     def chosen(self) -> str:
-        """Name of the chosen procedure."""
         return str(self.choice.currentData() or "")
 
     def _on_procedure_selected(self) -> None:
@@ -234,14 +233,12 @@ class ProcedurePanel(Panel):
         self._enable()
 
     def ask_start(self) -> None:
-        """Start the procedure with the arguments of the plan."""
         requests, name, arguments = self.context.session.requests, self.chosen, self._checked_arguments
         if requests is not None and self._plan is not None and arguments is not None:
             self.start.setEnabled(False)
             requests.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
 
     def ask_pause(self) -> None:
-        """Pause the procedure, or resume it."""
         running = self._state.procedure
         if running is not None and running.paused:
             self.context.session.ask("resume", lambda server: server.resume())

@@ -14,13 +14,7 @@ from escape_hw.errors import EscapeError
 
 
 class RecordingOpener(QObject):
-    """Reads recorded runs in a worker thread.
-
-    Parameters
-    ----------
-    window
-        Parent of the file dialogs; accepts files that are dropped on it.
-    """
+    """Reads recorded runs, chosen in a dialog or dropped on the window, in a worker thread."""
 
     #: A run or product was read, as :class:`~escape_gui.replay.source.ReplaySource`.
     opened = Signal(object)
@@ -37,13 +31,11 @@ class RecordingOpener(QObject):
         self._read.connect(self._on_read, Qt.ConnectionType.QueuedConnection)
 
     def ask_product(self) -> None:
-        """Ask for a product and open it."""
         chosen, _ = QFileDialog.getOpenFileName(self._window, "Open a product", "", "Products (*.fits)")
         if chosen:
             self.open(Path(chosen))
 
     def ask_run(self) -> None:
-        """Ask for a run folder and open it."""
         chosen = QFileDialog.getExistingDirectory(self._window, "Open the folder of a run")
         if chosen:
             self.open(Path(chosen))
@@ -69,7 +61,6 @@ class RecordingOpener(QObject):
         return super().eventFilter(watched, event)
 
     def close(self) -> None:
-        """Stop the worker thread."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 

@@ -21,20 +21,13 @@ Meta = Mapping[str, float | str]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedStream:
-    """Entries of a stream during a run.
+    """Entries of a stream during a run."""
 
-    Parameters
-    ----------
-    length
-        Number of steps.
-    at
-        Returns the entry after a step, 1 to ``length``.
-    meta
-        Metadata of all entries.
-    """
-
+    #: Number of steps.
     length: int
+    #: Returns the entry after a step, 1 to ``length``.
     at: Callable[[int], NDArray[Any]]
+    #: Metadata of all entries.
     meta: Meta
 
 

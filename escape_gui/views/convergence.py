@@ -24,23 +24,15 @@ UNITS = tuple(next(unit for _, unit, members in GROUPS if k in members) for k in
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConvergenceHistory:
-    """Iterations of SPRINT.
+    """Iterations of SPRINT."""
 
-    Parameters
-    ----------
-    values
-        Parameters by iteration ``(n_iterations, 5)`` in the paper's units.
-    sigma
-        Standard errors of the last iteration ``(5,)``; NaN if not known yet.
-    step_norm
-        Relative norm of each step ``(n_iterations,)``; NaN for the starting point.
-    converged
-        ``None`` during the fit.
-    """
-
+    #: Parameters by iteration ``(n_iterations, 5)`` in the paper's units.
     values: NDArray[np.float64]
+    #: Standard errors of the last iteration ``(5,)``; NaN if not known yet.
     sigma: NDArray[np.float64]
+    #: Relative norm of each step ``(n_iterations,)``; NaN for the starting point.
     step_norm: NDArray[np.float64]
+    #: ``None`` during the fit.
     converged: bool | None = None
 
     @classmethod
@@ -65,7 +57,6 @@ class ConvergenceHistory:
 
     @property
     def iterations(self) -> NDArray[np.int_]:
-        """Numbers of the iterations, from 1."""
         return np.arange(1, len(self.values) + 1)
 
     def normalise(self) -> ConvergenceHistory:
@@ -75,7 +66,6 @@ class ConvergenceHistory:
         return ConvergenceHistory(self.values / scale, self.sigma / scale, self.step_norm, self.converged)
 
     def headline(self) -> str:
-        """State of the fit and number of iterations."""
         n = len(self.values)
         state = {None: "running", True: "converged", False: "NOT converged"}[self.converged]
         return f"{state}, {n} iteration{'' if n == 1 else 's'}"
@@ -83,24 +73,16 @@ class ConvergenceHistory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegistrationDrift:
-    """The registration over time.
+    """The registration over time."""
 
-    Parameters
-    ----------
-    time
-        Time since the start of tracking ``(n,)``, in ``unit``.
-    unit
-        ``s``, ``min`` or ``h``, depending on the duration.
-    values, sigma
-        Parameters and standard errors ``(n, 5)`` in the paper's units.
-    marks
-        Exchanges and alarms: time in ``unit``, kind of event.
-    """
-
+    #: Time since the start of tracking ``(n,)``, in ``unit``.
     time: NDArray[np.float64]
+    #: ``s``, ``min`` or ``h``, depending on the duration.
     unit: str
+    #: Parameters and standard errors ``(n, 5)`` in the paper's units.
     values: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    #: Exchanges and alarms: time in ``unit``, kind of event.
     marks: tuple[tuple[float, str], ...] = ()
 
     @classmethod

@@ -13,25 +13,17 @@ from escape_hw.api.optical_gains import OpticalGains
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GainCurve:
-    """Optical gains relative to one matrix.
+    """Optical gains relative to one matrix."""
 
-    Parameters
-    ----------
-    label
-        Label of the matrix.
-    value, sigma
-        Measured gains and standard errors ``(n_modes,)``; NaN for modes that were not measured.
-    trend, trend_sigma
-        Gains smoothed over the modes, and their standard errors ``(n_modes,)``.
-    rounds
-        Gains by round of the bootstrap ``(n_rounds, n_modes)``.
-    """
-
+    #: Label of the matrix.
     label: str
+    #: Measured gains and standard errors ``(n_modes,)``; NaN for modes that were not measured.
     value: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    #: Gains smoothed over the modes, and their standard errors ``(n_modes,)``.
     trend: NDArray[np.float64]
     trend_sigma: NDArray[np.float64]
+    #: Gains by round of the bootstrap ``(n_rounds, n_modes)``.
     rounds: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
     @classmethod
@@ -49,7 +41,6 @@ class GainCurve:
 
     @property
     def modes(self) -> NDArray[np.int_]:
-        """Numbers of the modes, from 1."""
         return np.arange(1, self.value.size + 1)
 
     @property

@@ -39,13 +39,7 @@ def slope_map_pair(slopes: NDArray[np.floating], valid: NDArray[np.bool_]) -> ND
 
 
 class ActuatorImage:
-    """Maps actuator values to an image: one pixel per actuator of a grid, else the nearest actuator.
-
-    Parameters
-    ----------
-    geometry
-        Layout on a grid, or positions in metres.
-    """
+    """Maps actuator values to an image: one pixel per actuator of a grid, else the nearest actuator."""
 
     def __init__(self, geometry: Geometry) -> None:
         if geometry.layout:
@@ -80,15 +74,7 @@ def _nearest_actuator(positions: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 class RadialProfile:
-    """Means over rings of one pixel width, out to the nearest edge of the image.
-
-    Parameters
-    ----------
-    shape
-        Rows and columns of the images.
-    centre
-        Row and column of the centre of the rings.
-    """
+    """Means over rings of one pixel width around ``centre`` (row, column), out to the nearest edge."""
 
     def __init__(self, shape: tuple[int, ...], centre: tuple[int, int]) -> None:
         self.shape, self.centre = shape, centre

@@ -18,24 +18,16 @@ _LIMITS = (0.1, 0.25, 0.5, 1.0, LIMIT)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapTile:
-    """Maps of x and y side by side.
+    """Maps of x and y side by side."""
 
-    Parameters
-    ----------
-    title, note
-        Title, and numbers below it.
-    maps
-        ``(rows, 2 * columns + 1)``, NaN outside the pupil.
-    limits
-        Limits of the colour scale.
-    signed
-        Diverging colour scale with symmetric limits; otherwise sequential.
-    """
-
+    #: Title, and numbers below it.
     title: str
     note: str
+    #: ``(rows, 2 * columns + 1)``, NaN outside the pupil.
     maps: NDArray[np.float64]
+    #: Limits of the colour scale.
     limits: tuple[float, float]
+    #: Diverging colour scale with symmetric limits; otherwise sequential.
     signed: bool
 
 

@@ -19,26 +19,18 @@ _GAP, _MARGIN = 1, 3
 
 @dataclass(frozen=True, slots=True)
 class MosaicLayout:
-    """Positions of the maps in the image of a page. All lengths are in sub-apertures, one pixel each.
+    """Positions of the maps in the image of a page. All lengths are in sub-apertures, one pixel each."""
 
-    Parameters
-    ----------
-    shape
-        Rows and columns of one map.
-    columns, rows
-        Number of modes per row and per column of the page.
-    head
-        Space above each map for the number of the mode.
-    """
-
+    #: Rows and columns of one map.
     shape: tuple[int, int]
+    #: Number of modes per row and per column of the page.
     columns: int
     rows: int
+    #: Space above each map for the number of the mode.
     head: int = 0
 
     @property
     def per_page(self) -> int:
-        """Number of modes per page."""
         return self.columns * self.rows
 
     @property
@@ -48,7 +40,6 @@ class MosaicLayout:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the image."""
         height, width = self.cell
         return self.rows * height + _MARGIN, self.columns * width + _MARGIN
 
@@ -104,17 +95,11 @@ def fit_layout(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeStatistics:
-    """Statistics of each mode.
+    """Statistics of each mode."""
 
-    Parameters
-    ----------
-    rms
-        Rms slope per unit mode ``(n_modes,)``.
-    snr
-        Signal-to-noise ratio ``(n_modes,)``; infinite without standard errors.
-    """
-
+    #: Rms slope per unit mode ``(n_modes,)``.
     rms: NDArray[np.float64]
+    #: Signal-to-noise ratio ``(n_modes,)``; infinite without standard errors.
     snr: NDArray[np.float64]
 
     @classmethod

@@ -23,27 +23,18 @@ from escape_gui.window.workspaces import WORKSPACES
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """Description of an action.
+    """Description of an action."""
 
-    Parameters
-    ----------
-    name
-        Identifier: one or two words with an underscore.
-    menu, text
-        Menu and entry; ``&`` marks the letter to press with Alt.
-    tip
-        Tooltip, one sentence.
-    keys
-        Shortcuts; tooltips and menus show the first.
-    unavailable
-        Returns the reason why the action is unavailable in a context, empty if it is available.
-    """
-
+    #: Identifier: one or two words with an underscore.
     name: str
+    #: Menu and entry; ``&`` marks the letter to press with Alt.
     menu: str
     text: str
+    #: Tooltip, one sentence.
     tip: str
+    #: Shortcuts; tooltips and menus show the first.
     keys: tuple[str, ...] = ()
+    #: Returns the reason why the action is unavailable in a context, empty if it is available.
     unavailable: UnavailableReason = always_available
 
 

@@ -46,15 +46,7 @@ class _PanelScrollArea(QScrollArea):
 
 
 class Dock(QDockWidget):
-    """Dock widget with a panel.
-
-    Parameters
-    ----------
-    panel
-        Content.
-    window
-        Parent; without one, Qt does not find the dock when it restores a layout.
-    """
+    """Dock widget with a panel. It needs a parent: otherwise Qt does not restore its layout."""
 
     #: Name of the panel and ``png``, ``csv`` or ``fits``.
     save_requested = Signal(str, str)

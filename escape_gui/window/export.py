@@ -134,7 +134,6 @@ class Exporter:
             self._save(lambda: save_png(path, self._window))
 
     def save_panel_to(self, path: Path, kind: str, panel: Panel) -> None:
-        """Save a panel as ``png``, ``csv`` or ``fits``."""
         if kind == "png":
             self._save(lambda: save_png(path, panel))
         elif kind == "csv":

@@ -67,13 +67,7 @@ class ConnectionBanner(QLabel):
 
 
 class HeaderBar(QWidget):
-    """Connection banner, state of the system in two rows, and the safety buttons.
-
-    Parameters
-    ----------
-    open_loop, flatten
-        The actions of the safety buttons.
-    """
+    """Connection banner, state of the system in two rows, and the safety buttons."""
 
     def __init__(self, context: Context, open_loop: QAction, flatten: QAction) -> None:
         super().__init__()
@@ -180,13 +174,7 @@ def _safety_button(action: QAction, text: str) -> QPushButton:
 
 
 class FaultBanner(QWidget):
-    """A row below the header, visible during a fault.
-
-    Parameters
-    ----------
-    clear
-        The action that clears the fault.
-    """
+    """A row below the header, visible during a fault, with a button for the action that clears it."""
 
     def __init__(self, context: Context, clear: QAction) -> None:
         super().__init__()

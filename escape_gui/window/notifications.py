@@ -17,15 +17,7 @@ _MAX_NOTIFICATIONS = 4
 
 
 class Notification(QFrame):
-    """A notification in one line; the tooltip has the whole text.
-
-    Parameters
-    ----------
-    level, title
-        Indicator at the left.
-    text
-        One or several lines.
-    """
+    """A notification in one line; the tooltip has the whole text."""
 
     def __init__(self, theme: Theme, level: Level, title: str, text: str) -> None:
         super().__init__()
@@ -65,15 +57,7 @@ class NotificationBar(QWidget):
         self._show_newest()
 
     def show_message(self, level: Level, title: str, text: str, *, persistent: bool | None = None) -> None:
-        """Show a notification for :data:`DISPLAY_MS`, or until it is closed.
-
-        Parameters
-        ----------
-        level, title, text
-            Content.
-        persistent
-            Show it until it is closed; by default for errors only.
-        """
+        """Show a notification for :data:`DISPLAY_MS`, or until it is closed if ``persistent`` (as errors are)."""
         while len(self.notifications) >= _MAX_NOTIFICATIONS:
             self._remove(self.notifications[0])
         new = Notification(self._theme, level, title, text)
@@ -107,13 +91,7 @@ _LEVELS = {Finish.DONE: Level.GOOD, Finish.ABORTED: Level.WARNING, Finish.FAILED
 
 
 class StateNotifier:
-    """Shows a notification when a new state differs from the previous one.
-
-    Parameters
-    ----------
-    bar
-        Where notifications are shown.
-    """
+    """Shows notifications for the changes from one state to the next."""
 
     def __init__(self, bar: NotificationBar) -> None:
         self._bar = bar

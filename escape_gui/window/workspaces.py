@@ -38,7 +38,6 @@ class Workspace:
 
     @property
     def panels(self) -> tuple[str, ...]:
-        """Names of all panels."""
         return tuple(name for column in self.columns for cell in column.cells for name in cell.names)
 
 

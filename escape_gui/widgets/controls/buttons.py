@@ -16,17 +16,7 @@ _STEP_MS = 40
 
 
 class SegmentedButton(QWidget):
-    """A row of buttons of which exactly one is pressed.
-
-    Parameters
-    ----------
-    name
-        Accessible name.
-    choices
-        Texts of the buttons; the first is pressed at the start.
-    tips
-        Tooltips of the buttons.
-    """
+    """A row of buttons of which exactly one is pressed, at the start the first."""
 
     chosen = Signal(str)
 
@@ -46,11 +36,9 @@ class SegmentedButton(QWidget):
 
     @property
     def selected(self) -> str:
-        """Text of the pressed button."""
         return next(text for text, button in self.buttons.items() if button.isChecked())
 
     def choose(self, text: str) -> None:
-        """Press a button."""
         self.buttons[text].click()
 
 
@@ -58,11 +46,6 @@ class HoldButton(QPushButton):
     """A button for hazardous actions: emits :attr:`confirmed` after it was held for :data:`HOLD_MS`.
 
     It can be held with the mouse, Space or Return; a growing bar shows the time.
-
-    Parameters
-    ----------
-    text
-        The action; the label is ``Hold to`` and this text.
     """
 
     confirmed = Signal()

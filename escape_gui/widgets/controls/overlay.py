@@ -30,7 +30,6 @@ class Overlay(QFrame):
         self.hide()
 
     def open(self, title: str, text: str, *, markdown: bool = False) -> None:
-        """Show a page of HTML or Markdown."""
         self._title.setText(title)
         self.setAccessibleName(title)
         if markdown:

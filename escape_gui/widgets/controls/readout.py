@@ -10,15 +10,7 @@ from escape_gui.widgets.layouts import caption, row
 
 
 class Readout(QWidget):
-    """Caption, value and unit in a row; the value has a fixed width and is right-aligned.
-
-    Parameters
-    ----------
-    name, unit
-        Texts before and after the value.
-    digits
-        Number of characters of the longest value.
-    """
+    """Caption, value and unit in a row; the value is right-aligned in a field of ``digits`` characters."""
 
     def __init__(self, theme: Theme, name: str, unit: str, digits: int) -> None:
         super().__init__()
@@ -32,11 +24,9 @@ class Readout(QWidget):
 
     @property
     def text(self) -> str:
-        """The value as shown."""
         return self._value.text()
 
     def show_value(self, text: str) -> None:
-        """Show a value."""
         if text != self._value.text():
             self._value.setText(text)
             self.setAccessibleName(f"{self._name} {text} {self._unit}")

@@ -34,10 +34,7 @@ HEALTH_LEVELS: dict[DeviceHealth, Level] = {
 class StatusIndicator(QWidget):
     """Text beside a shape: disc good, ring neutral, play mark active, triangle warning, square error.
 
-    Parameters
-    ----------
-    widest_text
-        Determines the minimum width, so that neighbours do not move when the text changes.
+    ``widest_text`` sets the minimum width, so that neighbours do not move when the text changes.
     """
 
     def __init__(self, theme: Theme, widest_text: str = "") -> None:
@@ -51,7 +48,6 @@ class StatusIndicator(QWidget):
         self._apply_theme()
 
     def set_status(self, level: Level, text: str) -> None:
-        """Show a condition."""
         if (level, text) == (self.level, self.text):
             return
         longer = len(text) > len(self._widest_text) and len(text) != len(self.text)

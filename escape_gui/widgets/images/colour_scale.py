@@ -26,13 +26,7 @@ def lookup_table(name: str) -> NDArray[np.uint8]:
 
 
 class ColourScale(QWidget):
-    """A vertical colour scale with numbers and a label.
-
-    Parameters
-    ----------
-    name
-        Name of the colour map.
-    """
+    """A vertical colour scale with numbers and a label."""
 
     def __init__(self, theme: Theme, name: str) -> None:
         super().__init__()
@@ -54,7 +48,6 @@ class ColourScale(QWidget):
         self.apply_theme()
 
     def set_range(self, low: float, high: float, label: str) -> None:
-        """Set the limits and the label."""
         self._image.setRect(0, low, 1, high - low)
         self._plot.setRange(xRange=(0, 1), yRange=(low, high), padding=0.025)
         self._label = label

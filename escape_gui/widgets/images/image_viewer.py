@@ -155,13 +155,11 @@ class ImageViewer(QWidget):
 
     # ------------------------------------------------------------ display
     def reset_view(self) -> None:
-        """Show the whole image."""
         if self.data is not None:
             rows, columns = self.data.shape
             self.box.setRange(QRectF(0, 0, columns, rows), padding=0.02)
 
     def set_logarithmic(self, on: bool) -> None:
-        """Change between the logarithmic and the linear scale."""
         self.logarithmic = on
         self._levels_due = 0.0
         if self.data is not None:
@@ -228,15 +226,7 @@ class ImageViewer(QWidget):
 
 
 class ImageToolbar(QWidget):
-    """Value under the cursor and controls of the scale of an image.
-
-    Parameters
-    ----------
-    image_view
-        The image.
-    logarithmic
-        Offer a logarithmic scale.
-    """
+    """Value under the cursor and controls of the display range of an image."""
 
     def __init__(self, theme: Theme, image_view: ImageViewer, *, logarithmic: bool = True) -> None:
         super().__init__()

@@ -50,7 +50,6 @@ class MapImage(QWidget):
         self.setMinimumHeight(32)
 
     def show_tile(self, tile: MapTile) -> None:
-        """Show the maps of a tile."""
         low, high = tile.limits
         centred = tile.maps - (low + high) / 2
         colours = lookup_table(DIVERGING if tile.signed else SEQUENTIAL)
@@ -87,7 +86,6 @@ class MapTiles(QWidget):
 
     @property
     def titles(self) -> tuple[str, ...]:
-        """Titles of the tiles."""
         return tuple(one.title for one in self._tiles)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
@@ -103,7 +101,6 @@ class MapTiles(QWidget):
                 self._grid.addWidget(holder, *divmod(number, columns))
 
     def show_tiles(self, tiles: Sequence[MapTile]) -> None:
-        """Show these tiles only."""
         self._tiles = tuple(tiles)
         while len(self._tile_widgets) < len(self._tiles):
             self._add_tile_widget()

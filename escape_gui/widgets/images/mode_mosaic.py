@@ -79,7 +79,6 @@ class ModeMosaic(QWidget):
 
     @property
     def n_modes(self) -> int:
-        """Number of modes shown."""
         return int(self._data.shape[1])
 
     @property
@@ -111,7 +110,6 @@ class ModeMosaic(QWidget):
         self._arrange()
 
     def show_page(self, page: int) -> None:
-        """Change the page."""
         page = max(0, min(page, self.page[1] - 1))
         if page != self._page:
             self._page = page
@@ -119,7 +117,6 @@ class ModeMosaic(QWidget):
         self.page_changed.emit(*self.page)
 
     def choose(self, mode: int) -> None:
-        """Select a mode and show its page."""
         if not 0 <= mode < self.n_modes:
             return
         self._mode = mode

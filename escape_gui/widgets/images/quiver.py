@@ -31,7 +31,6 @@ class Quiver(pg.PlotCurveItem):  # type: ignore[misc]
         self.apply_theme()
 
     def set_geometry(self, geometry: Geometry) -> None:
-        """Set the centres of the sub-apertures."""
         outlines = np.asarray(geometry.outlines_px, float).reshape(-1, 3)
         self._x, self._y = outlines[:, 0], outlines[:, 1]
         self._length = _ARROW_SCALE * float(outlines[:, 2].mean()) if len(outlines) else 1.0

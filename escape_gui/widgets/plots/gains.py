@@ -31,13 +31,11 @@ class GainsPlot(PlotGrid):
         return axis_sides(self._curves)
 
     def show_rounds(self, on: bool) -> None:
-        """Show or hide the earlier rounds of the bootstrap."""
         if on != self._show_rounds:
             self._show_rounds = on
             self.build()
 
     def show_curves(self, curves: Mapping[str, GainCurve]) -> None:
-        """Show these curves only."""
         self._curves = dict(curves)
         if self._item_layout() != self._built:
             self.build()

@@ -33,14 +33,9 @@ def reparent_menu(plot: pg.PlotItem) -> None:
 
 
 class Plot(pg.PlotWidget):  # type: ignore[misc]
-    """A plot for live curves. It has no grid, which takes ten times as long to draw as the curves.
+    """A plot for live curves; ``x`` and ``y`` are the labels of the axes, with units.
 
-    Parameters
-    ----------
-    name
-        Accessible name.
-    x, y
-        Labels of the axes, with units.
+    It has no grid, which takes ten times as long to draw as the curves.
     """
 
     def __init__(self, theme: Theme, name: str, x: str, y: str) -> None:
@@ -73,7 +68,6 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         self.getAxis("left").setWidth(self._theme.pixels(9 * characters))
 
     def hide_bottom_label(self) -> None:
-        """Remove the label of the bottom axis."""
         del self._labels["bottom"]
         self.getAxis("bottom").showLabel(False)
 
@@ -155,7 +149,6 @@ class ErrorCurve:
         return cls(line, bars)
 
     def add_to(self, box: Any) -> None:
-        """Add the items to a plot or view box."""
         box.addItem(self.bars)
         box.addItem(self.line)
 
@@ -182,7 +175,6 @@ class ErrorBand:
         self.fill = pg.FillBetweenItem(self._low, self._high, brush=translucent)
 
     def add_to(self, box: Any) -> None:
-        """Add the items to a plot or view box."""
         for item in (self.fill, self._low, self._high, self.line):
             box.addItem(item)
 

@@ -42,7 +42,6 @@ class ConvergencePlot(_ParameterGrid):
         return self._physical
 
     def set_physical_units(self, physical: bool) -> None:
-        """Show the parameters in their physical units, or normalised."""
         if physical != self._physical:
             self._physical = physical
             self.build()
@@ -108,7 +107,6 @@ class DriftPlot(_ParameterGrid):
         self.build()
 
     def show_drift(self, drift: RegistrationDrift) -> None:
-        """Show a drift."""
         rebuild = drift.marks != self._drift.marks or drift.unit != self._drift.unit
         self._drift = drift
         if rebuild:

@@ -37,19 +37,7 @@ class TimeSeriesBuffer:
 
 
 class StripChart(Plot):
-    """A quantity over the last ``span_s`` seconds.
-
-    Parameters
-    ----------
-    name
-        Accessible name.
-    y
-        Label with unit.
-    span_s
-        Time span, seconds.
-    number
-        Number of the curve's colour.
-    """
+    """A quantity over the last ``span_s`` seconds."""
 
     def __init__(self, theme: Theme, name: str, y: str, span_s: float = 120.0, number: int = 0) -> None:
         super().__init__(theme, name, "time before now [s]", y)
@@ -60,7 +48,6 @@ class StripChart(Plot):
         self.pin_left_axis()
 
     def show_history(self, history: TimeSeriesBuffer, now: float) -> None:
-        """Show the entries up to the time ``now``."""
         times, values = history.arrays
         recent = times > now - self.span_s
         self._line.setData(times[recent] - now, values[recent])
