@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from PySide6.QtCore import QByteArray, Qt
@@ -138,7 +139,8 @@ class MainWindow(QMainWindow):
 
     def _make_handlers(self) -> dict[str, Callable[[], object]]:
         """What each action of :data:`~escape_gui.window.actions.ACTIONS` does, by its name."""
-        ask = self.context.session.ask
+        session = self.context.session
+        ask = session.ask
         return {
             "open_product": self.replay.ask_product,
             "open_run": self.replay.ask_run,
@@ -147,7 +149,7 @@ class MainWindow(QMainWindow):
             "save_fits": lambda: self.exporter.panel("fits", self.focused_panel()),
             "save_window": self.exporter.window,
             "quit": self.close,
-            **{f"workspace_{one.name}": lambda one=one: self.show_workspace(one.name) for one in WORKSPACES},
+            **{f"workspace_{one.name}": partial(self.show_workspace, one.name) for one in WORKSPACES},
             "reset_layout": self.reset_layout,
             "next_panel": lambda: self.focus_panel(+1),
             "previous_panel": lambda: self.focus_panel(-1),
@@ -158,8 +160,8 @@ class MainWindow(QMainWindow):
             "normal": lambda: self.context.theme.step_scale(0),
             "open_loop": lambda: ask("open the loop", lambda server: server.open_loop(), urgent=True),
             "flatten": lambda: ask("flatten the mirror", lambda server: server.flatten(), urgent=True),
-            "abort": lambda: ask("abort the procedure", lambda server: server.abort(), urgent=True),
-            "pause": self.toggle_pause,
+            "abort": session.abort,
+            "pause": session.toggle_pause,
             "take_control": self.take_control,
             "give_back": lambda: ask("release control", lambda server: server.release()),
             "record": self.toggle_recording,
@@ -298,13 +300,6 @@ class MainWindow(QMainWindow):
         """Request control, from the client that has it if there is one."""
         held = self.context.session.source.state.lease is not None
         self.context.session.ask("take control", lambda server: server.acquire(take_over=held))
-
-    def toggle_pause(self) -> None:
-        running = self.context.session.source.state.procedure
-        if running is not None and running.paused:
-            self.context.session.ask("resume", lambda server: server.resume())
-        else:
-            self.context.session.ask("pause", lambda server: server.pause())
 
     def toggle_recording(self) -> None:
         on = not self.context.session.source.state.telemetry.recording

@@ -22,14 +22,8 @@ log = logging.getLogger(__name__)
 
 #: Order of methods in lists: measured with a calibration source, measured without one, computed.
 _METHOD_ORDER = (
-    "push-pull",
-    "push-pull-fast",
-    "modulated",
-    "docrime",
-    "docrime-whitened",
-    "docrime-closed",
-    "escape",
-)
+    "push-pull", "push-pull-fast", "modulated", "docrime", "docrime-whitened", "docrime-closed", "escape",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import TypeVar
 
 from PySide6.QtCore import QObject, Qt, Signal
@@ -28,8 +29,6 @@ class RequestSender(QObject):
 
     #: Name of the request, and why it failed.
     failed = Signal(str, str)
-    #: Name of the request.
-    done = Signal(str)
     #: Number of requests without an answer.
     pending_changed = Signal(int)
     _delivered = Signal(object)
@@ -72,38 +71,27 @@ class RequestSender(QObject):
         """
         if not self._accepting:
             return
+
+        def deliver(future: Future[T]) -> None:
+            if not self._accepting:
+                return
+            self._change_pending(-1)
+            error = future.exception()
+            if error is None:
+                if on_result is not None:
+                    on_result(future.result())
+                return
+            if not isinstance(error, EscapeError):
+                log.error("%s failed unexpectedly", what, exc_info=error)
+            reason = str(error) or type(error).__name__
+            if not quiet:
+                self.failed.emit(what, reason)
+            if on_error is not None:
+                on_error(reason)
+
         self._change_pending(+1)
         future = self._executors[urgent].submit(call, self.control)
-        future.add_done_callback(
-            lambda done: self._delivered.emit(
-                lambda: self._deliver_result(what, done, on_result, on_error, quiet)
-            )
-        )
-
-    def _deliver_result(
-        self,
-        what: str,
-        future: Future[T],
-        on_result: Callable[[T], None] | None,
-        on_error: Callable[[str], None] | None,
-        quiet: bool,
-    ) -> None:
-        if not self._accepting:
-            return
-        self._change_pending(-1)
-        error = future.exception()
-        if error is None:
-            self.done.emit(what)
-            if on_result is not None:
-                on_result(future.result())
-            return
-        if not isinstance(error, EscapeError):
-            log.error("%s failed unexpectedly", what, exc_info=error)
-        reason = str(error) or type(error).__name__
-        if not quiet:
-            self.failed.emit(what, reason)
-        if on_error is not None:
-            on_error(reason)
+        future.add_done_callback(lambda answer: self._delivered.emit(partial(deliver, answer)))
 
     def _change_pending(self, step: int) -> None:
         self._pending += step
@@ -144,7 +132,6 @@ class Session(QObject):
     #: The source was replaced; panels clear their content.
     changed = Signal()
     failed = Signal(str, str)
-    done = Signal(str)
     pending_changed = Signal(int)
 
     def __init__(self) -> None:
@@ -162,7 +149,6 @@ class Session(QObject):
         if control is not None:
             self.requests = RequestSender(control)
             self.requests.failed.connect(self.failed)
-            self.requests.done.connect(self.done)
             self.requests.pending_changed.connect(self.pending_changed)
         self.changed.emit()
 
@@ -170,6 +156,18 @@ class Session(QObject):
         """Send a request without waiting for its result; does nothing without a server."""
         if self.requests is not None:
             self.requests.ask(what, call, urgent=urgent)
+
+    def toggle_pause(self) -> None:
+        """Request to pause the running procedure, or to resume it if it is paused."""
+        running = self.source.state.procedure
+        if running is not None and running.paused:
+            self.ask("resume", lambda server: server.resume())
+        else:
+            self.ask("pause", lambda server: server.pause())
+
+    def abort(self) -> None:
+        """Request to stop the running procedure; the data acquired so far are saved."""
+        self.ask("abort the procedure", lambda server: server.abort(), urgent=True)
 
     @property
     def live(self) -> bool:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QFrame, QLabel, QVBoxLayout, QWidget
 
 from escape_gui.panels.base import Context, Panel
 from escape_gui.widgets.controls.status_indicator import HEALTH_LEVELS, StatusIndicator
-from escape_gui.widgets.layouts import caption, column, row, scroll_area
+from escape_gui.widgets.layouts import column, row, scroll_area, text_label
 from escape_hw.remote.state import DeviceState, State
 
 #: Titles of the keys of ``[devices]``.
@@ -74,10 +73,8 @@ class _DeviceRow(QFrame):
         super().__init__()
         self._theme = context.theme
         self._indicator = StatusIndicator(context.theme, "closed")
-        self._name, self._model, self._facts = QLabel(), caption(), QLabel()
-        for label in (self._facts, self._model):
-            label.setWordWrap(True)
-            label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self._name, self._model, self._facts = QLabel(), text_label(), text_label()
+        self._model.setObjectName("caption")
         head = row(self._name, None, self._indicator)
         column(head, self._model, self._facts, parent=self, spacing=0).setContentsMargins(4, 4, 4, 4)
         context.theme.changed.connect(self._apply_theme)

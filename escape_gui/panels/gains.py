@@ -6,12 +6,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PySide6.QtWidgets import QCheckBox, QLabel
+from PySide6.QtWidgets import QCheckBox
 
 from escape_gui.client.product_library import LoadedProducts
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.gain_curves import GainCurve, live_curve
-from escape_gui.widgets.layouts import row
+from escape_gui.widgets.layouts import row, text_label
 from escape_gui.widgets.plots.gains import GainsPlot
 from escape_gui.widgets.plots.plot import MARKERS
 from escape_hw.remote.source import DataSource, Sample
@@ -48,8 +48,7 @@ class GainsPanel(Panel):
         self.rounds.setChecked(True)
         self.rounds.setToolTip("Draw the earlier rounds of the bootstrap as thin lines.")
         self.rounds.toggled.connect(self.plot.show_rounds)
-        self._legend = QLabel()
-        self._legend.setWordWrap(True)
+        self._legend = text_label()
         self.body.addLayout(row((self._legend, 1), self.rounds))
         self.body.addWidget(self.plot, 1)
         self.setFocusProxy(self.rounds)

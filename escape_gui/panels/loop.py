@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar
 
 from PySide6.QtCore import Qt
@@ -12,8 +13,9 @@ from escape_gui.panels.base import Context, Panel
 from escape_gui.views.loop_form import FIELDS, LoopSettingsEdit
 from escape_gui.widgets.controls.buttons import HoldButton
 from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.widgets.layouts import caption, row
+from escape_gui.widgets.layouts import caption, row, text_label
 from escape_hw.config.system import MAX_GAIN
+from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LoopState, Phase, State
 
@@ -59,8 +61,7 @@ class LoopPanel(Panel):
         self.apply_button = QPushButton("Apply")
         self.revert_button = QPushButton("Revert")
         self.revert_button.setToolTip("Revert the form to the current values")
-        self.message = QLabel()
-        self.message.setWordWrap(True)
+        self.message = text_label()
         self.close_button = HoldButton("close the loop", theme)
         self._loop = LoopState()
         self._matrices: list[str] = []
@@ -188,29 +189,24 @@ class LoopPanel(Panel):
         self.message.setText("\n".join(errors) or f"Apply: {edit.describe_changes(self._loop)}")
 
     def apply(self) -> None:
-        requests, edit = self.context.session.requests, self._checked_edit
-        if requests is None or edit is None:
-            return
-        changed = edit.changed(self._loop)
-        self.message.setText("Applying…")
-        requests.ask(
-            "change the loop", lambda server: server.set_loop(**changed), self._on_done, self._on_refused
-        )
+        if self._checked_edit is not None:
+            changed = self._checked_edit.changed(self._loop)
+            self._ask("change the loop", lambda server: server.set_loop(**changed))
 
     def close_loop(self) -> None:
-        requests, edit = self.context.session.requests, self.edit
-        if requests is None:
-            return
+        edit = self.edit
         if errors := edit.validation_errors(self._loop):
             self.message.setText("\n".join(errors))
             return
-        self.message.setText("Closing the loop…")
-        requests.ask(
+        self._ask(
             "close the loop",
             lambda server: server.close_loop(edit.matrix, edit.gain or None, edit.leak, edit.dropped_modes),
-            self._on_done,
-            self._on_refused,
         )
+
+    def _ask(self, what: str, call: Callable[[Connection], object]) -> None:
+        if self.context.session.requests is not None:
+            self.message.setText("Waiting for the server…")
+            self.context.session.requests.ask(what, call, self._on_done, self._on_refused)
 
     def _on_done(self, _: object) -> None:
         self.clear()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from numpy.typing import NDArray
-from PySide6.QtCore import Qt, QTimer, QUrl
+from PySide6.QtCore import QTimer, QUrl
 from PySide6.QtGui import QDesktopServices, QResizeEvent
 from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QProgressBar, QPushButton, QWidget
 
@@ -22,7 +22,7 @@ from escape_gui.panels.base import Context, Panel
 from escape_gui.views import procedure_form as form_text
 from escape_gui.views.mode_mosaic import ModeStatistics
 from escape_gui.widgets.controls.argument_form import ArgumentForm
-from escape_gui.widgets.layouts import row, scroll_area
+from escape_gui.widgets.layouts import row, scroll_area, text_label
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Arguments, FinishedRun, ProcedureEntry, ProcedurePlan, State
 
@@ -70,10 +70,10 @@ class ProcedurePanel(Panel):
         self.choice = QComboBox()
         self.choice.setAccessibleName("Procedure")
         self.choice.currentIndexChanged.connect(self._on_procedure_selected)
-        self._description = _text_label()
+        self._description = text_label()
         self.form = ArgumentForm(self.context.theme)
         self.form.edited.connect(self._on_edit)
-        self.plan = _text_label()
+        self.plan = text_label()
         self.plan.setAccessibleName("Plan")
         for widget, stretch in ((self.choice, 0), (self._description, 0), (self.form, 100), (self.plan, 0)):
             self.body.addWidget(widget, stretch)
@@ -82,9 +82,10 @@ class ProcedurePanel(Panel):
         self.check, self.start = QPushButton("&Check"), QPushButton("&Start")
         self.pause, self.abort = QPushButton("Pause"), QPushButton("Abort")
         self.abort.setObjectName("stop")
+        session = self.context.session
         handlers: tuple[tuple[QPushButton, Callable[[], None]], ...] = (
             (self.check, self.ask_plan), (self.start, self.ask_start),
-            (self.pause, self.ask_pause), (self.abort, self.ask_abort),
+            (self.pause, session.toggle_pause), (self.abort, session.abort),
         )  # fmt: skip
         for button, ask in handlers:
             button.clicked.connect(lambda _=False, ask=ask: ask())
@@ -92,15 +93,17 @@ class ProcedurePanel(Panel):
         self.bar = QProgressBar()
         self.bar.setTextVisible(False)
         self.bar.setFixedHeight(8)
-        self.progress, self._metrics = _text_label(), _text_label()
+        self.progress, self._metrics = text_label(), text_label()
         for widget in (self.progress, self.bar, self._metrics):
             self.body.addWidget(widget)
+        for label in (self._description, self.plan, self.progress, self._metrics):
+            label.hide()
 
     def _make_result(self) -> None:
         result = QWidget()
         grid = QGridLayout(result)
         grid.setContentsMargins(0, 0, 0, 0)
-        self.outcome, self.numbers = _text_label(), _text_label()
+        self.outcome, self.numbers = text_label(), text_label()
         self.report, self.folder = QPushButton("Open report"), QPushButton("Open folder")
         self.report.clicked.connect(lambda: self._open(self._product("report")))
         self.folder.clicked.connect(lambda: self._open(self._ended.folder if self._ended else ""))
@@ -238,17 +241,6 @@ class ProcedurePanel(Panel):
             self.start.setEnabled(False)
             requests.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
 
-    def ask_pause(self) -> None:
-        running = self._state.procedure
-        if running is not None and running.paused:
-            self.context.session.ask("resume", lambda server: server.resume())
-        elif running is not None:
-            self.context.session.ask("pause", lambda server: server.pause())
-
-    def ask_abort(self) -> None:
-        """Stop the procedure; the data acquired so far are saved."""
-        self.context.session.ask("abort the procedure", lambda server: server.abort(), urgent=True)
-
     def _enable(self) -> None:
         now = self.context.session.request_context
         busy = "a procedure is running" if now.state.procedure is not None else ""
@@ -292,12 +284,3 @@ def _set_text(label: QLabel, text: str) -> None:
 def _fit_height(label: QLabel) -> None:
     """Set the minimum height of wrapped text; the layout of the panel ignores its height for width."""
     label.setMinimumHeight(max(0, label.heightForWidth(label.width())) if label.text() else 0)
-
-
-def _text_label() -> QLabel:
-    """A label with wrapped, selectable text."""
-    label = QLabel()
-    label.setWordWrap(True)
-    label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-    label.setVisible(False)
-    return label

@@ -12,7 +12,7 @@ from PySide6.QtWidgets import QGridLayout, QLabel, QPushButton, QTabWidget, QWid
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.convergence import NAMES, UNITS, ConvergenceHistory, RegistrationDrift, short_unit
 from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.widgets.layouts import column, row
+from escape_gui.widgets.layouts import column, row, text_label
 from escape_gui.widgets.plots.plot import MARKERS
 from escape_gui.widgets.plots.registration import ConvergencePlot, DriftPlot
 from escape_hw.api.registration import PARAMETERS
@@ -74,8 +74,7 @@ class SprintPanel(Panel):
             for at, widget in enumerate((marker, QLabel(NAMES[k]), value, QLabel(short_unit(UNITS[k])))):
                 table.addWidget(widget, k, at)
         table.setColumnStretch(3, 1)
-        self._notes = QLabel()
-        self._notes.setWordWrap(True)
+        self._notes = text_label()
         self._notes.hide()
         page = QWidget()
         column((self.plot, 1), table, self._notes, parent=page).setContentsMargins(0, 4, 0, 0)

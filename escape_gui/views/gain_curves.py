@@ -65,7 +65,8 @@ def live_curve(
     unknown = np.full(value.size, np.nan)
 
     def matching(data: NDArray[np.floating] | None) -> NDArray[np.float64]:
-        return np.asarray(data, float).ravel() if np.size(data) == value.size else unknown
+        matches = data is not None and np.size(data) == value.size
+        return np.asarray(data, float).ravel() if matches else unknown
 
     errors = matching(sigma)
     errors = np.where(np.isfinite(errors), errors, np.nan)

@@ -24,7 +24,7 @@ class MapTile:
     title: str
     note: str
     #: ``(rows, 2 * columns + 1)``, NaN outside the pupil.
-    maps: NDArray[np.float64]
+    maps: NDArray[np.floating]
     #: Limits of the colour scale.
     limits: tuple[float, float]
     #: Diverging colour scale with symmetric limits; otherwise sequential.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TypeAlias, TypeVar
 
+from PySide6.QtCore import Qt
 from PySide6.QtWidgets import (
     QBoxLayout,
     QHBoxLayout,
@@ -49,6 +50,14 @@ def caption(text: str = "") -> QLabel:
     """A label in the muted colour."""
     label = QLabel(text)
     label.setObjectName("caption")
+    return label
+
+
+def text_label() -> QLabel:
+    """A label with wrapped, selectable text."""
+    label = QLabel()
+    label.setWordWrap(True)
+    label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
     return label
 
 

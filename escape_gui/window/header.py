@@ -11,7 +11,7 @@ from escape_gui.panels.base import Context
 from escape_gui.widgets.controls.buttons import HoldButton
 from escape_gui.widgets.controls.readout import Readout
 from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.widgets.layouts import column, row
+from escape_gui.widgets.layouts import column, row, text_label
 from escape_hw.remote.state import Phase, State
 
 PHASES: dict[Phase, Level] = {
@@ -180,8 +180,7 @@ class FaultBanner(QWidget):
         super().__init__()
         indicator = StatusIndicator(context.theme)
         indicator.set_status(Level.ERROR, "FAULT")
-        self._text = QLabel()
-        self._text.setWordWrap(True)
+        self._text = text_label()
         self._button = HoldButton("clear", context.theme)
         self._button.confirmed.connect(clear.trigger)
         clear.changed.connect(lambda: self._sync_action(clear))

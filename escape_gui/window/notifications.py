@@ -57,7 +57,7 @@ class NotificationBar(QWidget):
         self._show_newest()
 
     def show_message(self, level: Level, title: str, text: str, *, persistent: bool | None = None) -> None:
-        """Show a notification for :data:`DISPLAY_MS`, or until it is closed if ``persistent`` (as errors are)."""
+        """Show a notification for :data:`DISPLAY_MS`; if ``persistent`` (default: errors), until closed."""
         while len(self.notifications) >= _MAX_NOTIFICATIONS:
             self._remove(self.notifications[0])
         new = Notification(self._theme, level, title, text)
