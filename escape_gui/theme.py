@@ -69,29 +69,8 @@ LIGHT = Palette(
 PALETTES: dict[PaletteName, Palette] = {"dark": DARK, "light": LIGHT}
 
 
-def contrast(one: str, other: str) -> float:
-    """Contrast ratio of two colours, from 1 to 21 (Web Content Accessibility Guidelines 2.2, 1.4.3)."""
-    bright, dim = sorted((_luminance(one), _luminance(other)), reverse=True)
-    return (bright + 0.05) / (dim + 0.05)
-
-
-def _luminance(colour: str) -> float:
-    """Relative luminance of an sRGB colour, 0 to 1 (same source)."""
-    channels = (int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-
-
 class Theme(QObject):
-    """Palette and font scale in use; :attr:`changed` is emitted when either changes.
-
-    Parameters
-    ----------
-    palette_name
-        ``dark`` or ``light``.
-    scale
-        Font scale, limited to the range of :data:`SCALES`.
-    """
+    """Palette and font scale (within :data:`SCALES`); :attr:`changed` is emitted when either changes."""
 
     changed = Signal()
 
@@ -158,23 +137,14 @@ def qt_palette(colours: Palette) -> QPalette:
     """The palette as roles of Qt's Fusion style."""
     role = QPalette.ColorRole
     roles = {
-        role.Window: colours.panel,
-        role.WindowText: colours.text,
-        role.Base: colours.field,
-        role.AlternateBase: colours.panel,
-        role.Text: colours.text,
-        role.Button: colours.button,
-        role.ButtonText: colours.text,
-        role.BrightText: colours.bad,
-        role.Highlight: colours.accent,
-        role.HighlightedText: colours.on_accent,
-        role.ToolTipBase: colours.button,
-        role.ToolTipText: colours.text,
-        role.PlaceholderText: colours.muted,
-        role.Link: colours.accent,
-        role.Mid: colours.line,
-        role.Dark: colours.line,
-    }
+        role.Window: colours.panel, role.WindowText: colours.text,
+        role.Base: colours.field, role.AlternateBase: colours.panel, role.Text: colours.text,
+        role.Button: colours.button, role.ButtonText: colours.text, role.BrightText: colours.bad,
+        role.Highlight: colours.accent, role.HighlightedText: colours.on_accent,
+        role.ToolTipBase: colours.button, role.ToolTipText: colours.text,
+        role.PlaceholderText: colours.muted, role.Link: colours.accent,
+        role.Mid: colours.line, role.Dark: colours.line,
+    }  # fmt: skip
     palette = QPalette()
     for key, value in roles.items():
         palette.setColor(key, QColor(value))

@@ -113,7 +113,8 @@ def _collect(ready: dict[tuple[str, str, int], Future[RunContent]]) -> LoadedPro
                 continue
             gains[label] = GainCurve.of(label, result.gains, [one.gains.best for one in result.rounds])
             gains |= {other: GainCurve.of(other, one) for other, one in result.beside.items()}
-    ordered = dict(sorted(matrices.items(), key=lambda item: _method_rank(item[1])))
+    rank = {method: k for k, method in enumerate(_METHOD_ORDER)}
+    ordered = dict(sorted(matrices.items(), key=lambda item: rank.get(item[1].method, len(rank))))
     return LoadedProducts(ordered, gains, errors)
 
 
@@ -128,7 +129,3 @@ def _add_unique(
     if other is not None and other.data.shape == matrix.data.shape and (other.data == matrix.data).all():
         return
     matrices[label if other is None else f"{label} ({name})"] = matrix
-
-
-def _method_rank(matrix: InteractionMatrix) -> int:
-    return _METHOD_ORDER.index(matrix.method) if matrix.method in _METHOD_ORDER else len(_METHOD_ORDER)

@@ -95,6 +95,8 @@ class Panel(QWidget):
         self._state_serial = self._engine_pid = -1
         self._last_sample_s = 0.0
         self.health = DeviceHealth.STALE
+        #: Set by subclasses: :meth:`redraw` is called at the end of the refresh.
+        self.dirty = False
         self.show_placeholder(bool(self.placeholder))
         context.theme.changed.connect(self.apply_theme)
         context.session.changed.connect(self.reset)
@@ -117,6 +119,9 @@ class Panel(QWidget):
                 self.show_placeholder(False)
                 self.on_sample(stream, sample)
         self.tick(source)
+        if self.dirty:
+            self.dirty = False
+            self.redraw()
         self.health = self._assess_health(source, state)
 
     def _assess_health(self, source: DataSource, state: State) -> DeviceHealth:
@@ -160,6 +165,9 @@ class Panel(QWidget):
 
     def tick(self, source: DataSource) -> None:
         """Process everything else, such as geometry and log; called at each refresh, after the samples."""
+
+    def redraw(self) -> None:
+        """Draw data that have changed, see :attr:`dirty`."""
 
     def clear(self) -> None:
         """Discard the data of the previous source."""

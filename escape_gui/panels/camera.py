@@ -24,11 +24,8 @@ from escape_hw.remote.state import Geometry, State
 
 RAW, ARROWS, MAPS, DIFFERENCE = "raw", "arrows", "x | y", "difference"
 _TIPS = (
-    "Raw frame",
-    "Slopes as arrows over the frame",
-    "Slopes in x and in y as maps",
-    "Frame minus the reference",
-)
+    "Raw frame", "Slopes as arrows over the frame", "Slopes in x and y as maps", "Frame minus the reference",
+)  # fmt: skip
 _BINS = 128
 _HISTOGRAM_PERIOD_S = 0.2
 _MAX_SAMPLED_PIXELS = 40_000

@@ -41,7 +41,7 @@ class GainsPanel(Panel):
         self._live: dict[str, NDArray[Any]] = {}
         self._label = "live"
         self._loaded = LoadedProducts()
-        self._running = self._dirty = False
+        self._running = False
         self._curves: dict[str, GainCurve] = {}
         self.plot = GainsPlot(context.theme)
         self.rounds = QCheckBox("Rounds")
@@ -61,15 +61,14 @@ class GainsPanel(Panel):
         self._live[stream] = sample.data
         method = str(sample.meta.get("method", ""))
         self._label = METHOD_LABELS.get(method, method) or self._label
-        self._dirty = True
+        self.dirty = True
 
     def tick(self, source: DataSource) -> None:
         loaded = self.context.session.library.loaded
         if loaded is not self._loaded:
-            self._loaded, self._dirty = loaded, True
-        if not self._dirty:
-            return
-        self._dirty = False
+            self._loaded, self.dirty = loaded, True
+
+    def redraw(self) -> None:
         self._curves = self._collect_curves()
         if self._curves:
             self.show_placeholder(False)

@@ -54,8 +54,7 @@ class ModesPanel(Panel):
         self._live: dict[str, NDArray[np.float32]] = {}
         self._method = ""
         self._loaded = LoadedProducts()
-        self._dirty = self._running = False
-        self._user_selected = False
+        self._running = self._user_selected = False
         self._make_controls()
         self._make_maps()
 
@@ -68,7 +67,7 @@ class ModesPanel(Panel):
         self.weight_by_snr = QCheckBox("Weight by SNR")
         self.weight_by_snr.setChecked(True)
         self.weight_by_snr.setToolTip("Scale the colours of a mode by SNR² / (1 + SNR²).")
-        self.weight_by_snr.toggled.connect(self._redraw)
+        self.weight_by_snr.toggled.connect(self._show_mosaic)
         self._previous_button, self._next_button = QPushButton("‹"), QPushButton("›")
         for button, step, name, key in (
             (self._previous_button, -1, "Previous page", "Page Up"),
@@ -115,12 +114,12 @@ class ModesPanel(Panel):
     def on_state(self, state: State) -> None:
         """Request the products; at the end of a measurement its product replaces the live matrix."""
         running = state.procedure is not None
-        self._dirty |= running != self._running
+        self.dirty |= running != self._running
         self._running = running
         self.context.session.library.request(state.products)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        self._dirty = True
+        self.dirty = True
         if stream == "valid":
             self._valid = sample.data > 0
             return
@@ -133,14 +132,13 @@ class ModesPanel(Panel):
     def tick(self, source: DataSource) -> None:
         loaded = self.context.session.library.loaded
         if loaded is not self._loaded:
-            self._loaded, self._dirty = loaded, True
-        if not self._dirty:
-            return
-        self._dirty = False
+            self._loaded, self.dirty = loaded, True
+
+    def redraw(self) -> None:
         self._update_selector()
         if self.matrices:
             self.show_placeholder(False)
-            self._redraw()
+            self._show_mosaic()
 
     @property
     def matrices(self) -> dict[str, InteractionMatrix]:
@@ -179,9 +177,9 @@ class ModesPanel(Panel):
     # ------------------------------------------------------------ display
     def _choose_matrix(self) -> None:
         self._user_selected = True
-        self._redraw()
+        self._show_mosaic()
 
-    def _redraw(self) -> None:
+    def _show_mosaic(self) -> None:
         matrix = self.matrices.get(str(self.matrix_selector.currentData()))
         if matrix is None:
             return

@@ -17,7 +17,7 @@ from escape_gui.widgets.plots.plot import MARKERS
 from escape_gui.widgets.plots.registration import ConvergencePlot, DriftPlot
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Estimate
-from escape_hw.remote.source import DataSource, Sample
+from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
 from escape_hw.report.tables import format_with_error
 
@@ -44,7 +44,7 @@ class SprintPanel(Panel):
         super().__init__(context)
         self._data: dict[str, NDArray[Any]] = {}
         self._document: Mapping[str, Any] = {}
-        self._running = self._dirty = False
+        self._running = False
         self._last_result_id = -1
         self._history: ConvergenceHistory | None = None
         self.plot, self.drift = ConvergencePlot(context.theme), DriftPlot(context.theme)
@@ -91,20 +91,17 @@ class SprintPanel(Panel):
         self._last_result_id = last.id
         fitted = last.document.get("registration") is not None and last.document.get("converged") is not None
         if fitted or last.document.get("track"):
-            self._document, self._dirty = last.document, True
+            self._document, self.dirty = last.document, True
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         self._data[stream] = sample.data
-        self._dirty = True
+        self.dirty = True
         if self._running:
             self._document = {}
         if stream == "registration_track" and "registration" not in self._data:
             self.tabs.setCurrentIndex(1)
 
-    def tick(self, source: DataSource) -> None:
-        if not self._dirty:
-            return
-        self._dirty = False
+    def redraw(self) -> None:
         if "registration" in self._data:
             self._show_history()
         if "registration_track" in self._data:

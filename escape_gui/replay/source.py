@@ -73,6 +73,8 @@ class ReplaySource:
         The path is neither a run nor a product, or a file is damaged.
     """
 
+    connected = True
+
     def __init__(self, path: Path | str) -> None:
         # Imported here: it takes half a second, and windows on a server do not need it.
         from escape_hw.report.content import read_product, read_run
@@ -85,11 +87,8 @@ class ReplaySource:
         self._serial = 1
         self._log = _log_lines(self.run.log_text)
         self._opened_ns = time.monotonic_ns()
-        self._state = self._make_state()
-
-    @property
-    def connected(self) -> bool:
-        return True
+        #: The recorded run as the last run of a stopped server.
+        self.state = self._make_state()
 
     @property
     def steps(self) -> int:
@@ -100,7 +99,7 @@ class ReplaySource:
         """Show the run as it was at a position from 0 to 1."""
         self._position = min(1.0, max(0.0, position))
         self._serial += 1
-        self._state = self._make_state()
+        self.state = self._make_state()
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
         recorded = self._streams.get(stream)
@@ -109,11 +108,6 @@ class ReplaySource:
         step = max(1, min(recorded.length, int(np.ceil(self._position * recorded.length))))
         data = np.asarray(recorded.at(step))
         return Sample(self._serial, self._opened_ns, self._opened_ns, data, recorded.meta)
-
-    @property
-    def state(self) -> State:
-        """The recorded run as the last run of a stopped server."""
-        return self._state
 
     def _make_state(self) -> State:
         run, document = self.run, self.run.document

@@ -102,21 +102,11 @@ def _error_tiles(label: str, matrix: InteractionMatrix, mode: int) -> list[MapTi
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.abs(column) / sigma
     middle = float(np.nanmedian(ratio))
+    errors, ratios = slope_map_pair(relative, matrix.valid), slope_map_pair(ratio, matrix.valid)
+    note = f"1 σ, rms {_rms(sigma) / rms:.2g}"
     return [
-        MapTile(
-            f"Standard error of {label}",
-            f"1 σ, rms {_rms(sigma) / rms:.2g}",
-            slope_map_pair(relative, matrix.valid),
-            (0.0, _round_up(top)),
-            False,
-        ),
-        MapTile(
-            f"SNR of {label}",
-            f"median {middle:.3g}",
-            slope_map_pair(ratio, matrix.valid),
-            (0.0, _round_up(2 * middle)),
-            False,
-        ),
+        MapTile(f"Standard error of {label}", note, errors, (0.0, _round_up(top)), False),
+        MapTile(f"SNR of {label}", f"median {middle:.3g}", ratios, (0.0, _round_up(2 * middle)), False),
     ]
 
 

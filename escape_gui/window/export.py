@@ -36,12 +36,7 @@ def save_png(path: Path, widget: QWidget) -> tuple[Path, ...]:
 def save_csv(path: Path, panel: Panel) -> tuple[Path, ...]:
     """Save a panel's arrays as text and return the paths: one file per array.
 
-    Raises
-    ------
-    EscapeError
-        The panel has no arrays to export yet.
-    StorageError
-        A file cannot be written.
+    Raises `EscapeError` if the panel has no arrays yet, `StorageError` if a file cannot be written.
     """
     arrays = _arrays(panel)
     written = []
@@ -55,12 +50,7 @@ def save_csv(path: Path, panel: Panel) -> tuple[Path, ...]:
 def save_fits(path: Path, panel: Panel, state: State) -> tuple[Path, ...]:
     """Save a panel's arrays as extensions of one FITS file with checksums, and return the path.
 
-    Raises
-    ------
-    EscapeError
-        The panel has no arrays to export yet.
-    StorageError
-        The file cannot be written.
+    Raises `EscapeError` if the panel has no arrays yet, `StorageError` if the file cannot be written.
     """
     from escape_hw.io.fits import file as fits_file
 
@@ -96,19 +86,7 @@ def _csv(one: ExportArray) -> str:
 
 
 class Exporter:
-    """Saves panels and the window into files that the user chooses.
-
-    Parameters
-    ----------
-    window
-        Saved by :meth:`window`; parent of the file dialogs.
-    session
-        Its state goes into the header of FITS files.
-    notifications
-        Shows the result of each export.
-    on_saved
-        Called with the path of the last file written.
-    """
+    """Saves panels and the window into files that the user chooses, and reports it in a notification."""
 
     def __init__(
         self,

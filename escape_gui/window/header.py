@@ -15,13 +15,9 @@ from escape_gui.widgets.layouts import column, row, text_label
 from escape_hw.remote.state import Phase, State
 
 PHASES: dict[Phase, Level] = {
-    Phase.STARTING: Level.ACTIVE,
-    Phase.IDLE: Level.GOOD,
-    Phase.LOOP: Level.ACTIVE,
-    Phase.PROCEDURE: Level.ACTIVE,
-    Phase.FAULT: Level.ERROR,
-    Phase.STOPPED: Level.NEUTRAL,
-}
+    Phase.STARTING: Level.ACTIVE, Phase.IDLE: Level.GOOD, Phase.LOOP: Level.ACTIVE,
+    Phase.PROCEDURE: Level.ACTIVE, Phase.FAULT: Level.ERROR, Phase.STOPPED: Level.NEUTRAL,
+}  # fmt: skip
 #: Fraction of saturated pixels from which the indicator shows a warning and an error.
 SATURATION_WARNING, SATURATION_ERROR = 0.001, 0.01
 #: Banner before the first connection.

@@ -17,16 +17,9 @@ _SLOW_TICK_S = 0.2
 
 
 class UpdateTimer(QObject):
-    """Refreshes visible panels; a panel that raises is disabled and shows the reason.
+    """Refreshes visible panels, and calls ``on_slow_tick`` five times a second.
 
-    Parameters
-    ----------
-    session
-        Its source is handed to the panels.
-    panels
-        All panels, visible or not.
-    on_slow_tick
-        Called five times a second.
+    A panel that raises is disabled and shows the reason.
     """
 
     def __init__(self, session: Session, panels: Iterable[Panel], on_slow_tick: Callable[[], None]) -> None:

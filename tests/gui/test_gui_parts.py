@@ -16,11 +16,11 @@ from scripted import ScriptedControl, disc, rows_of, secondary
 from escape_gui.app import require_display
 from escape_gui.client.session import RequestSender
 from escape_gui.settings import Settings, load_settings, save_settings
-from escape_gui.theme import PALETTES, SCALES, Palette, Theme, contrast
+from escape_gui.theme import PALETTES, SCALES, Palette, Theme
 from escape_gui.views.images import MAP_GAP, ActuatorImage, RadialProfile, mask_from_rows, slope_map_pair
 from escape_gui.views.loop_form import LoopSettingsEdit
 from escape_gui.widgets.images.quiver import outline_points
-from escape_gui.widgets.plots.strip_chart import TimeSeriesBuffer
+from escape_gui.widgets.plots.plot import TimeSeriesBuffer
 from escape_hw.cli.app import run
 from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Geometry, LoopState
@@ -34,6 +34,19 @@ PAIRS = (
     ("on_stop", "stop"),
     ("text", "button"),
 )
+
+
+def contrast(one: str, other: str) -> float:
+    """Contrast ratio of two colours, from 1 to 21 (Web Content Accessibility Guidelines 2.2, 1.4.3)."""
+    bright, dim = sorted((_luminance(one), _luminance(other)), reverse=True)
+    return (bright + 0.05) / (dim + 0.05)
+
+
+def _luminance(colour: str) -> float:
+    """Relative luminance of an sRGB colour, 0 to 1 (same source)."""
+    channels = (int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
 @pytest.mark.parametrize("colours", PALETTES.values(), ids=PALETTES.keys())

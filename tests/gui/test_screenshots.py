@@ -47,9 +47,7 @@ def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         picture(operator, "plan")
         before = source.source.state.last.id
         operator.press(operator.procedure.start)
-        operator.until(
-            lambda: panels["modes"].matrix_selector.currentData() == "live", "maps fill in"
-        )
+        operator.until(lambda: panels["modes"].matrix_selector.currentData() == "live", "maps fill in")
         picture(operator, "measuring")
         operator.until(lambda: operator.ended(before), "it ends")
         operator.run("push-pull", frames="1")

@@ -25,11 +25,8 @@ _LEVEL_UPDATE_S, _LEVEL_SAMPLE_PIXELS = 0.2, 20_000
 #: Range of a logarithmic image below its brightest pixel, decades.
 DECADES = 4.0
 _CURSOR_STEPS = {
-    Qt.Key.Key_Left: (-1, 0),
-    Qt.Key.Key_Right: (1, 0),
-    Qt.Key.Key_Up: (0, -1),
-    Qt.Key.Key_Down: (0, 1),
-}
+    Qt.Key.Key_Left: (-1, 0), Qt.Key.Key_Right: (1, 0), Qt.Key.Key_Up: (0, -1), Qt.Key.Key_Down: (0, 1),
+}  # fmt: skip
 
 
 class ImageViewer(QWidget):
@@ -37,14 +34,10 @@ class ImageViewer(QWidget):
 
     Parameters
     ----------
-    name
-        Accessible name.
     maps
         Names of the colour maps that the key M cycles through.
     symmetric
         Display range symmetric about zero.
-    unit
-        Unit of the values.
     min_level
         Minimum of the upper level of a symmetric display range.
     """

@@ -55,7 +55,9 @@ class ModeMosaic(QWidget):
         self._data: NDArray[np.floating] = np.zeros((0, 0), np.float32)
         self._statistics = ModeStatistics(np.zeros(0), np.zeros(0))
         self._layout = MosaicLayout((1, 1), 1, 1)
-        self._page, self._mode, self._weight_by_snr = 0, -1, True
+        self._page, self._weight_by_snr = 0, True
+        #: The selected mode, from 0; -1 if none.
+        self.mode = -1
         self._build_view()
         theme.changed.connect(self.apply_theme)
         self.apply_theme()
@@ -80,11 +82,6 @@ class ModeMosaic(QWidget):
     @property
     def n_modes(self) -> int:
         return int(self._data.shape[1])
-
-    @property
-    def mode(self) -> int:
-        """The selected mode, from 0; -1 if none."""
-        return self._mode
 
     @property
     def page(self) -> tuple[int, int]:
@@ -119,7 +116,7 @@ class ModeMosaic(QWidget):
     def choose(self, mode: int) -> None:
         if not 0 <= mode < self.n_modes:
             return
-        self._mode = mode
+        self.mode = mode
         self.show_page(mode // self._layout.per_page)
         self._draw_frame()
         self.chosen.emit(mode)
@@ -139,7 +136,7 @@ class ModeMosaic(QWidget):
             self._theme.pixels(_MIN_MODE_WIDTH),
             QFontMetricsF(self._theme.font(_NUMBER_SCALE)).ascent(),
         )
-        self._page = max(0, self._mode) // self._layout.per_page
+        self._page = max(0, self.mode) // self._layout.per_page
         self._draw(labels=True)
         height, width = self._layout.size
         self._box.setRange(xRange=(0, width), yRange=(0, height), padding=0)
@@ -171,8 +168,8 @@ class ModeMosaic(QWidget):
                 label.setPos(left - 1, top)
 
     def _draw_frame(self) -> None:
-        position = self._mode - self._page * self._layout.per_page
-        if self._mode < 0 or not 0 <= position < self._layout.per_page:
+        position = self.mode - self._page * self._layout.per_page
+        if self.mode < 0 or not 0 <= position < self._layout.per_page:
             self._frame.clear()
             return
         top, left = self._layout.corner(position)
@@ -220,7 +217,7 @@ class ModeMosaic(QWidget):
         }
         key = Qt.Key(event.key())
         if key in steps:
-            self.choose(min(max(self._mode + steps[key], 0), self.n_modes - 1))
+            self.choose(min(max(self.mode + steps[key], 0), self.n_modes - 1))
         elif key == Qt.Key.Key_PageDown:
             self.show_page(self._page + 1)
         elif key == Qt.Key.Key_PageUp:

@@ -33,17 +33,13 @@ class ConvergencePlot(_ParameterGrid):
     def __init__(self, theme: Theme) -> None:
         super().__init__(theme)
         self._history: ConvergenceHistory | None = None
-        self._physical = False
+        #: Parameters are shown in their physical units; otherwise normalised.
+        self.physical = False
         self.build()
 
-    @property
-    def physical(self) -> bool:
-        """Whether parameters are shown in their physical units; otherwise normalised."""
-        return self._physical
-
     def set_physical_units(self, physical: bool) -> None:
-        if physical != self._physical:
-            self._physical = physical
+        if physical != self.physical:
+            self.physical = physical
             self.build()
 
     def show_convergence(self, history: ConvergenceHistory | None) -> None:
@@ -58,7 +54,7 @@ class ConvergencePlot(_ParameterGrid):
         top.setLogMode(y=True)
         self._norm = ErrorCurve.make(self._theme, 0)
         self._norm.add_to(top)
-        groups = GROUPS if self._physical else (("Normalised", "", tuple(range(len(NAMES)))),)
+        groups = GROUPS if self.physical else (("Normalised", "", tuple(range(len(NAMES)))),)
         plots = [top]
         for row, (title, unit, members) in enumerate(groups, 1):
             plot = self._add_row(row, title, unit, "Iteration" if row == len(groups) else "")
@@ -70,7 +66,7 @@ class ConvergencePlot(_ParameterGrid):
         self._marks = [reference_line(self._theme, 1, horizontal=False) for _ in plots]
         for row, (plot, mark) in enumerate(zip(plots, self._marks, strict=True)):
             plot.addItem(mark)
-            self.ci.layout.setRowStretchFactor(row, 3 if row or self._physical else 2)
+            self.ci.layout.setRowStretchFactor(row, 3 if row or self.physical else 2)
         self._plots = plots
         self._fill()
 
@@ -82,7 +78,7 @@ class ConvergencePlot(_ParameterGrid):
             for curve in (self._norm, *self._curves.values()):
                 curve.set(np.zeros(0), np.zeros(0), None)
             return
-        shown = history if self._physical else history.normalise()
+        shown = history if self.physical else history.normalise()
         x = shown.iterations
         self._norm.set(x, shown.step_norm, None)
         for member, curve in self._curves.items():
