@@ -26,7 +26,7 @@ from escape_hw.report.tables import TITLES, format_with_error
 NO_CHOICE = "–"
 #: Labels of parameters whose names are not suitable as labels.
 _LABELS = {
-    "snr": "SNR goal", "im": "Matrix", "closed_loop": "Control matrix (closed loop)", "frames": "Frames",
+    "snr": "SNR goal", "im": "Matrix", "closed_loop": "Control matrix", "frames": "Frames",
     "poke": "Poke", "accuracy": "Accuracy goal", "strehl": "Measure Strehl", "best": "Optimise gain",
     "resume": "Resume run", "plain": "Paper's estimator", "whiten": "Whiten turbulence",
     "budget": "Allowed Strehl loss", "exchange": "Exchange matrix",
