@@ -1,4 +1,4 @@
-"""The panels of the Calibrate workspace on a source that the test scripts."""
+"""The panels of the Calibrate workspace on a scripted source."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ RUNNING = ActiveRun(
 @pytest.fixture
 def source() -> ScriptedSource:
     source = ScriptedSource()
-    source.offers = PROCEDURES
+    source.entries = PROCEDURES
     source.change(phase=Phase.IDLE, products=())
     return source
 
@@ -104,7 +104,7 @@ def press(button: QPushButton) -> None:
 
 
 def measure(source: ScriptedSource, share: float) -> None:
-    """The matrix after a share of its frames."""
+    """Push the matrix with the standard errors after a fraction of its frames."""
     sigma = MATRIX.sigma / np.sqrt(share)
     source.push("valid", MATRIX.valid.astype(np.float32))
     source.push("matrix_sigma", sigma, stage="DO-CRIME")
@@ -131,7 +131,7 @@ def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
 
 
 def contrast(panel: ModesPanel) -> float:
-    """How far the mosaic's colours lie from white."""
+    """Mean distance of the mosaic's colours from white."""
     picture = panel.mosaic._image.image.astype(float)
     return float(np.abs(picture[picture > 0] - 128).mean())
 
@@ -172,11 +172,11 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
 @pytest.mark.parametrize(
     ("width", "height", "columns"), [(900, 260, 6), (480, 300, 3), (500, 700, 2), (500, 1200, 1)]
 )
-def test_tiles_use_their_room(width, height, columns):
+def test_tiles_use_the_available_space(width, height, columns):
     assert best_columns(6, width, height, 56) == columns
 
 
-def test_pages_turn(calibrate, source):
+def test_pages_change(calibrate, source):
     panel = calibrate.panels["modes"]
     source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
     measure(source, 1.0)
@@ -215,7 +215,7 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     assert panel._indicator.text == "converged, 18 iterations"
     assert "±" in panel._values[0].text()
     assert "tangential_scaling is consistent with zero" in panel._notes.text()
-    # Runs that fit no registration leave the verdict as it is, gains that did not converge among them.
+    # Runs without a registration do not change the state of the fit.
     for k, name, told in ((4, "push-pull", None), (5, "gains", False)):
         source.change(last=FinishedRun(id=k, name=name, finish=Finish.ABORTED, document={"converged": told}))
         look(calibrate)
@@ -226,7 +226,7 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     np.testing.assert_allclose(table[:, 2:], path, rtol=1e-6)
 
 
-def test_a_drift_is_followed(calibrate, source):
+def test_a_drift_is_shown(calibrate, source):
     panel = calibrate.panels["sprint"]
     track = np.zeros((30, 11))
     track[:, 0] = np.arange(30)
@@ -258,7 +258,7 @@ def press_box(panel: GainsPanel) -> None:
 
 
 # ---------------------------------------------------------------- procedures
-def test_from_the_form_to_the_start(calibrate, source, control):
+def test_a_procedure_is_started_from_the_form(calibrate, source, control):
     panel = calibrate.panels["procedure"]
     look(calibrate)
     assert [panel.choice.itemText(k) for k in range(panel.choice.count())] == ["ESCAPE", "Optical gains"]
@@ -275,7 +275,7 @@ def test_from_the_form_to_the_start(calibrate, source, control):
     assert ("start", {"args": ("escape",), **arguments}) in control.asked
 
 
-def test_a_form_that_is_wrong_starts_nothing(calibrate, control):
+def test_an_invalid_form_starts_nothing(calibrate, control):
     panel = calibrate.panels["procedure"]
     look(calibrate)
     until(panel.start.isEnabled, calibrate)
@@ -288,7 +288,7 @@ def test_a_form_that_is_wrong_starts_nothing(calibrate, control):
     assert "not checked" in panel.start.toolTip()
 
 
-def test_a_refusal_is_told_beside_the_form(calibrate, control):
+def test_a_refusal_is_shown_below_the_form(calibrate, control):
     panel = calibrate.panels["procedure"]
     control.refuse = "no light on the sensor"
     look(calibrate)
@@ -297,7 +297,7 @@ def test_a_refusal_is_told_beside_the_form(calibrate, control):
     control.refuse = ""
 
 
-def test_a_procedure_is_watched_halted_and_stopped(calibrate, source, control):
+def test_a_procedure_is_monitored_paused_and_aborted(calibrate, source, control):
     panel = calibrate.panels["procedure"]
     look(calibrate)
     assert not panel.abort.isEnabled()
@@ -322,7 +322,7 @@ def test_a_procedure_is_watched_halted_and_stopped(calibrate, source, control):
     until(lambda: ("abort", {}) in control.asked, calibrate)
 
 
-def test_the_result_stands_beside_the_one_before(calibrate, source):
+def test_the_result_is_compared_with_the_previous_one(calibrate, source):
     panel = calibrate.panels["procedure"]
     document = calibration_document(fake.calibration("escape"))
     first = FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/1", document=document)

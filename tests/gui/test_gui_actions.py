@@ -1,4 +1,4 @@
-"""Every action of the table, through its menu entry: what it does, and why it is impossible otherwise."""
+"""Every action of the table: its effect when triggered, and the reason when it is unavailable."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SOMEBODY = Lease(
 
 
 class Stage:
-    """What a check may look at."""
+    """Objects that the checks use."""
 
     def __init__(
         self, window: MainWindow, source: ScriptedSource, control: ScriptedControl, folder: Path, bot: QtBot
@@ -31,11 +31,11 @@ class Stage:
         self.window, self.source, self.control, self.folder, self.bot = window, source, control, folder, bot
 
     def asked(self, verb: str, **arguments: object) -> None:
-        """The server was asked exactly this."""
+        """The server received exactly this request."""
         self.bot.waitUntil(lambda: self.control.asked == [(verb, arguments)], timeout=5000)
 
     def refused(self, name: str) -> None:
-        """What was chosen is no recording, and a note says so."""
+        """The chosen file is not a recorded run, and a notification says so."""
         self.bot.waitUntil(lambda: bool(self.window.notifications.notifications), timeout=5000)
         assert name in self.window.notifications.notifications[-1].text
 
@@ -81,7 +81,7 @@ def _reset(stage: Stage) -> None:
     assert stage.window.docks["log"].isVisible()
 
 
-#: What each action must have done. An action that is missing here fails.
+#: Check of the effect of each action. The test of an action without a check fails.
 CHECKS: dict[str, Callable[[Stage], None]] = {
     "open_product": lambda s: s.refused("chosen.fits"),
     "open_run": lambda s: s.refused("saved"),
@@ -113,7 +113,7 @@ CHECKS: dict[str, Callable[[Stage], None]] = {
     "keys": lambda s: _is("Ctrl+Shift+F" in s.window.overlay.page),
 }
 
-#: What must be so before, where the usual state does not do.
+#: Changes of the state that an action needs.
 SETTINGS: dict[str, Callable[[ScriptedSource], None]] = {
     "abort": lambda s: s.change(procedure=RUN),
     "pause": lambda s: s.change(procedure=RUN),

@@ -1,4 +1,4 @@
-"""Every panel through what can happen to its source; and what single panels show of it."""
+"""All panels in all states of their source, and the content of single panels."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MakeWindow = Callable[..., MainWindow]
 
 @pytest.fixture
 def window(make_window: MakeWindow) -> MainWindow:
-    """A window of the panels that are looked at here together."""
+    """A window with several panels."""
     return make_window((DevicesPanel, CameraPanel, MirrorPanel, LoopPanel, PerformancePanel, LogPanel))
 
 
@@ -54,7 +54,7 @@ def panel_of(window: MainWindow, kind: type[P]) -> P:
 
 
 @pytest.mark.parametrize("kind", PANELS, ids=lambda kind: kind.name)
-def test_each_panel_lives_through_everything(
+def test_each_panel_handles_all_states_of_the_source(
     kind: type[Panel], make_window: MakeWindow, source: ScriptedSource
 ) -> None:
     window = make_window((kind,))
@@ -77,7 +77,7 @@ def test_each_panel_lives_through_everything(
     source.state = running(engine_pid=99, serial=1000)
     source.push_all(1)
     assert look() is DeviceHealth.OK
-    # Nothing at all, as before the first connection.
+    # An empty source, as before the first connection.
     source.state, source.streams, source.lines = State(), {}, []
     look()
     assert panel.shows_placeholder == bool(panel.placeholder) or kind.stale_after_s is None
@@ -97,7 +97,7 @@ def test_frames_that_stop_are_called_stale(
     assert camera.health is DeviceHealth.OK
 
 
-def test_every_panel_says_what_to_do_when_there_is_nothing() -> None:
+def test_every_panel_has_a_help_text() -> None:
     for kind in PANELS:
         assert kind.title
         assert len(kind.help) > 40
@@ -122,7 +122,7 @@ def test_camera_views(window: MainWindow, source: ScriptedSource) -> None:
     kept = source.streams["frames"].data.astype(np.float32)
     camera.choice.choose("arrows")
     assert camera.quiver.isVisible()
-    n = len(source.places.outlines_px)
+    n = len(source.geometry_data.outlines_px)
     assert camera.quiver.getData()[0].size == 2 * n
     camera.choice.choose("x | y")
     maps = camera.signed.data
@@ -135,7 +135,7 @@ def test_camera_views(window: MainWindow, source: ScriptedSource) -> None:
     assert np.array_equal(camera.signed.data, source.streams["frames"].data - kept)
 
 
-def test_cursor_says_place_and_value(window: MainWindow, source: ScriptedSource, qtbot: QtBot) -> None:
+def test_cursor_shows_position_and_value(window: MainWindow, source: ScriptedSource, qtbot: QtBot) -> None:
     image_view = panel_of(window, CameraPanel).image_view
     said: list[str] = []
     image_view.cursor_changed.connect(said.append)
@@ -158,7 +158,7 @@ def test_mirror_of_a_secondary_shows_both(session: Session, make_window: MakeWin
     assert mirror.image_view.unit == "µm"
 
 
-def test_mirror_tells_peak_and_clipping(window: MainWindow, source: ScriptedSource) -> None:
+def test_mirror_shows_peak_and_clipping(window: MainWindow, source: ScriptedSource) -> None:
     source.change(mirror=MirrorState(rms=0.0812, peak=0.8, clipped=0.031))
     window.show_workspace("align")
     window.update_timer.tick(force=True)
@@ -246,7 +246,7 @@ def test_log_search_level_and_copy(window: MainWindow, source: ScriptedSource) -
     assert "message 4" in QGuiApplication.clipboard().text()
 
 
-def test_performance_has_gaps_where_nobody_looked(window: MainWindow, source: ScriptedSource) -> None:
+def test_performance_has_gaps_while_hidden(window: MainWindow, source: ScriptedSource) -> None:
     panel = panel_of(window, PerformancePanel)
     panel._last_state_s -= 60.0
     source.change(loop=source.state.loop.model_copy(update={"residual_nm": 50.0}))
@@ -279,7 +279,7 @@ def test_profiles_begin_at_the_strehl_ratio(make_window: MakeWindow, source: Scr
     assert profiles["psf_profile"][0] / profiles["model_psf_profile"][0] == pytest.approx(0.25, rel=0.01)
 
 
-def test_latencies_are_counted_where_they_lie(make_window: MakeWindow, source: ScriptedSource) -> None:
+def test_latencies_are_exported_by_bin(make_window: MakeWindow, source: ScriptedSource) -> None:
     window = make_window((LatencyPanel,))
     (table,) = panel_of(window, LatencyPanel).export_arrays()
     assert table.data[:, 1].sum() == 4000
@@ -305,13 +305,11 @@ def test_devices_are_listed_with_units(window: MainWindow, source: ScriptedSourc
         ("unread", 4.0, "unread 4"),
     ],
 )
-def test_facts_in_words(key: str, value: float | str, text: str) -> None:
+def test_format_of_facts(key: str, value: float | str, text: str) -> None:
     assert format_fact(key, value) == text
 
 
-def test_a_full_disk_is_told_and_nothing_breaks(
-    window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_notified(window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, content: bytes) -> None:
         raise StorageError(f"{path}: cannot be written (No space left on device)")
 
@@ -321,7 +319,7 @@ def test_a_full_disk_is_told_and_nothing_breaks(
     assert list(tmp_path.glob("a*")) == []
 
 
-def test_a_missing_model_image_is_told(make_window: MakeWindow, source: ScriptedSource) -> None:
+def test_a_missing_reference_psf_is_shown(make_window: MakeWindow, source: ScriptedSource) -> None:
     model = source.streams.pop("model_psf")
     source.change(loop=LoopState(closed=True, matrix="escape", residual_nm=50.0))
     window = make_window((PsfPanel, PerformancePanel))

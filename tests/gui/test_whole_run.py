@@ -27,12 +27,12 @@ def recovered(ended: FinishedRun) -> None:
 
 
 def calibrated(operator: Operator, ended: FinishedRun) -> None:
-    """What the panels show after ESCAPE."""
+    """Check the content of the panels after ESCAPE."""
     window = operator.window
     modes, sprint = window.panels["modes"], window.panels["sprint"]
     assert ended.finish is Finish.DONE, ended.message
     recovered(ended)
-    # The maps filled in while frames came, and SPRINT's iterations came one by one.
+    # The maps were updated during the acquisition.
     assert operator.seen["live_modes"]
     assert any(operator.seen["abort"])
     operator.until(lambda: {"DO-CRIME", "ESCAPE"} <= set(modes.matrices), "products are shown")
@@ -56,7 +56,7 @@ def test_escape_through_the_buttons(small: Path, tmp_path: Path) -> None:
     with operating(small, tmp_path) as operator:
         operator.take_control()
         calibrated(operator, operator.run("escape", frames="3000"))
-        # Again, and stopped on the way: what was measured is kept.
+        # Again, and aborted: the acquired data are saved.
         operator.choose("docrime", frames="1000000")
         operator.press(operator.procedure.start)
         source = operator.window.context.session.source
@@ -64,7 +64,7 @@ def test_escape_through_the_buttons(small: Path, tmp_path: Path) -> None:
         operator.until(lambda: bool(operator.procedure._metrics.text()), "it is under way")
         operator.press(operator.procedure.abort)
         operator.until(lambda: source.state.last.finish is Finish.ABORTED, "it is stopped")
-        operator.until(lambda: "Aborted" in operator.procedure.outcome.text(), "that is told")
+        operator.until(lambda: "Aborted" in operator.procedure.outcome.text(), "the outcome is shown")
 
 
 @pytest.mark.slow
