@@ -138,8 +138,7 @@ class LoopPanel(Panel):
         if self._is_edited and selected in summaries:
             self.matrix.setCurrentText(selected)
         else:
-            # The newest matrix.
-            self.matrix.setCurrentIndex(len(summaries) - 1)
+            self.matrix.setCurrentIndex(len(summaries) - 1)  # the newest
 
     def tick(self, source: DataSource) -> None:
         now = self.context.session.request_context

@@ -34,26 +34,6 @@ if TYPE_CHECKING:
     from escape_hw.report.content import RunContent
 
 
-def run_geometry(run: RunContent) -> Geometry:
-    """Geometry of a run's main calibration and of its mirror; parts that were not recorded are empty."""
-    main = main_calibration(run)
-    parts: dict[str, object] = {}
-    if main is not None:
-        grid = main[1].grid
-        parts |= {
-            "valid": _rows(grid.valid), "outlines_px": outlines(grid), "n_modes": main[1].matrix.n_modes,
-        }  # fmt: skip
-    if run.layout is not None:
-        parts["layout"] = _rows(run.layout)
-    if run.places_m is not None:
-        parts["places_m"] = tuple((float(x), float(y)) for x, y in run.places_m)
-    return Geometry.model_validate(parts)
-
-
-def _rows(mask: NDArray[np.bool_]) -> tuple[str, ...]:
-    return tuple("".join("1" if valid else "0" for valid in row) for row in mask)
-
-
 #: Why nothing can be commanded.
 READ_ONLY_REASON = "replay of a recorded run: no procedure can be started"
 _LOG_LINE = re.compile(r"(\S+ \S+) ([A-Z]+) (\S+): (.*)")
@@ -82,7 +62,7 @@ class ReplaySource:
         self.path = Path(path)
         self.run: RunContent = read_run(self.path) if self.path.is_dir() else read_product(self.path)
         self._streams = recorded_streams(self.run)
-        self._geometry = run_geometry(self.run)
+        self._geometry = _geometry_of(self.run)
         self._position = 1.0
         self._serial = 1
         self._log = _log_lines(self.run.log_text)
@@ -148,6 +128,26 @@ class ReplaySource:
     def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """Raise `ConfigError`: no procedure can be started in a replay."""
         raise ConfigError(READ_ONLY_REASON)
+
+
+def _geometry_of(run: RunContent) -> Geometry:
+    """Geometry of a run's main calibration and of its mirror; parts that were not recorded are empty."""
+    main = main_calibration(run)
+    parts: dict[str, object] = {}
+    if main is not None:
+        grid = main[1].grid
+        parts |= {
+            "valid": _rows(grid.valid), "outlines_px": outlines(grid), "n_modes": main[1].matrix.n_modes,
+        }  # fmt: skip
+    if run.layout is not None:
+        parts["layout"] = _rows(run.layout)
+    if run.places_m is not None:
+        parts["places_m"] = tuple((float(x), float(y)) for x, y in run.places_m)
+    return Geometry.model_validate(parts)
+
+
+def _rows(mask: NDArray[np.bool_]) -> tuple[str, ...]:
+    return tuple("".join("1" if valid else "0" for valid in row) for row in mask)
 
 
 def _loop_state(run: RunContent) -> LoopState:

@@ -65,20 +65,10 @@ class MosaicLayout:
 def fit_layout(
     shape: tuple[int, int], n_modes: int, size: tuple[float, float], min_width: float, head: float
 ) -> MosaicLayout:
-    """The layout with the most modes per page, at a minimum width of each mode.
+    """The layout with the most modes per page, for a widget of ``size`` (width, height).
 
-    Parameters
-    ----------
-    shape
-        Rows and columns of one map.
-    n_modes
-        Number of modes.
-    size
-        Width and height of the widget, in screen pixels.
-    min_width
-        Minimum width of a mode's pair of maps, in screen pixels.
-    head
-        Height of the number above a map, in screen pixels.
+    ``min_width`` is the minimum width of a mode's pair of maps, ``head`` the height of the number above it,
+    all in screen pixels.
     """
     width, height = size
     best = MosaicLayout(shape, 1, 1)

@@ -97,9 +97,9 @@ class HeaderBar(QWidget):
         for k, names in enumerate(pairs, len(indicators)):
             for line, name in enumerate(names):
                 grid.addWidget(self.readouts[name], line, k, Qt.AlignmentFlag.AlignRight)
-        whole = row(grid, None, self.open_button, self.flatten_button)
-        whole.setContentsMargins(8, 4, 8, 4)
-        return whole
+        content = row(grid, None, self.open_button, self.flatten_button)
+        content.setContentsMargins(8, 4, 8, 4)
+        return content
 
     def show_state(self, state: State, *, connected: bool, live: bool, mine: bool) -> None:
         """Update everything; ``mine``: this client holds the lease."""

@@ -21,16 +21,9 @@ _LINE = 14
 
 
 def best_columns(count: int, width: float, height: float, title: float) -> int:
-    """Number of columns for which images with an aspect ratio of 2 : 1 are largest.
+    """Number of columns for which ``count`` images with an aspect ratio of 2 : 1 are largest.
 
-    Parameters
-    ----------
-    count
-        Number of images.
-    width, height
-        Size of the grid, in pixels.
-    title
-        Height of the title above each image, in pixels.
+    ``width`` and ``height`` are those of the grid, ``title`` is the height above each image, in pixels.
     """
 
     def size(columns: int) -> float:
