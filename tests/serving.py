@@ -17,7 +17,8 @@ from running import ESCAPE
 from escape_hw.errors import ServerGone
 from escape_hw.remote.client import Connection, connect
 from escape_hw.remote.state import Phase
-from escape_hw.streams.segments import process_start, segments
+from escape_hw.streams.segments import segments
+from escape_hw.supervision import process_start
 
 #: Longest wait for something that takes seconds on an idle machine.
 PATIENCE_S = 120.0

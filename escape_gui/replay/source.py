@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_gui.replay.streams import RecordedStream, main_calibration, recorded_streams
+from escape_hw.api.outlines import outlines
 from escape_hw.errors import ConfigError
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
@@ -28,7 +29,6 @@ from escape_hw.remote.state import (
     State,
     StreamEntry,
 )
-from escape_hw.server.engine.bench_status import outlines
 
 if TYPE_CHECKING:
     from escape_hw.report.content import RunContent

@@ -15,7 +15,7 @@ import platformdirs
 
 from escape_hw.errors import ConfigError, ServerGone, StorageError
 from escape_hw.io.storage import storage_error, write_atomic
-from escape_hw.streams.segments import process_start
+from escape_hw.supervision import is_alive
 
 #: Longest path of a local socket, the system's own limit (with room for its end).
 _LONGEST_SOCKET = 100
@@ -58,7 +58,7 @@ class ServerListing:
     @property
     def alive(self) -> bool:
         """Whether that very process lives."""
-        return process_start(self.pid) == self.started
+        return is_alive(self.pid, self.started)
 
 
 def runtime_folder() -> Path:

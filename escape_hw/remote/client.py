@@ -257,9 +257,7 @@ class ReadOnlyConnection:
         return f"<Connection to {state.system}, {state.phase.value}, {'alive' if self.connected else 'gone'}>"
 
     def _repr_html_(self) -> str:
-        from escape_hw.remote.html import state_html
-
-        return state_html(self.state)
+        return self.state._repr_html_()
 
     def _heartbeat(self, refused: bool) -> Mapping[str, Any] | None:
         if not self._registered:

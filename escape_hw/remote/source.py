@@ -8,7 +8,7 @@ from typing import Protocol
 from escape_hw.remote.state import Arguments, Geometry, LogLine, ProcedureEntry, ProcedurePlan, State
 from escape_hw.streams.ring import Sample
 
-__all__ = ["STREAMS", "Sample", "DataSource"]
+__all__ = ["STREAMS", "DataSource", "Sample"]
 
 
 class DataSource(Protocol):

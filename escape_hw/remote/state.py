@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from escape_hw.api.representation import table_html
+
 #: Version of the documents below; a client of another version is refused.
 SCHEMA = 1
 
@@ -248,9 +250,25 @@ class State(StateDocument):
     notes: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
-        from escape_hw.remote.html import state_html
-
-        return state_html(self)
+        loop, running, lease, fault = self.loop, self.procedure, self.lease, self.fault
+        rows: dict[str, object] = {
+            "system": f"{self.system} ({'SIMULATED' if self.simulated else 'HARDWARE'})",
+            "phase": self.phase.value,
+        }
+        if fault is not None:
+            rows["FAULT"] = f"{fault.reason}. {fault.way_out}"
+        if running is not None:
+            rows["running"] = (
+                f"{running.name}: {running.stage}, {running.done} of {running.total} {running.unit}s"
+            )
+        if loop.closed:
+            rows["loop"] = f"closed on {loop.matrix}, gain {loop.gain:g}, residual {loop.residual_nm:.0f} nm"
+        rows["camera"] = f"{self.rates.frame_hz:.1f} Hz, {self.rates.lost} frames lost"
+        rows["mirror"] = f"rms {100 * self.mirror.rms:.2f} %, peak {100 * self.mirror.peak:.2f} % of the stroke"
+        rows["in control"] = "no client" if lease is None else f"{lease.name} on {lease.host}"
+        rows["devices"] = ", ".join(f"{one.name} {one.health.value}" for one in self.devices)
+        rows["server"] = f"process {self.server_pid}, ESCAPE {self.version}"
+        return table_html(rows, "Server")
 
 
 class LogLine(StateDocument):
@@ -294,9 +312,16 @@ class ProcedurePlan(StateDocument):
     warnings: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
-        from escape_hw.remote.html import plan_html
-
-        return plan_html(self)
+        given = {key: value for key, value in self.arguments.items() if value is not None}
+        rows: dict[str, object] = {
+            "frames": self.frames,
+            "at the camera's rate": f"{self.seconds:.1f} s",
+            "largest poke": f"{100 * self.stroke:.3g} % of the stroke" if self.stroke else "none",
+            "arguments": ", ".join(f"{key} {value}" for key, value in given.items()),
+        }
+        if self.warnings:
+            rows["warnings"] = "; ".join(self.warnings)
+        return table_html(rows, f"Plan of {self.name}")
 
 
 class ProcedureParameter(StateDocument):
@@ -322,6 +347,8 @@ class ProcedureEntry(StateDocument):
     parameters: tuple[ProcedureParameter, ...] = ()
 
     def _repr_html_(self) -> str:
-        from escape_hw.remote.html import procedure_html
-
-        return procedure_html(self)
+        rows = {
+            one.name: f"{one.help} {'' if one.default is None else f'Default: {one.default} {one.unit}'}".strip()
+            for one in self.parameters
+        }
+        return table_html(rows, f"{self.name}: {self.help}")

@@ -19,6 +19,7 @@ import zmq
 from escape_hw.errors import ServerGone
 from escape_hw.remote.address import Endpoint
 from escape_hw.remote.requests import error_from_document
+from escape_hw.supervision import BackgroundThread
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +76,7 @@ class ClientTransport:
         self._ending = self._heartbeat_refused = False
         #: When the server was last heard of, monotonic seconds.
         self.last_message_s = 0.0
-        self._thread = threading.Thread(target=self._run, name="escape-link", daemon=True)
+        self._thread = BackgroundThread("escape client", self._run)
         self._thread.start()
 
     def _socket(self, kind: int, address: str, keys: Keys | None) -> zmq.Socket[bytes]:

@@ -19,6 +19,7 @@ from escape_hw.streams import layout, segments
 from escape_hw.streams.futex import futex_address, futex_wait, futex_wake
 from escape_hw.streams.segments import StreamUnavailable
 from escape_hw.streams.timing import BINS, bin_of
+from escape_hw.supervision import is_alive
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,7 +129,7 @@ class RingReader:
     @property
     def alive(self) -> bool:
         """Whether the writer has not said goodbye and its process lives; reads a file of the system."""
-        return not self.closed and segments.process_start(self.pid) == self._started
+        return not self.closed and is_alive(self.pid, self._started)
 
     def latest(self, after: int = -1) -> Sample | None:
         """The newest entry.

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from escape_hw.errors import EscapeError, StorageError
+from escape_hw.supervision import is_alive, process_start
 
 #: Where segments lie.
 SHARED = Path("/dev/shm")
@@ -62,17 +63,6 @@ def segment_name(system: str, stream: str, pid: int | None = None) -> str:
     """Name of the segment of a stream; of this process by default."""
     system = re.sub(r"[^A-Za-z0-9._-]", "_", system)
     return f"escape-{os.getuid()}-{system}-{os.getpid() if pid is None else pid}-{stream}"
-
-
-def process_start(pid: int) -> int | None:
-    """When a process began, in clock ticks after boot; ``None``: there is none (or only its remains)."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
-    except OSError:
-        return None
-    # The command's name stands in brackets and may hold anything.
-    fields = text[text.rindex(")") + 2 :].split()
-    return None if fields[0] in "ZX" else int(fields[19])
 
 
 def create(name: str, size: int, fill: struct.Struct, *header: int) -> mmap.mmap:
@@ -180,7 +170,7 @@ def read_identity(name: str) -> Segment | None:
     if len(head) < IDENTITY.size or IDENTITY.unpack(head)[0] != MAGIC:
         return None
     _, _, pid, started = IDENTITY.unpack(head)
-    alive = process_start(pid) == started
+    alive = is_alive(pid, started)
     return Segment(name, parts["system"], parts["stream"], pid, started, size, alive)
 
 

@@ -140,7 +140,7 @@ def test_a_full_disk_ends_the_recording_and_leaves_whole_blocks(tmp_path, writer
 
 
 def test_room_is_left_to_others(tmp_path, writer):
-    state = recorded(tmp_path, writer, lambda: time.sleep(0.2), least_free=1 << 60)
+    state = recorded(tmp_path, writer, lambda: time.sleep(0.2), min_free_bytes=1 << 60)
     assert "are left to others" in state.fault
 
 

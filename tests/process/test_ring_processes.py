@@ -16,6 +16,7 @@ import pytest
 from escape_hw.streams import segments
 from escape_hw.streams.ring import RingReader, RingWriter
 from escape_hw.streams.segments import segment_name
+from escape_hw.supervision import process_start
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="shared memory as on Linux")
 
@@ -135,7 +136,7 @@ def test_the_segments_of_a_killed_owner_are_reaped_and_no_others() -> None:
 
 def test_a_process_number_that_came_round_again_is_not_taken_for_the_owner() -> None:
     name = segment_name(SYSTEM, "psf")
-    began = segments.process_start(os.getpid())
+    began = process_start(os.getpid())
     assert began is not None
     with RingWriter(name, 64):
         content = bytearray((segments.SHARED / name).read_bytes())
@@ -154,12 +155,12 @@ def test_a_forked_child_does_not_remove_its_parents_segment() -> None:
     script = f"""
 import os, sys
 from escape_hw.streams.ring import RingWriter
-from escape_hw.streams.segments import examine, segment_name
+from escape_hw.streams.segments import read_identity, segment_name
 with RingWriter(segment_name({SYSTEM!r}, "frames"), 64) as writer:
     child = os.fork()
     if child:
         os.waitpid(child, 0)
-        print(examine(writer.name) is not None, flush=True)
+        print(read_identity(writer.name) is not None, flush=True)
 """
     with process(script) as parent:
         assert says(parent) == "True"

@@ -100,7 +100,7 @@ def test_while_it_measures_matrix_and_progress_are_shown(bench: Connection) -> N
     assert bench.latest("matrix").data.shape[1] == 30
     wait_for(lambda: bench.state.mirror.peak > 0, "pokes")
     bench.abort()
-    with pytest.raises(Aborted, match="what was measured is kept") as stop:
+    with pytest.raises(Aborted, match="the data measured so far are saved") as stop:
         run.wait(120)
     assert stop.value.partial.partial
     wait_for(lambda: bench.state.mirror.peak == 0.0, "a flat mirror")
@@ -118,7 +118,7 @@ def test_the_loop_closes_takes_other_settings_and_opens(bench: Connection, matri
     wait_for(lambda: bench.state.latency.p50 > 0, "latency")
     with pytest.raises(RequestRefused, match="the loop is closed; open it first"):
         bench.start("docrime")
-    with pytest.raises(ConfigError, match="no matrix is called 'nothing'"):
+    with pytest.raises(ConfigError, match="there is no matrix 'nothing'"):
         bench.set_loop(matrix="nothing")
     assert bench.state.phase is Phase.LOOP
     bench.open_loop()
@@ -254,7 +254,7 @@ def test_products_come_from_the_folders_of_the_server_only(
 def test_who_only_watches_writes_nothing_but_may_always_stop(served: Served, bench: Connection) -> None:
     with served.connect() as watcher:
         assert not watcher.holds_lease
-        with pytest.raises(LeaseHeld, match=r"has had the right to write since"):
+        with pytest.raises(LeaseHeld, match=r"has had control since"):
             watcher.start("docrime")
         with pytest.raises(LeaseHeld):
             watcher.acquire()
@@ -269,7 +269,7 @@ def test_who_only_watches_writes_nothing_but_may_always_stop(served: Served, ben
         with pytest.raises(LeaseHeld):
             bench.set_loop(gain=0.3)
         taken = [
-            line.text for line in watcher.log_after(-1) if "takes the right to write over from" in line.text
+            line.text for line in watcher.log_after(-1) if "takes control over from" in line.text
         ]
         assert taken
 

@@ -20,7 +20,8 @@ from escape_hw.io.fits.matrix import load_matrix
 from escape_hw.remote.address import ServerListing, local_endpoint, register_server, unregister_server
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Phase
-from escape_hw.streams.segments import process_start, segments
+from escape_hw.streams.segments import segments
+from escape_hw.supervision import process_start
 from escape_sim.devices.twins import shared_bench
 from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build_library
 from escape_sim.stand_ins.bench_server import StandInBench

@@ -100,7 +100,7 @@ def test_what_is_too_large_is_refused_or_cut_off(raw: zmq.Socket[bytes], bench: 
 def test_who_did_not_say_hello_is_not_heard(raw: zmq.Socket[bytes], bench: Connection) -> None:
     request = {"verb": "open_loop", "client": bench.client}
     raw.send_multipart([b"1", json.dumps(request).encode()])
-    assert "say hello first" in answer(raw)["error"]["message"]
+    assert "not registered under that client number" in answer(raw)["error"]["message"]
     hello = {"verb": "hello", "client": bench.client, "schema_version": 1, "name": "x", "host": "y", "pid": 1}
     raw.send_multipart([b"2", json.dumps(hello).encode()])
     assert "belongs to another connection" in answer(raw)["error"]["message"]

@@ -37,7 +37,7 @@ def comes(book: LeaseManager, number: int, route: bytes | None = None) -> Regist
 def test_the_second_is_told_who_has_it(book: LeaseManager) -> None:
     one, other = comes(book, 1), comes(book, 2)
     assert book.acquire(one, False).name == "client 1"
-    with pytest.raises(LeaseHeld, match=r"client 1 on here \(process 1\) has had the right to write since"):
+    with pytest.raises(LeaseHeld, match=r"client 1 on here \(process 1\) has had control since"):
         book.acquire(other, False)
     book.require(one)
     with pytest.raises(LeaseHeld):
@@ -55,7 +55,7 @@ def test_it_is_taken_over_on_request_and_given_back(book: LeaseManager) -> None:
     assert book.lease.name == "client 2"
     book.release(other)
     assert book.lease is None
-    with pytest.raises(LeaseHeld, match="nobody has the right to write"):
+    with pytest.raises(LeaseHeld, match="no client has control"):
         book.require(one)
 
 
@@ -65,7 +65,7 @@ def test_a_holder_that_is_silent_loses_it(book: LeaseManager, clock: Clock) -> N
     clock.now += 5.0
     book.expire()
     assert book.lease is not None
-    book.record_activity(one.hello.client, one.route)
+    book.record_activity(one.registration.client, one.route)
     clock.now += 5.1
     book.expire()
     assert book.lease is None
@@ -80,9 +80,9 @@ def test_nobody_speaks_for_another(book: LeaseManager) -> None:
     book.acquire(one, False)
     with pytest.raises(RequestRefused, match="belongs to another connection"):
         comes(book, 1, b"somebody else")
-    with pytest.raises(RequestRefused, match="say hello first"):
-        book.record_activity(one.hello.client, b"somebody else")
-    with pytest.raises(RequestRefused, match="say hello first"):
+    with pytest.raises(RequestRefused, match="not registered under that client number"):
+        book.record_activity(one.registration.client, b"somebody else")
+    with pytest.raises(RequestRefused, match="not registered under that client number"):
         book.record_activity("0000000f-0000", b"x")
 
 
@@ -90,7 +90,7 @@ def test_too_many_are_refused_until_some_are_forgotten(book: LeaseManager, clock
     for number in range(MAX_CLIENTS):
         comes(book, number)
     assert book.count == MAX_CLIENTS
-    with pytest.raises(RequestRefused, match="clients are here already"):
+    with pytest.raises(RequestRefused, match="clients are registered already"):
         comes(book, MAX_CLIENTS)
     clock.now += 61
     book.expire()

@@ -28,7 +28,7 @@ def test_a_gain_outside_the_configurations_range_is_refused(
         requests.build_request(kind, client=CLIENT, matrix=matrix, gain=gain)
 
 
-@pytest.mark.parametrize("kind", [requests.StartProcedure, requests.Check])
+@pytest.mark.parametrize("kind", [requests.StartProcedure, requests.PlanProcedure])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_an_argument_that_is_no_number_does_not_become_the_default(
     kind: type[requests.Request], value: float

@@ -77,7 +77,7 @@ def test_no_frames_in_closed_loop(engine: Engine) -> None:
     violation = engine.tell(0.5, frames=0)
     assert violation is not None
     assert violation.reason.startswith("no frame for 2.2 s in closed loop (limit 2 s)")
-    assert "camera" in violation.way_out
+    assert "camera" in violation.remedy
 
 
 def test_no_frames_while_nothing_is_closed_is_no_fault(engine: Engine) -> None:

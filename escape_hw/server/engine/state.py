@@ -1,21 +1,25 @@
-"""What the engine's threads know of each other: written by one, read by all."""
+"""State of the engine: an immutable snapshot, and every transition as an atomic method."""
 
 from __future__ import annotations
 
+import math
 import threading
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from escape_hw.api.concurrency import SignalSafeFlag
+from escape_hw.api.procedure import Progress
 from escape_hw.calibration.loop.control import LoopControl
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import RequestRefused
 from escape_hw.io.provenance import format_utc
-from escape_hw.remote.state import ActiveRun, FaultState, FinishedRun, Phase
+from escape_hw.remote.state import ActiveRun, FaultState, Finish, FinishedRun, Phase
 
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
-    """How the loop is closed, or would be; the matrix by its name."""
+    """Parameters of the loop; ``matrix`` is a name in the product store."""
 
     matrix: str = ""
     gain: float = 0.0
@@ -24,63 +28,330 @@ class LoopSettings:
 
     @classmethod
     def from_config(cls, config: SystemConfig, matrix: str = "") -> LoopSettings:
-        """As the configuration has it."""
+        """The configured parameters."""
         loop = config.loop
         return cls(matrix, loop.gain, loop.leak, loop.dropped_modes)
 
 
-@dataclass(slots=True)
-class EngineState:
-    """The engine's present condition.
+@dataclass(frozen=True, slots=True)
+class EngineSnapshot:
+    """State of the engine at one moment.
 
     Parameters
     ----------
-    stop
-        Set it to stop what runs.
+    loop
+        Parameters of the loop, closed or not.
+    needs_loop
+        Whether the present activity works in closed loop.
     paused
-        Whether the procedure is asked to halt.
-    closed
-        Whether the loop is closed.
-    orders, loop_metrics
-        What a loop that stays closed is asked, and what it tells of itself.
-    complaints
-        What devices were last heard to complain of, by name.
+        Whether the operator asked the procedure to pause.
+    loop_control, loop_statistics
+        Control of the loop outside procedures, and its newest metrics; ``None`` and empty when there is none.
+    device_messages
+        Newest problem of each device, by its key in ``[devices]``.
     """
 
     loop: LoopSettings
     phase: Phase = Phase.STARTING
     fault: FaultState | None = None
-    running: ActiveRun | None = None
-    last: FinishedRun | None = None
-    stop: SignalSafeFlag = field(default_factory=SignalSafeFlag)
+    active_run: ActiveRun | None = None
+    last_run: FinishedRun | None = None
     paused: bool = False
-    closed: bool = False
-    loop_control: LoopControl | None = None
-    loop_statistics: dict[str, float] = field(default_factory=dict)
+    loop_closed: bool = False
     needs_loop: bool = False
-    device_messages: dict[str, str] = field(default_factory=dict)
-    lock: threading.Lock = field(default_factory=threading.Lock)
+    loop_control: LoopControl | None = None
+    loop_statistics: Mapping[str, float] = field(default_factory=dict)
+    device_messages: Mapping[str, str] = field(default_factory=dict)
 
-    def latch_fault(self, reason: str, way_out: str) -> None:
-        """Remember why the mirror was made safe; the first reason stays."""
-        if self.fault is None:
-            self.fault = FaultState(reason=reason, at_utc=format_utc(), way_out=way_out)
 
-    def require_idle(self) -> None:
-        """Raise unless something may be started.
+@dataclass(frozen=True, slots=True)
+class RunTicket:
+    """Permission to run a procedure.
+
+    Parameters
+    ----------
+    run
+        The run.
+    stop
+        Set when the run has to stop.
+    loop_before
+        Loop that was closed when the run was accepted and is closed again after it.
+    """
+
+    run: ActiveRun
+    stop: SignalSafeFlag
+    loop_before: LoopSettings | None
+
+
+class EngineState:
+    """State of the engine, shared by its threads.
+
+    Readers take :attr:`snapshot`. Each transition is one method, atomic under the only lock.
+
+    Parameters
+    ----------
+    loop
+        Parameters of the loop.
+    first_run_id
+        Number of the first run.
+    """
+
+    def __init__(self, loop: LoopSettings, first_run_id: int = 1) -> None:
+        self._now = EngineSnapshot(loop)
+        self._stop = SignalSafeFlag()
+        self._next_run_id = first_run_id
+        self._lock = threading.Lock()
+
+    @property
+    def snapshot(self) -> EngineSnapshot:
+        """The present state."""
+        return self._now
+
+    @property
+    def stop_requested(self) -> bool:
+        """Whether the present activity has to stop."""
+        return self._stop.is_set()
+
+    def _set(self, **changes: Any) -> None:
+        self._now = replace(self._now, **changes)
+
+    # ------------------------------------------------------------ devices and faults
+    def begin_opening(self) -> None:
+        """The devices are being opened."""
+        with self._lock:
+            self._set(phase=Phase.STARTING)
+
+    def clear_fault(self) -> None:
+        """Release the latched fault."""
+        with self._lock:
+            self._set(fault=None)
+
+    def become_idle(self) -> None:
+        """The devices are open and the mirror is flat."""
+        with self._lock:
+            self._set(phase=Phase.IDLE, device_messages={})
+
+    def become_stopped(self) -> None:
+        """The engine ends."""
+        with self._lock:
+            self._set(phase=Phase.STOPPED)
+
+    def set_device_message(self, device: str, message: str = "") -> None:
+        """Store the problem of a device; an empty message removes it."""
+        with self._lock:
+            if self._now.device_messages.get(device, "") != message:
+                others = {name: text for name, text in self._now.device_messages.items() if name != device}
+                self._set(device_messages={**others, device: message} if message else others)
+
+    def latch_fault(self, reason: str, remedy: str) -> None:
+        """Latch a fault and stop the present activity. A fault that is latched already stays."""
+        with self._lock:
+            self._latch(reason, remedy)
+            self._stop.set()
+
+    def enter_fault(self, reason: str, remedy: str) -> None:
+        """Latch a fault; the loop is open and the mirror is being made safe."""
+        with self._lock:
+            self._latch(reason, remedy)
+            self._set(phase=Phase.FAULT, loop_closed=False)
+
+    def _latch(self, reason: str, remedy: str) -> None:
+        if self._now.fault is None:
+            self._set(fault=FaultState(reason=reason, at_utc=format_utc(), way_out=remedy))
+
+    # ------------------------------------------------------------ stop
+    def request_stop(self) -> None:
+        """Stop the present activity."""
+        with self._lock:
+            self._stop.set()
+
+    def request_abort(self) -> bool:
+        """Stop the procedure; false when none runs."""
+        with self._lock:
+            if self._now.active_run is None:
+                return False
+            self._stop.set()
+            return True
+
+    def request_open_loop(self) -> bool:
+        """Stop whatever closes the loop; false when a procedure runs that works in open loop."""
+        with self._lock:
+            if self._now.active_run is not None and not self._now.needs_loop:
+                return False
+            self._stop.set()
+            return True
+
+    # ------------------------------------------------------------ procedures
+    def check_can_start(self, needs_loop: bool) -> LoopSettings | None:
+        """Check that a procedure can start; returns the loop that is closed again after it.
 
         Raises
         ------
         RequestRefused
-            Says what is in the way.
+            A fault is latched, or something else runs.
         """
-        if self.fault is not None:
-            raise RequestRefused(f"made safe: {self.fault.reason}; clear the fault first")
-        if self.running is not None:
+        now = self._now
+        restorable = now.loop_control is not None and now.fault is None and now.active_run is None
+        if needs_loop and restorable and not self._stop.is_set():
+            return now.loop
+        self._require_idle()
+        return None
+
+    def _require_idle(self) -> None:
+        now = self._now
+        if now.fault is not None:
+            raise RequestRefused(f"a fault is latched: {now.fault.reason}; clear the fault first")
+        if now.active_run is not None:
             raise RequestRefused(
-                f"'{self.running.name}' (run {self.running.id}) is running; abort it, or wait"
+                f"'{now.active_run.name}' (run {now.active_run.id}) is running; abort it, or wait for its end"
             )
-        if self.phase is Phase.LOOP:
+        if now.phase is Phase.LOOP:
             raise RequestRefused("the loop is closed; open it first")
-        if self.phase is not Phase.IDLE:
-            raise RequestRefused(f"the engine is {self.phase.value}; wait a moment")
+        if now.phase is not Phase.IDLE:
+            raise RequestRefused(f"the engine is {now.phase.value}; wait until it is idle")
+
+    def begin_run(self, name: str, arguments: dict[str, Any], needs_loop: bool) -> RunTicket:
+        """Reserve the engine for a procedure; a loop that is closed outside procedures is opened.
+
+        Raises
+        ------
+        RequestRefused
+            As for :meth:`check_can_start`.
+        """
+        with self._lock:
+            loop_before = self.check_can_start(needs_loop)
+            if self._now.loop_control is not None:
+                self._now.loop_control.open()
+            run = ActiveRun(
+                id=self._next_run_id, name=name, arguments=arguments, stage="starting",
+                started_utc=format_utc(),
+            )  # fmt: skip
+            self._next_run_id += 1
+            self._stop = SignalSafeFlag()
+            self._set(active_run=run, phase=Phase.PROCEDURE, paused=False, needs_loop=needs_loop)
+            return RunTicket(run, self._stop, loop_before)
+
+    def begin_acquisition(self) -> None:
+        """The procedure starts on the hardware; one that needs the loop counts as closed from here."""
+        with self._lock:
+            self._set(loop_closed=self._now.needs_loop)
+
+    def end_acquisition(self) -> None:
+        """The procedure has released the hardware; its results are still being saved."""
+        with self._lock:
+            self._set(loop_closed=False)
+
+    def finish_run(
+        self, finished: FinishedRun, next_loop: tuple[LoopSettings, LoopControl] | None = None
+    ) -> SignalSafeFlag | None:
+        """End the run and, where ``next_loop`` is given and nothing speaks against it, begin that loop.
+
+        Returns
+        -------
+        SignalSafeFlag or None
+            Stop flag of the loop that begins; ``None``: the loop stays open.
+        """
+        with self._lock:
+            fault = self._now.fault
+            phase = Phase.IDLE if fault is None else Phase.FAULT
+            self._set(
+                active_run=None, last_run=finished, phase=phase, paused=False, needs_loop=False,
+                loop_closed=False,
+            )  # fmt: skip
+            undisturbed = finished.finish is Finish.DONE and fault is None and not self._stop.is_set()
+            return self._begin_loop(*next_loop) if next_loop is not None and undisturbed else None
+
+    def pause(self) -> None:
+        """Ask the procedure to pause.
+
+        Raises
+        ------
+        RequestRefused
+            No procedure runs, or it works in closed loop.
+        """
+        with self._lock:
+            run = self._require_run()
+            if self._now.needs_loop:
+                raise RequestRefused(f"'{run.name}' works in closed loop and cannot be paused; abort it")
+            self._set(paused=True)
+
+    def resume(self) -> None:
+        """Ask the procedure to resume.
+
+        Raises
+        ------
+        RequestRefused
+            No procedure runs.
+        """
+        with self._lock:
+            self._require_run()
+            self._set(paused=False)
+
+    def _require_run(self) -> ActiveRun:
+        if self._now.active_run is None:
+            raise RequestRefused("no procedure is running")
+        return self._now.active_run
+
+    def mark_run_paused(self, paused: bool) -> None:
+        """Note in the active run whether it is paused."""
+        with self._lock:
+            if self._now.active_run is not None:
+                self._set(active_run=self._now.active_run.model_copy(update={"paused": paused}))
+
+    def update_progress(self, progress: Progress) -> ActiveRun | None:
+        """Store the progress of the loop or the procedure; returns the procedure's run, ``None`` for a loop."""
+        with self._lock:
+            if self._now.loop_control is not None:
+                self._set(loop_statistics=dict(progress.metrics))
+                return None
+            if self._now.active_run is None:
+                return None
+            left = progress.remaining_s
+            run = self._now.active_run.model_copy(
+                update={
+                    "stage": progress.stage, "done": progress.done, "total": progress.total,
+                    "unit": progress.unit, "elapsed_s": progress.elapsed_s,
+                    "remaining_s": left if math.isfinite(left) else None,
+                    "metrics": {k: float(v) for k, v in progress.metrics.items() if math.isfinite(v)},
+                }
+            )  # fmt: skip
+            self._set(active_run=run)
+            return run
+
+    # ------------------------------------------------------------ the loop outside procedures
+    def begin_loop(self, settings: LoopSettings, control: LoopControl) -> SignalSafeFlag:
+        """Reserve the engine for a loop; returns its stop flag.
+
+        Raises
+        ------
+        RequestRefused
+            A fault is latched, or something else runs.
+        """
+        with self._lock:
+            self._require_idle()
+            return self._begin_loop(settings, control)
+
+    def _begin_loop(self, settings: LoopSettings, control: LoopControl) -> SignalSafeFlag:
+        self._stop = SignalSafeFlag()
+        self._set(loop=settings, loop_control=control, phase=Phase.LOOP, needs_loop=True)
+        return self._stop
+
+    def mark_loop_closed(self) -> None:
+        """The loop is closed."""
+        with self._lock:
+            self._set(loop_closed=True)
+
+    def end_loop(self) -> None:
+        """The loop is open; a procedure that was accepted meanwhile may begin."""
+        with self._lock:
+            now = self._now
+            self._set(
+                loop_closed=False, loop_control=None, loop_statistics={},
+                needs_loop=now.needs_loop and now.active_run is not None,
+                phase=Phase.IDLE if now.phase is Phase.LOOP else now.phase,
+            )  # fmt: skip
+
+    def set_loop_settings(self, settings: LoopSettings) -> None:
+        """Store the parameters of the loop."""
+        with self._lock:
+            self._set(loop=settings)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from escape_hw.streams.recording.block_file import HEADER, SUFFIX, write_block
 from escape_hw.streams.ring import RingReader, Sample
+from escape_hw.supervision import BackgroundThread
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +96,7 @@ class StreamRecorder:
         Gets ``NAME.blocks`` for each stream; see :func:`~escape_hw.streams.recording.block_file.read_recording`.
     streams
         Segment by stream's name.
-    least_free
+    min_free_bytes
         Bytes that stay free on the disk; the recording ends before.
 
     Raises
@@ -106,8 +107,8 @@ class StreamRecorder:
         The folder cannot be written to.
     """
 
-    def __init__(self, folder: Path, streams: Mapping[str, str], *, least_free: int = MIN_FREE_BYTES) -> None:
-        self.folder, self._min_free_bytes = folder, least_free
+    def __init__(self, folder: Path, streams: Mapping[str, str], *, min_free_bytes: int = MIN_FREE_BYTES) -> None:
+        self.folder, self._min_free_bytes = folder, min_free_bytes
         self.state = RecordingState()
         self._queue: queue.SimpleQueue[_Block | None] = queue.SimpleQueue()
         self._queued_bytes, self._lock = 0, threading.Lock()
@@ -127,7 +128,7 @@ class StreamRecorder:
         on_state: Callable[[RecordingState], object] = lambda state: None,
     ) -> RecordingState:
         """Record until ``is_stopped``, a full disk, or the end of all streams; ``on_state`` hears once a second."""
-        writer = threading.Thread(target=self._write, name="recorder", daemon=True)
+        writer = BackgroundThread("recorder", self._write)
         writer.start()
         next_report = 0.0
         with self._opened:

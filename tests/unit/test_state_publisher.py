@@ -19,7 +19,7 @@ class Looked:
         self.now = 1000.0
         self.dm = SimpleNamespace(is_open=True, clipped_count=0, sent_count=0, flatten_count=0)
         bench: Any = SimpleNamespace(dm=self.dm)
-        publisher: Any = SimpleNamespace(command=np.full(10, 0.5))
+        publisher: Any = SimpleNamespace(latest_command=np.full(10, 0.5))
         nothing: Any = None
         self.state_publisher = StatePublisher(
             bench, nothing, publisher, nothing, Path(), lambda state: None, clock=lambda: self.now

@@ -15,7 +15,7 @@ from asm_bench import emulator, port_of, wait_for
 from escape_hw.api.adaptive_secondary import ShellState
 from escape_hw.config.loader import load_system
 from escape_hw.server.safety.failsafe import FailsafeSettings, IncidentReport
-from escape_hw.streams.segments import process_start
+from escape_hw.supervision import process_start
 
 #: What an engine does, as far as its guardian is concerned: holds the mirror and the pipe, and a shape.
 _ENGINE = """
@@ -30,7 +30,7 @@ print("shaped", flush=True)
 sys.stdin.readline()
 mirror.close()
 import os
-os.write(int(sys.argv[2]), b"bye")
+os.write(int(sys.argv[2]), b"clean")
 """
 
 
