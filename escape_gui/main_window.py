@@ -241,7 +241,7 @@ class MainWindow(QMainWindow):
         for dock in self.docks.values():
             dock.show_health()
         self.state_notifier.update(state, connected=now.connected)
-        written = state.telemetry
+        written = state.recording
         self.set_status_text(
             "recording",
             f"recording {written.written} frames, {written.dropped} dropped" if written.recording else "",
@@ -267,7 +267,7 @@ class MainWindow(QMainWindow):
 
     def toggle_pause(self) -> None:
         """Halt the procedure or go on with it."""
-        running = self.context.session.source.state.procedure
+        running = self.context.session.source.state.active_run
         if running is not None and running.paused:
             self.ask("go on", lambda server: server.resume())
         else:
@@ -275,7 +275,7 @@ class MainWindow(QMainWindow):
 
     def toggle_recording(self) -> None:
         """Begin or end telemetry."""
-        on = not self.context.session.source.state.telemetry.recording
+        on = not self.context.session.source.state.recording.recording
         self.ask("record telemetry" if on else "stop recording", lambda server: server.record(on))
 
     def toggle_theme(self) -> None:

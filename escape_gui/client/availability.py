@@ -74,12 +74,12 @@ def reason_no_write(now: RequestContext) -> str:
 
 def reason_no_abort(now: RequestContext) -> str:
     """Why there is nothing to abort."""
-    return reason_no_request(now) or ("" if now.state.procedure else "no procedure runs")
+    return reason_no_request(now) or ("" if now.state.active_run else "no procedure runs")
 
 
 def reason_no_pause(now: RequestContext) -> str:
     """Why the procedure cannot be halted or continued."""
-    return reason_no_write(now) or ("" if now.state.procedure else "no procedure runs")
+    return reason_no_write(now) or ("" if now.state.active_run else "no procedure runs")
 
 
 def reason_no_take_control(now: RequestContext) -> str:

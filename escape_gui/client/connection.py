@@ -79,9 +79,9 @@ class LiveSource:
         """What can be started, once that has arrived."""
         return self._procedures
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """Ask the server; waits for the answer."""
-        return self.connection.check(procedure, arguments)
+        return self.connection.plan(procedure, arguments)
 
     def fetch(self) -> None:
         """Fetch what takes time; called by the thread only."""

@@ -46,7 +46,7 @@ class ServerControl(Protocol):
         """Stop the running procedure."""
         ...
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """What a procedure would do."""
         ...
 
@@ -219,7 +219,7 @@ class EmptySource:
         """None."""
         return ()
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """Refuse: there is nobody to ask."""
         raise EscapeError("not connected to a server")
 

@@ -104,7 +104,7 @@ class CameraPanel(Panel):
 
     def on_state(self, state: State) -> None:
         """Saturation, counted by the server over all frames."""
-        light = state.light
+        light = state.illumination
         peak, saturated = f"{100 * light.peak:3.0f} %", f"{100 * light.saturated:5.2f} %"
         if not has_frames(state):
             peak = saturated = UNKNOWN_VALUE

@@ -136,7 +136,7 @@ class LoopPanel(Panel):
         self.loop_indicator.set_status(
             Level.ACTIVE if loop.closed else Level.NEUTRAL, "closed" if loop.closed else "open"
         )
-        self.modes.setText(f"{loop.modes} modes controlled" if loop.modes else "")
+        self.modes.setText(f"{loop.n_modes} modes controlled" if loop.n_modes else "")
         values = {
             "matrix": loop.matrix or "none", "gain": f"{loop.gain:.4f}", "leak": f"{loop.leak:.4f}",
             "dropped_modes": str(loop.dropped_modes),
@@ -176,8 +176,8 @@ class LoopPanel(Panel):
             reason = "it is closed"
         elif not self._matrices:
             reason = "there is no interaction matrix yet: calibrate, or load one"
-        elif source.state.procedure is not None:
-            reason = f"{source.state.procedure.name} runs"
+        elif source.state.active_run is not None:
+            reason = f"{source.state.active_run.name} runs"
         else:
             reason = ""
         _set_enabled(self.close_button, why or reason, "Close the loop with the values of the right column")

@@ -131,7 +131,7 @@ class ModesPanel(Panel):
     # ------------------------------------------------------------ data
     def on_state(self, state: State) -> None:
         """Follow what the server holds; once a measurement has ended, its product stands for it."""
-        running = state.procedure is not None
+        running = state.active_run is not None
         self._dirty |= running != self._running
         self._running = running
         self.context.session.library.request(state.products)

@@ -150,10 +150,10 @@ class ProcedurePanel(Panel):
         """Progress, products to choose from, and how the last one ended."""
         self._state = state
         self.form.set_matrix_choices(form_text.matrices(state.products))
-        running = state.procedure
+        running = state.active_run
         if running is None:
             self._matrix.clear()
-        share = 0.0 if running is None or not running.total else running.done / running.total
+        share = 0.0 if running is None or not running.total else running.completed / running.total
         self.bar.setVisible(running is not None)
         self.bar.setRange(0, 1000 if running is None or running.total else 0)
         self.bar.setValue(round(1000 * min(1.0, share)))
@@ -162,8 +162,8 @@ class ProcedurePanel(Panel):
         self.pause.setText("Go on" if running is not None and running.paused else "Pause")
         # While something runs, what came of the last one only takes its room.
         self._result_area.setVisible(self._ended is not None and running is None)
-        if state.last is not None and (self._ended is None or state.last.id != self._ended.id):
-            self._show_ended(state.last)
+        if state.last_run is not None and (self._ended is None or state.last_run.id != self._ended.id):
+            self._show_ended(state.last_run)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         """The matrix that is being measured tells which mode is known worst."""
@@ -238,7 +238,7 @@ class ProcedurePanel(Panel):
         self._checked_arguments = arguments
         requests.ask(
             "check the arguments",
-            lambda server: server.check(name, arguments),
+            lambda server: server.plan(name, arguments),
             lambda plan: self._on_plan(name, arguments, plan),
             lambda why: self._show_plan(f"⚠ {why}", "bad"),
             quiet=True,
@@ -261,7 +261,7 @@ class ProcedurePanel(Panel):
 
     def ask_pause(self) -> None:
         """Halt, or go on."""
-        requests, running = self.context.session.requests, self._state.procedure
+        requests, running = self.context.session.requests, self._state.active_run
         if requests is not None and running is not None:
             paused = running.paused
             requests.ask(
@@ -279,7 +279,7 @@ class ProcedurePanel(Panel):
         session = self.context.session
         source = session.source
         now = RequestContext(source.state, source.connected, session.live, session.may_write)
-        busy = "a procedure runs" if now.state.procedure is not None else ""
+        busy = "a procedure runs" if now.state.active_run is not None else ""
         unplanned = "" if self._plan is not None else "the arguments are not checked yet"
         for button, tip, why in (
             (self.check, "Ask what it would do; nothing moves.", reason_no_request(now)),

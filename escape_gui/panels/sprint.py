@@ -94,8 +94,8 @@ class SprintPanel(Panel):
 
         A run that fits no registration says nothing of it: the verdict on the one shown stays.
         """
-        self._running = state.procedure is not None
-        last = state.last
+        self._running = state.active_run is not None
+        last = state.last_run
         if last is None or last.id == self._last_result_id or self._running:
             return
         self._last_result_id = last.id

@@ -50,7 +50,7 @@ def run_geometry(run: RunContent) -> Geometry:
         {
             **seen,
             "layout": () if layout is None else _rows(layout),
-            "places_m": () if places is None else tuple((float(x), float(y)) for x, y in places),
+            "positions_m": () if places is None else tuple((float(x), float(y)) for x, y in places),
         }
     )
 
@@ -145,7 +145,7 @@ class ReplaySource:
             seed=int(document.get("seed") or 0),
             phase=Phase.STOPPED,
             loop=_loop_state(run),
-            last=FinishedRun(
+            last_run=FinishedRun(
                 id=0,
                 name=name,
                 finish=finish,
@@ -171,7 +171,7 @@ class ReplaySource:
         """Nothing can be started."""
         return ()
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """Nothing can be started.
 
         Raises

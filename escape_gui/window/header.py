@@ -129,7 +129,7 @@ class HeaderBar(QWidget):
         self._show_control(state, replay=replay, mine=mine)
         values = {
             "rate": f"{state.rates.frame_hz:.1f}",
-            "lost": f"{state.rates.lost:d}",
+            "lost": f"{state.rates.lost_frames:d}",
             "rms": f"{state.mirror.rms:.3f}",
             "peak": f"{state.mirror.peak:.3f}",
             # Nothing was late where no frame was answered in the last second.
@@ -152,7 +152,7 @@ class HeaderBar(QWidget):
         if not (known and has_frames(state)):
             self.light.set_status(Level.NEUTRAL, f"saturated {UNKNOWN_VALUE}")
             return
-        saturated = state.light.saturated
+        saturated = state.illumination.saturated
         level = Level.GOOD if saturated < SATURATION_WARNING else Level.WARNING
         self.light.set_status(
             Level.ERROR if saturated >= SATURATION_ERROR else level, f"saturated {100 * saturated:.2f} %"
@@ -224,6 +224,6 @@ class FaultBanner(QWidget):
         fault = state.fault
         if fault is not None:
             text = f"{fault.reason} · {fault.at_utc}"
-            self._text.setText(f"{text}\n{fault.way_out}" if fault.way_out else text)
+            self._text.setText(f"{text}\n{fault.remedy}" if fault.remedy else text)
         # Shown before it has its words it would take another height for a moment.
         self.setVisible(fault is not None)

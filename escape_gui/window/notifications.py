@@ -152,8 +152,8 @@ class StateNotifier:
             return
         if state.fault is not None and state.fault != before.fault:
             self._toasts.show_message(Level.ERROR, "Fault, mirror made safe", state.fault.reason)
-        if state.last is not None and state.last != before.last:
-            last = state.last
+        if state.last_run is not None and state.last_run != before.last_run:
+            last = state.last_run
             where = f"\n{last.folder}" if last.folder else ""
             self._toasts.show_message(
                 _LEVELS[last.finish], f"{last.name} {last.finish.value}", f"{last.message}{where}".strip()

@@ -52,7 +52,11 @@ def build_request(kind: type[R], **fields: Any) -> R:
 
 # ---------------------------------------------------------------- read only
 class RegisterClient(Request):
-    """First request of a client: its name and its version of the protocol. Answered with the state."""
+    """First request of a client: its name and its version of the protocol. Answered with the state.
+
+    The verb and ``schema_version`` are the same in all versions, so that a server can refuse another
+    version with a message that its client understands.
+    """
 
     verb: Literal["hello"] = "hello"
     schema_version: int
@@ -90,16 +94,16 @@ class GetLog(Request):
 class GetLatestSample(Request):
     """Newest sample of a stream, for clients on another computer; answered with its bytes."""
 
-    verb: Literal["latest"] = "latest"
+    verb: Literal["latest_sample"] = "latest_sample"
     stream: Name
     #: Index of the sample that the client has; only a newer one is sent.
     after: int = -1
 
 
 class PlanProcedure(Request):
-    """Plan a procedure without moving anything; answered with :class:`~escape_hw.remote.state.ProcedurePlan`."""
+    """Plan a procedure; nothing moves. Answered with :class:`~escape_hw.remote.state.ProcedurePlan`."""
 
-    verb: Literal["check"] = "check"
+    verb: Literal["plan"] = "plan"
     procedure: Name
     arguments: Arguments = Field(default_factory=dict)
 
@@ -108,7 +112,7 @@ class PlanProcedure(Request):
 class AcquireLease(Request):
     """Acquire the lease; refused while another client holds it."""
 
-    verb: Literal["acquire"] = "acquire"
+    verb: Literal["acquire_lease"] = "acquire_lease"
     #: Take it from its holder; logged.
     take_over: bool = False
 
@@ -122,7 +126,7 @@ class ClientHeartbeat(Request):
 class ReleaseLease(Request):
     """Release the lease."""
 
-    verb: Literal["release"] = "release"
+    verb: Literal["release_lease"] = "release_lease"
 
 
 # ---------------------------------------------------------------- safety: allowed to every client at any time
@@ -141,14 +145,14 @@ class Flatten(Request):
 class AbortProcedure(Request):
     """Stop the running procedure; the measured data are saved."""
 
-    verb: Literal["abort"] = "abort"
+    verb: Literal["abort_procedure"] = "abort_procedure"
 
 
 # ---------------------------------------------------------------- control: needs the lease
 class StartProcedure(Request):
     """Start a procedure; answered with the number of the run."""
 
-    verb: Literal["start"] = "start"
+    verb: Literal["start_procedure"] = "start_procedure"
     procedure: Name
     arguments: Arguments = Field(default_factory=dict)
 
@@ -156,13 +160,13 @@ class StartProcedure(Request):
 class PauseProcedure(Request):
     """Pause the running procedure between two steps, mirror flat."""
 
-    verb: Literal["pause"] = "pause"
+    verb: Literal["pause_procedure"] = "pause_procedure"
 
 
 class ResumeProcedure(Request):
     """Resume a paused procedure."""
 
-    verb: Literal["resume"] = "resume"
+    verb: Literal["resume_procedure"] = "resume_procedure"
 
 
 class CloseLoop(Request):
@@ -196,7 +200,7 @@ class LoadProduct(Request):
 class SetRecording(Request):
     """Start or stop recording telemetry at full rate."""
 
-    verb: Literal["record"] = "record"
+    verb: Literal["set_recording"] = "set_recording"
     on: bool
 
 

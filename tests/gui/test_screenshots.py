@@ -45,7 +45,7 @@ def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         window.show_workspace("calibrate")
         operator.choose("escape", frames="2000")
         picture(operator, "plan")
-        before = source.source.state.last.id
+        before = source.source.state.last_run.id
         operator.press(operator.procedure.start)
         operator.until(
             lambda: panels["modes"].matrix_selector.currentData() == "as measured now", "maps fill in"

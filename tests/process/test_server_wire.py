@@ -24,7 +24,7 @@ from escape_hw.errors import ConfigError, ServerGone
 from escape_hw.remote import keys
 from escape_hw.remote.address import resolve
 from escape_hw.remote.client import Connection, connect
-from escape_hw.remote.state import Phase
+from escape_hw.remote.state import SCHEMA, Phase
 
 PORT = 30000 + os.getpid() % 20000
 
@@ -85,7 +85,7 @@ def test_documents_that_are_no_requests_are_refused(raw: zmq.Socket[bytes], docu
 
 
 def test_what_is_too_large_is_refused_or_cut_off(raw: zmq.Socket[bytes], bench: Connection) -> None:
-    before = bench.state.refused
+    before = bench.state.refused_requests
     raw.send_multipart([b"1", b"x" * 100_000])
     reply = answer(raw)
     assert reply["error"]["message"].endswith("100000 bytes; a request has at most 65536")
@@ -93,7 +93,7 @@ def test_what_is_too_large_is_refused_or_cut_off(raw: zmq.Socket[bytes], bench: 
     # The connection was cut; the next request comes over a new one.
     raw.send_multipart([b"3", b"{}"])
     assert answer(raw)["ok"] is False
-    wait_for(lambda: bench.state.refused >= before + 2, "refusals are counted")
+    wait_for(lambda: bench.state.refused_requests >= before + 2, "refusals are counted")
     assert bench.state.fault is None
 
 
@@ -101,11 +101,14 @@ def test_who_did_not_say_hello_is_not_heard(raw: zmq.Socket[bytes], bench: Conne
     request = {"verb": "open_loop", "client": bench.client}
     raw.send_multipart([b"1", json.dumps(request).encode()])
     assert "not registered under that client number" in answer(raw)["error"]["message"]
-    hello = {"verb": "hello", "client": bench.client, "schema_version": 1, "name": "x", "host": "y", "pid": 1}
+    hello = {
+        "verb": "hello", "client": bench.client, "schema_version": SCHEMA, "name": "x", "host": "y", "pid": 1,
+    }  # fmt: skip
     raw.send_multipart([b"2", json.dumps(hello).encode()])
     assert "belongs to another connection" in answer(raw)["error"]["message"]
-    raw.send_multipart([b"3", json.dumps({**hello, "client": "0" * 8, "schema_version": 99}).encode()])
-    assert "this server speaks version 1, the client 99" in answer(raw)["error"]["message"]
+    for version in (1, 99):
+        raw.send_multipart([b"3", json.dumps({**hello, "client": "0" * 8, "schema_version": version}).encode()])
+        assert f"the client version {version}; use the same version" in answer(raw)["error"]["message"]
 
 
 def test_a_client_that_was_forgotten_says_hello_again(served: Served, bench: Connection) -> None:
@@ -132,7 +135,7 @@ def test_slow_and_half_messages_on_a_plain_socket_stop_nothing(bench: Connection
                 one.sendall(b"\x03")
             except OSError:
                 continue  # cut off, as it should be
-        assert bench.check("docrime", {"frames": 500}).frames == 500
+        assert bench.plan("docrime", {"frames": 500}).frames == 500
     for one in lines:
         one.close()
 
@@ -141,7 +144,7 @@ def test_a_flood_leaves_the_server_to_others(raw: zmq.Socket[bytes], bench: Conn
     for _ in range(20_000):
         raw.send_multipart([b"1", b"nonsense"])  # whose answers nobody takes
     began = bench.state.serial
-    assert bench.check("docrime", {"frames": 500}).frames == 500
+    assert bench.plan("docrime", {"frames": 500}).frames == 500
     wait_for(lambda: bench.state.serial > began + 3, "states go on")
 
 
@@ -196,7 +199,7 @@ def test_from_afar_the_samples_come_over_the_wire(bench: Connection) -> None:
         assert sample.meta["top"] == 1023
         assert far.geometry().n_modes == 30
         with pytest.raises(ConfigError):
-            far.check("nothing")
+            far.plan("nothing")
         wait_for(lambda: far.connected and far.state.serial > 1, "events")
 
 
@@ -207,7 +210,7 @@ def test_nobody_is_found_where_no_server_is(served: Served) -> None:
         connect("elsewhere")
     with pytest.raises(ConfigError, match="is no address"):
         connect("http://127.0.0.1:80")
-    with pytest.raises(ServerGone, match="no answer to 'hello'"):
+    with pytest.raises(ServerGone, match="no reply to 'hello'"):
         connect("tcp://127.0.0.1:9")
 
 
@@ -241,12 +244,12 @@ def test_with_keys_from_another_machine_and_nothing_without(
         served.connect() as local,
     ):
         until_idle(local)
-        with pytest.raises(ServerGone, match=r"If it asks for keys: escape keys trust 127\.0\.0\.2 KEY"):
+        with pytest.raises(ServerGone, match=r"If it requires keys: escape keys trust 127\.0\.0\.2 KEY"):
             connect(address)
         escape_keys(clients, "trust", "127.0.0.2", server.decode())
         with connect(address, control=True) as far:
             wait_for(lambda: far.latest("frames") is not None, "a frame")
-            assert far.check("docrime", {"frames": 300}).frames == 300
+            assert far.plan("docrime", {"frames": 300}).frames == 300
             wait_for(lambda: far.state.serial > 1 and far.holds_lease, "events")
         secret = keys.own_keys().secret
         stranger = zmq.curve_keypair()
@@ -259,10 +262,12 @@ def test_with_keys_from_another_machine_and_nothing_without(
         # Whom the operator lets in is in at once, and out again.
         escape_keys(running_servers, "allow", "stranger", stranger[0].decode())
         wait_for(lambda: heard(address, *stranger, server) > 0, "the stranger is let in")
-        escape_keys(running_servers, "forget", "stranger")
+        escape_keys(running_servers, "remove", "stranger")
         assert heard(address, *stranger, server) == 0
-        escape_keys(running_servers, "forget", "client")
-        with pytest.raises(ServerGone, match=r"Does it let this key in \(there: escape keys allow NAME"):
+        escape_keys(running_servers, "remove", "client")
+        with pytest.raises(
+            ServerGone, match=r"Check that it allows this key \(there: escape keys allow NAME"
+        ):
             connect(address)
         assert local.state.fault is None
 

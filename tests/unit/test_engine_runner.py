@@ -82,9 +82,7 @@ def services(owner: Owner) -> tuple[Any, ...]:
 
 def procedure_runner(owner: Any, runs: Path, sent: list[Any]) -> ProcedureRunner:
     loop_runner = LoopRunner(owner, *services(owner))
-    return ProcedureRunner(
-        owner, loop_runner, *services(owner), config_text="", runs=runs, send=sent.append
-    )
+    return ProcedureRunner(owner, loop_runner, *services(owner), config_text="", runs=runs, send=sent.append)
 
 
 def finished(run: int) -> FinishedRun:
@@ -186,7 +184,7 @@ def test_only_a_procedure_in_open_loop_can_be_paused() -> None:
 
 
 def test_concurrent_transitions_lose_nothing() -> None:
-    """Each thread changes another part of the state; with unlocked writes changes would overwrite each other."""
+    """Each thread changes another part of the state; unlocked writes would overwrite each other."""
     state = idle_state()
     state.begin_run("docrime", {}, needs_loop=False)
 
@@ -204,7 +202,7 @@ def test_concurrent_transitions_lose_nothing() -> None:
     now = state.snapshot
     assert now.device_messages == {f"device {n}": "499" for n in range(4)}
     assert now.active_run is not None
-    assert now.active_run.done == 499
+    assert now.active_run.completed == 499
 
 
 @pytest.fixture

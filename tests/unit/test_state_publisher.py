@@ -32,7 +32,7 @@ class Looked:
             self.now += every
             self.dm.sent_count += round(500 * every)
             self.dm.clipped_count += clipped * round(500 * every)
-            share = self.state_publisher._mirror().clipped
+            share = self.state_publisher._mirror().saturated_share
         return share
 
 
@@ -48,4 +48,4 @@ def test_the_share_of_clipped_actuators_is_that_of_the_last_second(every: float)
 def test_it_tells_how_often_the_mirror_was_flattened() -> None:
     looked = Looked()
     looked.dm.flatten_count = 3
-    assert looked.state_publisher._mirror().flattened == 3
+    assert looked.state_publisher._mirror().flatten_count == 3

@@ -107,7 +107,8 @@ def test_gains_without_a_round_are_shown_as_such() -> None:
 def test_a_state_shows_the_fault_and_the_remedy() -> None:
     state = State(
         system="razor", simulated=False, phase=Phase.FAULT,
-        fault=FaultState(reason="it broke", at_utc="", way_out="Fix it."), loop=LoopState(closed=True, matrix="m"),
+        fault=FaultState(reason="it broke", at_utc="", remedy="Fix it."),
+        loop=LoopState(closed=True, matrix="m"),
     )  # fmt: skip
     html = state._repr_html_()
     assert "razor (HARDWARE)" in html

@@ -28,8 +28,8 @@ class Engine:
             self.told += fresh
             state = State(
                 rates=FrameCounters(frames=self.frames), fault=fault,
-                mirror=MirrorState(clipped=clipped, flattened=flattened),
-                procedure=None if run is None else ActiveRun(id=run, name="gains", arguments={}),
+                mirror=MirrorState(saturated_share=clipped, flatten_count=flattened),
+                active_run=None if run is None else ActiveRun(id=run, name="gains", arguments={}),
                 # No two residuals are quite the same.
                 loop=LoopState(closed=closed, residual_nm=residual * (1 + 1e-6 * self.told)),
             )  # fmt: skip

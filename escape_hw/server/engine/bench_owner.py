@@ -1,4 +1,4 @@
-"""Main thread of the engine: opens and closes the devices, makes the mirror safe, and runs one job at a time."""
+"""Main thread of the engine: devices, safe state of the mirror, and a queue of jobs."""
 
 from __future__ import annotations
 
@@ -64,14 +64,12 @@ class BenchOwner:
         self._jobs.put(job)
 
     def reply_when_flat(self, reply: Callable[[object], object]) -> None:
-        """Flatten the mirror after the present job; ``reply`` is called when it is flat and nothing moves it."""
+        """Flatten the mirror after the present job, then call ``reply`` with the answer."""
         with self._flat_replies_lock:
             self._flat_replies.append(reply)
         self.post(self.flatten)
 
-    def request_safe_state(
-        self, reason: str, remedy: str = "Look at the log, then clear the fault."
-    ) -> None:
+    def request_safe_state(self, reason: str, remedy: str = "Look at the log, then clear the fault.") -> None:
         """Latch a fault, stop what runs, and make the mirror safe."""
         log.error("FAULT: %s", reason)
         self._state.latch_fault(reason, remedy)
@@ -141,7 +139,7 @@ class BenchOwner:
         Raises
         ------
         Exception
-            A device failed; the fail-safe process, which gets no message of a clean exit, flattens the mirror.
+            A device failed. Without a clean exit of the engine, the fail-safe process flattens the mirror.
         """
         try:
             self.bench.close()

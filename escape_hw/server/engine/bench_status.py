@@ -71,7 +71,7 @@ def geometry_of(bench: Bench, grid: SensorGeometry | None) -> Geometry:
     return Geometry(
         valid=valid,
         layout=actuator_layout(bench),
-        places_m=actuator_positions(bench),
+        positions_m=actuator_positions(bench),
         outlines_px=() if grid is None else outlines(grid),
         n_modes=bench.config.basis.n_modes,
     )

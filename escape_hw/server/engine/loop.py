@@ -1,4 +1,4 @@
-"""The closed loop outside procedures: closed on request, changed while it runs, and opened on request or on a fault."""
+"""The closed loop outside procedures: closing, changing parameters, opening."""
 
 from __future__ import annotations
 
@@ -50,7 +50,8 @@ class LoopRunner:
         self._owner, self._bench, self._state = owner, owner.bench, state
         #: A procedure replaces the bench's configuration while it runs.
         self._config = owner.bench.config
-        self._publisher, self._state_publisher, self._product_store = publisher, state_publisher, product_store
+        self._publisher, self._state_publisher = publisher, state_publisher
+        self._product_store = product_store
         self.model_psf: NDArray[np.float32] | None = None
 
     def prepare(self, request: CloseLoop | LoopSettings) -> tuple[LoopSettings, LoopControl]:

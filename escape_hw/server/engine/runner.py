@@ -61,7 +61,8 @@ class ProcedureRunner:
         send: Callable[[Mapping[str, Any]], object],
     ) -> None:
         self._owner, self._bench, self._loop_runner, self._state = owner, owner.bench, loop_runner, state
-        self._publisher, self._state_publisher, self._product_store = publisher, state_publisher, product_store
+        self._publisher, self._state_publisher = publisher, state_publisher
+        self._product_store = product_store
         self._config_text, self._runs, self._send = config_text, runs, send
 
     def start(self, task: Task[Any], name: str, arguments: Arguments, needs_loop: bool) -> int:
@@ -169,10 +170,8 @@ class ProcedureRunner:
         return saved, stop
 
     def _store_products(self, finished: FinishedRun) -> None:
-        """Store the products under the run's name: ``NAME-ID`` for the main one, ``NAME-ID-KEY`` for others."""
-        main = next(
-            (key for key in ("escape", "im", "loop", finished.name) if key in finished.products), ""
-        )
+        """Store the products as ``NAME-ID`` (the main one) and ``NAME-ID-KEY``."""
+        main = next((key for key in ("escape", "im", "loop", finished.name) if key in finished.products), "")
         for key, path in finished.products.items():
             if key in _STORED_PRODUCTS:
                 name = f"{finished.name}-{finished.id}" + ("" if key == main else f"-{key}")

@@ -157,7 +157,7 @@ class EngineState:
 
     def _latch(self, reason: str, remedy: str) -> None:
         if self._now.fault is None:
-            self._set(fault=FaultState(reason=reason, at_utc=format_utc(), way_out=remedy))
+            self._set(fault=FaultState(reason=reason, at_utc=format_utc(), remedy=remedy))
 
     # ------------------------------------------------------------ stop
     def request_stop(self) -> None:
@@ -299,7 +299,7 @@ class EngineState:
                 self._set(active_run=self._now.active_run.model_copy(update={"paused": paused}))
 
     def update_progress(self, progress: Progress) -> ActiveRun | None:
-        """Store the progress of the loop or the procedure; returns the procedure's run, ``None`` for a loop."""
+        """Store progress; returns the run of a procedure, ``None`` for the loop."""
         with self._lock:
             if self._now.loop_control is not None:
                 self._set(loop_statistics=dict(progress.metrics))
@@ -309,7 +309,7 @@ class EngineState:
             left = progress.remaining_s
             run = self._now.active_run.model_copy(
                 update={
-                    "stage": progress.stage, "done": progress.done, "total": progress.total,
+                    "stage": progress.stage, "completed": progress.done, "total": progress.total,
                     "unit": progress.unit, "elapsed_s": progress.elapsed_s,
                     "remaining_s": left if math.isfinite(left) else None,
                     "metrics": {k: float(v) for k, v in progress.metrics.items() if math.isfinite(v)},

@@ -106,24 +106,24 @@ class StatePublisher:
         now, bench, publisher = self._engine_state.snapshot, self._bench, self._publisher
         frame = publisher.latest_frame
         illumination = {} if frame is None or not bench.wfs.is_open else {
-            "light": illumination_of(frame, bench.wfs.info.full_scale)
+            "illumination": illumination_of(frame, bench.wfs.info.full_scale)
         }  # fmt: skip
         return State(
             at_utc=format_utc(), engine_pid=os.getpid(), version=get_software_version(),
             system=bench.config.system.name, simulated=bench.simulated, seed=bench.config.system.seed,
             phase=now.phase, fault=now.fault, devices=device_states(bench, now.device_messages),
-            rates=self._frame_counters(frame, now), mirror=self._mirror(), latency=_latency(now.loop_statistics),
-            loop=self._loop(now),
-            procedure=now.active_run, last=now.last_run, products=self._product_store.products,
-            telemetry=self._recording(), disk=self._disk(), streams=publisher.entries,
-            geometries=publisher.geometry_version, **illumination,
+            rates=self._frame_counters(frame, now), mirror=self._mirror(), loop=self._loop(now),
+            latency=_latency(now.loop_statistics),
+            active_run=now.active_run, last_run=now.last_run, products=self._product_store.products,
+            recording=self._recording(), disk=self._disk(), streams=publisher.entries,
+            geometry_version=publisher.geometry_version, **illumination,
         )  # fmt: skip
 
     def _loop(self, now: EngineSnapshot) -> LoopState:
         loop, residual = now.loop, self._publisher.residual_nm
         return LoopState(
             closed=now.loop_closed, matrix=loop.matrix, gain=loop.gain, leak=loop.leak,
-            dropped_modes=loop.dropped_modes, modes=self._bench.config.basis.n_modes,
+            dropped_modes=loop.dropped_modes, n_modes=self._bench.config.basis.n_modes,
             residual_nm=residual if now.loop_closed and math.isfinite(residual) else 0.0,
             strehl=_finite_metric(now.loop_statistics, "strehl"),
             strehl_sigma=_finite_metric(now.loop_statistics, "strehl_sigma"),
@@ -139,7 +139,7 @@ class StatePublisher:
             self._lost = int(engine.loop_statistics.get("lost", 0.0))
         elif engine.active_run is not None and self._bench.wfs.is_open:
             self._lost = self._bench.wfs.status().lost
-        return FrameCounters(frame_hz=self._rate, frames=self._publisher.frames, lost=self._lost)
+        return FrameCounters(frame_hz=self._rate, frames=self._publisher.frames, lost_frames=self._lost)
 
     def _mirror(self) -> MirrorState:
         dm, command = self._bench.dm, self._publisher.latest_command
@@ -154,8 +154,8 @@ class StatePublisher:
         return MirrorState(
             rms=float(np.sqrt(np.mean(np.square(command)))),
             peak=float(np.abs(command).max(initial=0.0)),
-            clipped=clipped / (sent * command.size) if sent > 0 else 0.0,
-            flattened=dm.flatten_count,
+            saturated_share=clipped / (sent * command.size) if sent > 0 else 0.0,
+            flatten_count=dm.flatten_count,
         )
 
     def _disk(self) -> DiskState:
@@ -170,7 +170,7 @@ def _rate(before: Frame, frame: Frame) -> float:
 
 
 def _latency(metrics: Mapping[str, float]) -> LatencyState:
-    names = {"p50": "latency_p50", "p99": "latency_p99", "largest": "latency_max", "jitter_p99": "jitter_p99"}
+    names = {"p50": "latency_p50", "p99": "latency_p99", "max": "latency_max", "jitter_p99": "jitter_p99"}
     values = {key: metrics.get(name, math.nan) for key, name in names.items()}
     return LatencyState(**{key: value for key, value in values.items() if math.isfinite(value)})
 

@@ -165,7 +165,8 @@ class EngineSupervisor:
         state = self._published.state
         # Compilation on a busy computer may delay an engine, which is harmless while the mirror is flat.
         moving = state.mirror.peak > 0 or state.loop.closed
-        silence, limit = now - engine.last_message_s, self._limits.silent_s if moving else IDLE_SILENCE_LIMIT_S
+        limit = self._limits.silent_s if moving else IDLE_SILENCE_LIMIT_S
+        silence = now - engine.last_message_s
         if silence > limit:
             self._kill(engine, f"the engine was silent for {silence:.1f} s (limit {limit:g} s)")
         elif self._stop_requested_s is not None and now - self._stop_requested_s > STOP_TIMEOUT_S:
@@ -194,9 +195,9 @@ class EngineSupervisor:
             return
         engine.close()
         self._engine, self._kill_reason = None, ""
-        incident = self._journal.read_incident(engine.pid)
-        outcome = "the fail-safe process left no report; check the mirror" if incident is None else incident.mirror
-        self._publish_fault(f"{why}; {outcome}")
+        report = self._journal.read_incident(engine.pid)
+        no_report = "the fail-safe process left no report; check the mirror"
+        self._publish_fault(f"{why}; {no_report if report is None else report.mirror}")
         self.stopping = self._stop_requested_s is not None
 
     def _publish_fault(self, reason: str) -> None:
@@ -206,8 +207,8 @@ class EngineSupervisor:
         self._published.update(
             state.model_copy(
                 update={
-                    "phase": Phase.FAULT, "procedure": None, "streams": (), "engine_pid": 0,
-                    "fault": FaultState(reason=reason, at_utc=format_utc(), way_out=_RESTART_REMEDY),
+                    "phase": Phase.FAULT, "active_run": None, "streams": (), "engine_pid": 0,
+                    "fault": FaultState(reason=reason, at_utc=format_utc(), remedy=_RESTART_REMEDY),
                     "loop": state.loop.model_copy(update={"closed": False}),
                 }
             )

@@ -122,7 +122,7 @@ class LeaseManager:
         if holder is not None and holder is not client:
             if not take_over:
                 raise LeaseHeld(
-                    f"{holder.description} has had control since {self._since} UTC; ask there, or take control over"
+                    f"{holder.description} has had control since {self._since} UTC; ask there, or take over"
                 )
             log.warning("%s takes control over from %s", client.description, holder.description)
         elif holder is None:

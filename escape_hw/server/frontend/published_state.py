@@ -29,7 +29,8 @@ class PublishedState:
         self.state = (before if state is None else state).model_copy(
             update={
                 "serial": before.serial + 1, "server_pid": os.getpid(), "lease": self._leases.lease,
-                "clients": self._leases.count, "refused": self._transport.refused, "notes": before.notes,
+                "clients": self._leases.count, "refused_requests": self._transport.refused,
+                "notes": before.notes,
             }
         )  # fmt: skip
         self._transport.publish("state", self.state)

@@ -129,8 +129,9 @@ class FrontEnd:
         self._journal.write(None)
         setup = EngineSetup(config_text=config.to_toml(), runs=runs, read_folders=read_folders)
         self._supervisor = EngineSupervisor(
-            config.server, setup, self._journal, self._published, self._on_engine_message, self._refuse_pending
-        )
+            config.server, setup, self._journal, self._published,
+            on_message=self._on_engine_message, on_exit=self._refuse_pending,
+        )  # fmt: skip
         self._handlers: dict[type[requests.Request], Callable[[Any, RegisteredClient], object]] = {
             requests.GetState: lambda request, client: self._published.state,
             requests.GetLog: lambda request, client: [
@@ -188,7 +189,7 @@ class FrontEnd:
     def _check_abandoned_run(self) -> None:
         """Abort a procedure that no client has controlled for a while."""
         state, limit = self._published.state, self._config.server.abandoned_s
-        abandoned_s, run = self._leases.seconds_without_holder(), state.procedure
+        abandoned_s, run = self._leases.seconds_without_holder(), state.active_run
         if run is None or abandoned_s <= limit or state.fault is not None or self._leases.lease is not None:
             return
         self._leases.released_s = None
@@ -288,7 +289,9 @@ class FrontEnd:
         if isinstance(request, requests.Shutdown):
             supervisor.stopping = True
         elif not supervisor.has_ended:
-            raise RequestRefused("the engine has died and the fail-safe process makes the mirror safe; try again")
+            raise RequestRefused(
+                "the engine has died; the fail-safe process makes the mirror safe; try again"
+            )
         elif isinstance(request, requests.ClearFault):
             self._published.state = self._published.state.model_copy(
                 update={"fault": None, "phase": Phase.STARTING}

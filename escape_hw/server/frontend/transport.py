@@ -127,9 +127,13 @@ class ZmqTransport:
         route = ReplyRoute(pair_index, parts[0], number[:_MAX_ID_BYTES])
         try:
             if len(parts) != 3 or len(number) > _MAX_ID_BYTES:
-                raise RequestRefused(f"a message of {len(parts) - 1} parts; a request has two: identifier and JSON text")
+                raise RequestRefused(
+                    f"a message of {len(parts) - 1} parts; a request has two: identifier and JSON text"
+                )
             if len(parts[2]) > MAX_REQUEST_BYTES:
-                raise RequestRefused(f"a message of {len(parts[2])} bytes; a request has at most {MAX_REQUEST_BYTES}")
+                raise RequestRefused(
+                    f"a message of {len(parts[2])} bytes; a request has at most {MAX_REQUEST_BYTES}"
+                )
             return IncomingRequest(route, REQUESTS.validate_json(parts[2]))
         except ValidationError as error:
             self.refuse(route, RequestRefused(f"not a valid request: {first_error(error)}"))

@@ -1,8 +1,9 @@
-"""JSON messages between the front end and the engine over a socket pair, and the engine's start-up settings. No pickle.
+"""JSON messages between the front end and the engine over a socket pair, and the engine's start-up settings.
 
 Front end to engine: the settings, then ``{"heartbeat": true}``, ``{"id": N, "request": {...}}``,
-``{"make_safe": {"reason": ..., "remedy": ...}}``, ``{"stop": true}``. Engine to front end: ``state``, ``log``,
-``progress``, ``run``, ``ended``, ``{"reply": N, "answer": ...}`` or ``{"reply": N, "error": ...}``, ``clean_exit``.
+``{"make_safe": {"reason": ..., "remedy": ...}}``, ``{"stop": true}``. Engine to front end: ``{"reply": N,
+"answer": ...}`` or ``{"reply": N, "error": ...}``, and objects with the key ``state``, ``log``, ``progress``,
+``run``, ``ended`` or ``clean_exit``.
 """
 
 from __future__ import annotations

@@ -54,8 +54,8 @@ class Watchdog:
         """Check a state; returns the limit that it exceeds, or ``None``."""
         if state.fault is not None:
             return None
-        run = None if state.procedure is None else state.procedure.id
-        loop = state.loop.closed, run, state.mirror.flattened
+        run = None if state.active_run is None else state.active_run.id
+        loop = state.loop.closed, run, state.mirror.flatten_count
         if loop != self._loop:
             self._loop = loop
             self._residuals.clear()
@@ -79,7 +79,7 @@ class Watchdog:
 
     def _check_saturation(self, state: State) -> LimitViolation | None:
         now, limit, max_share = self._clock(), self._limits.saturated_s, self._limits.saturated_share
-        if not state.loop.closed or state.mirror.clipped <= max_share:
+        if not state.loop.closed or state.mirror.saturated_share <= max_share:
             self._clipped_since = None
             return None
         if self._clipped_since is None:
@@ -87,7 +87,7 @@ class Watchdog:
         if now - self._clipped_since <= limit:
             return None
         return LimitViolation(
-            f"{100 * state.mirror.clipped:.0f} % of the actuators at their limits for "
+            f"{100 * state.mirror.saturated_share:.0f} % of the actuators at their limits for "
             f"{now - self._clipped_since:.1f} s (limit {100 * max_share:.0f} % for {limit:g} s)",
             "Lower the gain, use another matrix, or wait for better seeing; then clear the fault.",
         )
@@ -116,7 +116,7 @@ class Watchdog:
         if now - self._diverging_since < limit:
             return None
         return LimitViolation(
-            f"the residual grew to {present:.0f} nm, {present / baseline:.1f} times the usual {baseline:.0f} nm "
-            f"(limit {factor:g} times for {limit:g} s)",
+            f"the residual grew to {present:.0f} nm, {present / baseline:.1f} times its median of "
+            f"{baseline:.0f} nm (limit {factor:g} times for {limit:g} s)",
             "Lower the gain or use another matrix, then clear the fault.",
         )

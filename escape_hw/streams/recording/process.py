@@ -1,4 +1,4 @@
-"""A recorder in a process of its own. It ends when its standard input ends, also when its parent is killed."""
+"""A recorder in a process of its own, which ends with its parent."""
 
 from __future__ import annotations
 
