@@ -107,7 +107,8 @@ def test_who_did_not_say_hello_is_not_heard(raw: zmq.Socket[bytes], bench: Conne
     raw.send_multipart([b"2", json.dumps(hello).encode()])
     assert "belongs to another connection" in answer(raw)["error"]["message"]
     for version in (1, 99):
-        raw.send_multipart([b"3", json.dumps({**hello, "client": "0" * 8, "schema_version": version}).encode()])
+        other = {**hello, "client": "0" * 8, "schema_version": version}
+        raw.send_multipart([b"3", json.dumps(other).encode()])
         assert f"the client version {version}; use the same version" in answer(raw)["error"]["message"]
 
 

@@ -130,7 +130,7 @@ class StreamRecorder:
         is_stopped: Callable[[], bool],
         on_state: Callable[[RecordingState], object] = lambda state: None,
     ) -> RecordingState:
-        """Record until ``is_stopped``, a full disk or the end of all streams; ``on_state`` gets the progress."""
+        """Record until ``is_stopped``, a full disk or the end of all streams; ``on_state`` gets the state."""
         writer = BackgroundThread("recorder", self._write)
         writer.start()
         next_report = 0.0
