@@ -85,7 +85,7 @@ class Aborted(EscapeError):
 
 
 class LeaseHeld(EscapeError):
-    """Somebody else has the right to write, or nobody asked for it."""
+    """The client does not have control of the server."""
 
 
 class ServerGone(EscapeError):

@@ -109,7 +109,9 @@ def watch_standard_input() -> threading.Event:
     ended = threading.Event()
 
     def wait_for_end() -> None:
-        sys.stdin.buffer.read()
+        # Not through sys.stdin: a thread that holds its lock aborts the interpreter at exit.
+        while os.read(0, 4096):
+            pass
         ended.set()
 
     BackgroundThread("standard input", wait_for_end).start()

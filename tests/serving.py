@@ -103,7 +103,7 @@ class Served:
         return self._process.wait(PATIENCE_S)
 
     def engines(self) -> list[int]:
-        """Engines and guardians that live, of this server or of one before in the same folder."""
+        """Engines and fail-safe processes that run, of this server or of one before in the same folder."""
         mine = f"XDG_RUNTIME_DIR={self.environment['XDG_RUNTIME_DIR']}".encode()
         found = []
         for entry in Path("/proc").iterdir():
@@ -131,7 +131,7 @@ def serving(*words: object, folder: Path, more: Mapping[str, str] | None = None)
             os.environ.pop("XDG_RUNTIME_DIR", None)
         else:
             os.environ["XDG_RUNTIME_DIR"] = before
-    wait_for(lambda: not served.engines(), "engine and guardian end")
+    wait_for(lambda: not served.engines(), "engine and fail-safe process end")
     assert not [one for one in segments(SYSTEM) if not one.alive]
 
 

@@ -105,7 +105,7 @@ def test_memory_is_bounded_when_the_disk_stands_still(tmp_path, writer, monkeypa
 
     monkeypatch.setattr(module, "write_block", stuck)
     monkeypatch.setattr(module, "_BLOCK_BYTES", 4000)
-    monkeypatch.setattr(module, "MOST_WAITING", 20_000)
+    monkeypatch.setattr(module, "MAX_QUEUED_BYTES", 20_000)
 
     def produce():
         entries(writer, 0, 800, wait_s=0.0002)

@@ -36,7 +36,7 @@ def holder(served: Served) -> Iterator[Connection]:
 
 @pytest.fixture
 def bench(holder: Connection) -> Iterator[Connection]:
-    """The server, idle and with the right to write, whatever the test before did."""
+    """The server, idle and with control, whatever the previous test did."""
     holder.acquire(take_over=True)
     yield holder
     holder.flatten()

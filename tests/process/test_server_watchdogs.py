@@ -155,6 +155,6 @@ def test_a_poke_run_that_lost_its_lease(held, mirror) -> None:
         lambda: watcher.state.last_run is not None and watcher.state.last_run.name == "docrime", "its end"
     )
     watcher.acquire()
-    made_safe(watcher, mirror[1], "was left alone for")
+    made_safe(watcher, mirror[1], "was without a client in control for")
     assert watcher.state.last_run.finish is Finish.ABORTED
     watcher.release()

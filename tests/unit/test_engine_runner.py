@@ -29,7 +29,7 @@ CLOSED = LoopSettings("im", 0.3, 0.01, 2)
 
 def idle_state() -> EngineState:
     state = EngineState(LoopSettings(gain=0.4), first_run_id=3)
-    state.become_idle()
+    state.set_phase(Phase.IDLE)
     return state
 
 

@@ -43,7 +43,7 @@ def test_a_key_is_told_as_a_shell_takes_it(escape, document) -> None:
 def test_an_address_without_a_port_is_refused(escape) -> None:
     code, _, said = escape("serve", "razor-shwfs", "--bind", "0.0.0.0")
     assert code == 2
-    assert "--bind 0.0.0.0 needs a --port" in said
+    assert "--bind 0.0.0.0 needs --port" in said
 
 
 def test_a_secret_key_that_others_may_read_is_not_used() -> None:

@@ -16,6 +16,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import ramp_to
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function
 from escape_hw.errors import DeviceError, EscapeError, FrameTimeout
+from escape_hw.remote.state import Phase
 from escape_hw.server.engine.publisher import StreamPublisher
 from escape_hw.server.engine.state import EngineState
 from escape_hw.server.engine.state_publisher import StatePublisher
@@ -33,15 +34,7 @@ Job = Callable[[], object]
 
 
 class BenchOwner:
-    """Owns the devices. All methods but those of the first group belong to the main thread.
-
-    Parameters
-    ----------
-    bench, state, publisher, state_publisher
-        The devices, the engine's state, and the publishers of streams and state.
-    send
-        Sends a message to the front end.
-    """
+    """Owns the devices. All methods but those of the first group belong to the main thread."""
 
     def __init__(
         self,
@@ -120,7 +113,7 @@ class BenchOwner:
     # ------------------------------------------------------------ devices
     def open(self) -> None:
         """Open the devices and flatten the mirror; a failure is latched as a fault."""
-        self._state.begin_opening()
+        self._state.set_phase(Phase.STARTING)
         bench = self.bench
         try:
             bench.open()
@@ -130,16 +123,13 @@ class BenchOwner:
         except EscapeError as error:
             self.make_safe(str(error), REOPEN_REMEDY)
             return
-        self._state.become_idle()
+        self._state.set_phase(Phase.IDLE)
         log.info("%s: %d devices open, mirror flat", bench.config.system.name, len(bench.devices))
 
     def close(self) -> None:
         """Close the devices; the mirror is flat then.
 
-        Raises
-        ------
-        Exception
-            A device failed. Without a clean exit of the engine, the fail-safe process flattens the mirror.
+        An exception passes: without a clean exit, the fail-safe process flattens the mirror.
         """
         try:
             self.bench.close()
@@ -148,7 +138,7 @@ class BenchOwner:
             log.error("the devices did not close cleanly: %s", error)
             raise
         finally:
-            self._state.become_stopped()
+            self._state.set_phase(Phase.STOPPED)
             self.send_flat_replies()
 
     def clear_fault(self) -> None:

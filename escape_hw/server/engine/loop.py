@@ -72,12 +72,7 @@ class LoopRunner:
     def close(self, request: CloseLoop, on_closed: OnClosed) -> None:
         """Close the loop until it is opened.
 
-        Raises
-        ------
-        RequestRefused
-            A fault is latched, or something else runs.
-        ConfigError, ProductError, IncompatibleProduct, CalibrationError
-            As for :meth:`prepare`.
+        RequestRefused unless the engine is idle; errors of :meth:`prepare`.
         """
         self._state.check_can_start(needs_loop=False)
         settings, control = self.prepare(request)
@@ -92,10 +87,7 @@ class LoopRunner:
     def change(self, request: SetLoop) -> None:
         """Change the parameters of the loop, closed or not; those that are absent stay.
 
-        Raises
-        ------
-        ConfigError, ProductError, IncompatibleProduct, CalibrationError
-            As for :meth:`prepare`; the loop continues unchanged.
+        After an error (see :meth:`prepare`) the loop continues unchanged.
         """
         before, control = self._state.snapshot.loop, self._state.snapshot.loop_control
         settings = self._merge(request)
@@ -132,7 +124,7 @@ class LoopRunner:
         try:
             self._bench.wfs.stop()
             self._publisher.reset_residual()
-            state.mark_loop_closed()
+            state.set_loop_closed(True)
             self._state_publisher.publish()
             on_closed(None)
             log.info("loop closed on '%s', gain %g", settings.matrix, settings.gain)

@@ -31,15 +31,7 @@ from escape_hw.supervision import BackgroundThread
 
 
 class Engine:
-    """Composes the parts of the engine and runs its main loop.
-
-    Parameters
-    ----------
-    channel
-        Connection to the front end.
-    setup
-        Start-up settings from the front end.
-    """
+    """Composes the parts of the engine and runs its main loop."""
 
     def __init__(self, channel: Channel, setup: EngineSetup) -> None:
         self._channel, self._front_end_timeout_s = channel, setup.front_end_timeout_s
@@ -75,10 +67,7 @@ class Engine:
     def run(self, messages: Iterator[dict[str, Any]]) -> None:
         """Serve the front end until it ends or asks to stop; the mirror is flat then.
 
-        Raises
-        ------
-        Exception
-            A device did not close, or a background thread failed.
+        Raises the exception of a device that did not close, or of a background thread.
         """
         silence = BackgroundThread(
             "front end silence", self._check_front_end, self._front_end_timeout_s / 5, self._on_thread_failure

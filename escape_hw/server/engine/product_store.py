@@ -16,13 +16,7 @@ from escape_hw.remote.state import ProductEntry
 
 
 class ProductStore:
-    """Products by name. Only the paths are stored, not the contents.
-
-    Parameters
-    ----------
-    folders
-        Folders that clients may load files from.
-    """
+    """Products by name. Only the paths are stored, not the contents."""
 
     def __init__(self, folders: Iterable[Path]) -> None:
         self._folders = tuple(folder.resolve() for folder in folders)
@@ -34,13 +28,7 @@ class ProductStore:
         return tuple(self._products.values())
 
     def matrix_path(self, name: str) -> Path:
-        """Path of a matrix.
-
-        Raises
-        ------
-        ConfigError
-            There is no matrix of that name.
-        """
+        """Path of a matrix (ConfigError: there is no matrix of that name)."""
         product = self._products.get(name)
         if product is None or product.kind != "matrix":
             known = ", ".join(one.name for one in self.products if one.kind == "matrix") or "none"
@@ -65,13 +53,7 @@ class ProductStore:
         return resolved
 
     def load(self, path: str, name: str | None = None) -> ProductEntry:
-        """Add a file that a client named.
-
-        Raises
-        ------
-        ProductError
-            The path is not allowed, or as for :meth:`add`.
-        """
+        """Add a file that a client named (ProductError: the path is not allowed, or as for :meth:`add`)."""
         return self.add(self.readable_path(path), name)
 
     def add(self, path: Path, name: str | None = None) -> ProductEntry:

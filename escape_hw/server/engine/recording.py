@@ -19,15 +19,7 @@ _RECORDED_STREAMS = ("frames", "slopes", "modes", "commands", "psf")
 
 
 class TelemetryRecording:
-    """Records the streams at full rate, in a process that the loop does not wait for.
-
-    Parameters
-    ----------
-    runs
-        Parent of the dated folders of recordings.
-    publisher
-        Its streams at the time of the start are recorded.
-    """
+    """Records the streams at full rate, in a process that the loop does not wait for."""
 
     def __init__(self, runs: Path, publisher: StreamPublisher) -> None:
         self._runs, self._publisher = runs, publisher
@@ -37,12 +29,7 @@ class TelemetryRecording:
     def set_recording(self, on: bool) -> RecordingState:
         """Start or stop; does nothing when the recording is in that state already.
 
-        Raises
-        ------
-        RequestRefused
-            There is no stream to record yet.
-        StorageError
-            The folder is not writable, or the process cannot be started.
+        RequestRefused when there is no stream yet; StorageError when folder or process are not available.
         """
         if on and self._process is None:
             self._start()

@@ -49,17 +49,7 @@ class Services:
 
 
 class RequestHandler:
-    """Dispatches the messages of the front end; for one thread.
-
-    Parameters
-    ----------
-    services
-        What the handlers use.
-    send
-        Sends a message to the front end.
-    request_stop
-        Ends the engine.
-    """
+    """Dispatches the messages of the front end; for one thread."""
 
     def __init__(
         self,

@@ -33,19 +33,7 @@ _STORED_PRODUCTS = ("im", "escape", "docrime", "gains", "loop")
 
 
 class ProcedureRunner:
-    """Starts procedures and saves their results.
-
-    Parameters
-    ----------
-    owner, loop_runner, state, publisher, state_publisher, product_store
-        The devices, the loop, the engine's state, its publishers, and the store of the products.
-    config_text
-        The system's configuration, TOML.
-    runs
-        Parent of the run folders.
-    send
-        Sends a message to the front end.
-    """
+    """Starts procedures and saves their results."""
 
     def __init__(
         self,
@@ -66,15 +54,7 @@ class ProcedureRunner:
         self._config_text, self._runs, self._send = config_text, runs, send
 
     def start(self, task: Task[Any], name: str, arguments: Arguments, needs_loop: bool) -> int:
-        """Queue a procedure; returns the number of its run.
-
-        Raises
-        ------
-        RequestRefused
-            A fault is latched, or something else runs.
-        EscapeError
-            The task's inputs cannot be loaded.
-        """
+        """Load a task, reserve the engine and queue the procedure; returns the number of its run."""
         config = load_text(self._config_text, overrides=task.overrides)
         task.load(config, self._bench.simulated)
         ticket = self._state.begin_run(name, arguments, needs_loop)
@@ -90,12 +70,12 @@ class ProcedureRunner:
         log.info("run %d: %s %s", run.id, run.name, words)
         previous_config, bench.config = bench.config, config
         self._publisher.reset_residual()
-        self._state.begin_acquisition()
+        self._state.set_loop_closed(self._state.snapshot.needs_loop)
         try:
             finished = self._run_in_folder(ticket, task)
         finally:
             bench.config = previous_config
-            self._state.end_acquisition()
+            self._state.set_loop_closed(False)
         level = logging.INFO if finished.finish is Finish.DONE else logging.WARNING
         message = f": {finished.message}" if finished.message else ""
         log.log(level, "run %d: %s %s%s", finished.id, finished.name, finished.finish.value, message)
@@ -157,7 +137,7 @@ class ProcedureRunner:
             result, stop = error.partial, error
         # The mirror is flat: those who wait for it do not wait for the files.
         self._owner.send_flat_replies()
-        self._state.end_acquisition()
+        self._state.set_loop_closed(False)
         grid, psf = getattr(result, "grid", None), getattr(result, "model_psf", None)
         if grid is not None:
             self._publisher.set_geometry(grid)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.api.procedure import Progress
@@ -66,34 +67,33 @@ class EngineSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class RunTicket:
-    """Permission to run a procedure.
-
-    Parameters
-    ----------
-    run
-        The run.
-    stop
-        Set when the run has to stop.
-    loop_before
-        Loop that was closed when the run was accepted and is closed again after it.
-    """
+    """Permission to run a procedure: the run, its stop flag, and the loop to close again after it."""
 
     run: ActiveRun
     stop: SignalSafeFlag
     loop_before: LoopSettings | None
 
 
+S = TypeVar("S", bound="EngineState")
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _atomic(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
+    """Run a method under the state's lock."""
+
+    @functools.wraps(method)
+    def locked(self: S, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        with self._lock:
+            return method(self, *args, **kwargs)
+
+    return locked
+
+
 class EngineState:
     """State of the engine, shared by its threads.
 
     Readers take :attr:`snapshot`. Each transition is one method, atomic under the only lock.
-
-    Parameters
-    ----------
-    loop
-        Parameters of the loop.
-    first_run_id
-        Number of the first run.
     """
 
     def __init__(self, loop: LoopSettings, first_run_id: int = 1) -> None:
@@ -116,79 +116,66 @@ class EngineState:
         self._now = replace(self._now, **changes)
 
     # ------------------------------------------------------------ devices and faults
-    def begin_opening(self) -> None:
-        """The devices are being opened."""
-        with self._lock:
-            self._set(phase=Phase.STARTING)
+    @_atomic
+    def set_phase(self, phase: Phase) -> None:
+        """Enter a phase; :attr:`Phase.IDLE` when the devices are open and the mirror is flat."""
+        self._set(phase=phase, device_messages={} if phase is Phase.IDLE else self._now.device_messages)
 
+    @_atomic
     def clear_fault(self) -> None:
         """Release the latched fault."""
-        with self._lock:
-            self._set(fault=None)
+        self._set(fault=None)
 
-    def become_idle(self) -> None:
-        """The devices are open and the mirror is flat."""
-        with self._lock:
-            self._set(phase=Phase.IDLE, device_messages={})
-
-    def become_stopped(self) -> None:
-        """The engine ends."""
-        with self._lock:
-            self._set(phase=Phase.STOPPED)
-
+    @_atomic
     def set_device_message(self, device: str, message: str = "") -> None:
         """Store the problem of a device; an empty message removes it."""
-        with self._lock:
-            if self._now.device_messages.get(device, "") != message:
-                others = {name: text for name, text in self._now.device_messages.items() if name != device}
-                self._set(device_messages={**others, device: message} if message else others)
+        if self._now.device_messages.get(device, "") != message:
+            others = {name: text for name, text in self._now.device_messages.items() if name != device}
+            self._set(device_messages={**others, device: message} if message else others)
 
+    @_atomic
     def latch_fault(self, reason: str, remedy: str) -> None:
         """Latch a fault and stop the present activity. A fault that is latched already stays."""
-        with self._lock:
-            self._latch(reason, remedy)
-            self._stop.set()
+        self._latch(reason, remedy)
+        self._stop.set()
 
+    @_atomic
     def enter_fault(self, reason: str, remedy: str) -> None:
         """Latch a fault; the loop is open and the mirror is being made safe."""
-        with self._lock:
-            self._latch(reason, remedy)
-            self._set(phase=Phase.FAULT, loop_closed=False)
+        self._latch(reason, remedy)
+        self._set(phase=Phase.FAULT, loop_closed=False)
 
     def _latch(self, reason: str, remedy: str) -> None:
         if self._now.fault is None:
             self._set(fault=FaultState(reason=reason, at_utc=format_utc(), remedy=remedy))
 
     # ------------------------------------------------------------ stop
+    @_atomic
     def request_stop(self) -> None:
         """Stop the present activity."""
-        with self._lock:
-            self._stop.set()
+        self._stop.set()
 
+    @_atomic
     def request_abort(self) -> bool:
         """Stop the procedure; false when none runs."""
-        with self._lock:
-            if self._now.active_run is None:
-                return False
-            self._stop.set()
-            return True
+        if self._now.active_run is None:
+            return False
+        self._stop.set()
+        return True
 
+    @_atomic
     def request_open_loop(self) -> bool:
         """Stop whatever closes the loop; false when a procedure runs that works in open loop."""
-        with self._lock:
-            if self._now.active_run is not None and not self._now.needs_loop:
-                return False
-            self._stop.set()
-            return True
+        if self._now.active_run is not None and not self._now.needs_loop:
+            return False
+        self._stop.set()
+        return True
 
     # ------------------------------------------------------------ procedures
     def check_can_start(self, needs_loop: bool) -> LoopSettings | None:
-        """Check that a procedure can start; returns the loop that is closed again after it.
+        """Check that a procedure can start; returns the loop to close again after it.
 
-        Raises
-        ------
-        RequestRefused
-            A fault is latched, or something else runs.
+        RequestRefused when a fault is latched or something else runs.
         """
         now = self._now
         restorable = now.loop_control is not None and now.fault is None and now.active_run is None
@@ -210,148 +197,111 @@ class EngineState:
         if now.phase is not Phase.IDLE:
             raise RequestRefused(f"the engine is {now.phase.value}; wait until it is idle")
 
+    @_atomic
     def begin_run(self, name: str, arguments: dict[str, Any], needs_loop: bool) -> RunTicket:
-        """Reserve the engine for a procedure; a loop that is closed outside procedures is opened.
+        """Reserve the engine for a procedure, see :meth:`check_can_start`; opens a closed loop."""
+        loop_before = self.check_can_start(needs_loop)
+        if self._now.loop_control is not None:
+            self._now.loop_control.open()
+        run = ActiveRun(
+            id=self._next_run_id, name=name, arguments=arguments, stage="starting",
+            started_utc=format_utc(),
+        )  # fmt: skip
+        self._next_run_id += 1
+        self._stop = SignalSafeFlag()
+        self._set(active_run=run, phase=Phase.PROCEDURE, paused=False, needs_loop=needs_loop)
+        return RunTicket(run, self._stop, loop_before)
 
-        Raises
-        ------
-        RequestRefused
-            As for :meth:`check_can_start`.
-        """
-        with self._lock:
-            loop_before = self.check_can_start(needs_loop)
-            if self._now.loop_control is not None:
-                self._now.loop_control.open()
-            run = ActiveRun(
-                id=self._next_run_id, name=name, arguments=arguments, stage="starting",
-                started_utc=format_utc(),
-            )  # fmt: skip
-            self._next_run_id += 1
-            self._stop = SignalSafeFlag()
-            self._set(active_run=run, phase=Phase.PROCEDURE, paused=False, needs_loop=needs_loop)
-            return RunTicket(run, self._stop, loop_before)
+    @_atomic
+    def set_loop_closed(self, closed: bool) -> None:
+        """Note that the loop is closed, or open."""
+        self._set(loop_closed=closed)
 
-    def begin_acquisition(self) -> None:
-        """The procedure starts on the hardware; one that needs the loop counts as closed from here."""
-        with self._lock:
-            self._set(loop_closed=self._now.needs_loop)
-
-    def end_acquisition(self) -> None:
-        """The procedure has released the hardware; its results are still being saved."""
-        with self._lock:
-            self._set(loop_closed=False)
-
+    @_atomic
     def finish_run(
         self, finished: FinishedRun, next_loop: tuple[LoopSettings, LoopControl] | None = None
     ) -> SignalSafeFlag | None:
         """End the run and, where ``next_loop`` is given and nothing speaks against it, begin that loop.
 
-        Returns
-        -------
-        SignalSafeFlag or None
-            Stop flag of the loop that begins; ``None``: the loop stays open.
+        Returns its stop flag; ``None`` when the loop stays open.
         """
-        with self._lock:
-            fault = self._now.fault
-            phase = Phase.IDLE if fault is None else Phase.FAULT
-            self._set(
-                active_run=None, last_run=finished, phase=phase, paused=False, needs_loop=False,
-                loop_closed=False,
-            )  # fmt: skip
-            undisturbed = finished.finish is Finish.DONE and fault is None and not self._stop.is_set()
-            return self._begin_loop(*next_loop) if next_loop is not None and undisturbed else None
+        fault = self._now.fault
+        phase = Phase.IDLE if fault is None else Phase.FAULT
+        self._set(
+            active_run=None, last_run=finished, phase=phase, paused=False, needs_loop=False,
+            loop_closed=False,
+        )  # fmt: skip
+        undisturbed = finished.finish is Finish.DONE and fault is None and not self._stop.is_set()
+        return self._begin_loop(*next_loop) if next_loop is not None and undisturbed else None
 
+    @_atomic
     def pause(self) -> None:
-        """Ask the procedure to pause.
+        """Ask the procedure to pause (RequestRefused: no procedure runs, or it works in closed loop)."""
+        run = self._require_run()
+        if self._now.needs_loop:
+            raise RequestRefused(f"'{run.name}' works in closed loop and cannot be paused; abort it")
+        self._set(paused=True)
 
-        Raises
-        ------
-        RequestRefused
-            No procedure runs, or it works in closed loop.
-        """
-        with self._lock:
-            run = self._require_run()
-            if self._now.needs_loop:
-                raise RequestRefused(f"'{run.name}' works in closed loop and cannot be paused; abort it")
-            self._set(paused=True)
-
+    @_atomic
     def resume(self) -> None:
-        """Ask the procedure to resume.
-
-        Raises
-        ------
-        RequestRefused
-            No procedure runs.
-        """
-        with self._lock:
-            self._require_run()
-            self._set(paused=False)
+        """Ask the procedure to resume (RequestRefused: no procedure runs)."""
+        self._require_run()
+        self._set(paused=False)
 
     def _require_run(self) -> ActiveRun:
         if self._now.active_run is None:
             raise RequestRefused("no procedure is running")
         return self._now.active_run
 
+    @_atomic
     def mark_run_paused(self, paused: bool) -> None:
         """Note in the active run whether it is paused."""
-        with self._lock:
-            if self._now.active_run is not None:
-                self._set(active_run=self._now.active_run.model_copy(update={"paused": paused}))
+        if self._now.active_run is not None:
+            self._set(active_run=self._now.active_run.model_copy(update={"paused": paused}))
 
+    @_atomic
     def update_progress(self, progress: Progress) -> ActiveRun | None:
         """Store progress; returns the run of a procedure, ``None`` for the loop."""
-        with self._lock:
-            if self._now.loop_control is not None:
-                self._set(loop_statistics=dict(progress.metrics))
-                return None
-            if self._now.active_run is None:
-                return None
-            left = progress.remaining_s
-            run = self._now.active_run.model_copy(
-                update={
-                    "stage": progress.stage, "completed": progress.done, "total": progress.total,
-                    "unit": progress.unit, "elapsed_s": progress.elapsed_s,
-                    "remaining_s": left if math.isfinite(left) else None,
-                    "metrics": {k: float(v) for k, v in progress.metrics.items() if math.isfinite(v)},
-                }
-            )  # fmt: skip
-            self._set(active_run=run)
-            return run
+        if self._now.loop_control is not None:
+            self._set(loop_statistics=dict(progress.metrics))
+            return None
+        if self._now.active_run is None:
+            return None
+        left = progress.remaining_s
+        run = self._now.active_run.model_copy(
+            update={
+                "stage": progress.stage, "completed": progress.done, "total": progress.total,
+                "unit": progress.unit, "elapsed_s": progress.elapsed_s,
+                "remaining_s": left if math.isfinite(left) else None,
+                "metrics": {k: float(v) for k, v in progress.metrics.items() if math.isfinite(v)},
+            }
+        )  # fmt: skip
+        self._set(active_run=run)
+        return run
 
     # ------------------------------------------------------------ the loop outside procedures
+    @_atomic
     def begin_loop(self, settings: LoopSettings, control: LoopControl) -> SignalSafeFlag:
-        """Reserve the engine for a loop; returns its stop flag.
-
-        Raises
-        ------
-        RequestRefused
-            A fault is latched, or something else runs.
-        """
-        with self._lock:
-            self._require_idle()
-            return self._begin_loop(settings, control)
+        """Reserve the engine for a loop, if it is idle; returns its stop flag."""
+        self._require_idle()
+        return self._begin_loop(settings, control)
 
     def _begin_loop(self, settings: LoopSettings, control: LoopControl) -> SignalSafeFlag:
         self._stop = SignalSafeFlag()
         self._set(loop=settings, loop_control=control, phase=Phase.LOOP, needs_loop=True)
         return self._stop
 
-    def mark_loop_closed(self) -> None:
-        """The loop is closed."""
-        with self._lock:
-            self._set(loop_closed=True)
-
+    @_atomic
     def end_loop(self) -> None:
         """The loop is open; a procedure that was accepted meanwhile may begin."""
-        with self._lock:
-            now = self._now
-            self._set(
-                loop_closed=False, loop_control=None, loop_statistics={},
-                needs_loop=now.needs_loop and now.active_run is not None,
-                phase=Phase.IDLE if now.phase is Phase.LOOP else now.phase,
-            )  # fmt: skip
+        now = self._now
+        self._set(
+            loop_closed=False, loop_control=None, loop_statistics={},
+            needs_loop=now.needs_loop and now.active_run is not None,
+            phase=Phase.IDLE if now.phase is Phase.LOOP else now.phase,
+        )  # fmt: skip
 
+    @_atomic
     def set_loop_settings(self, settings: LoopSettings) -> None:
         """Store the parameters of the loop."""
-        with self._lock:
-            self._set(loop=settings)
+        self._set(loop=settings)

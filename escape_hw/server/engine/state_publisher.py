@@ -42,23 +42,7 @@ _RATE_S = 0.5
 
 
 class StatePublisher:
-    """Publishes the engine's state five times a second, in a thread of its own.
-
-    Parameters
-    ----------
-    bench
-        The bench. Only stored values are read from its devices.
-    engine_state, publisher, product_store
-        Sources of the state.
-    runs
-        Parent of the run folders; its disk is reported.
-    emit
-        Called with each state.
-    recording
-        Returns the state of the recording.
-    clock
-        Monotonic seconds.
-    """
+    """Publishes the engine's state five times a second, in a thread of its own; reads no device."""
 
     def __init__(
         self,

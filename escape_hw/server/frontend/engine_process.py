@@ -25,13 +25,6 @@ _ENGINE, _FAILSAFE = "escape_hw.server.engine.main", "escape_hw.server.safety.fa
 class EngineProcess:
     """A running engine with its fail-safe process.
 
-    Parameters
-    ----------
-    setup
-        Start-up settings of the engine.
-    incidents
-        Folder of the fail-safe process's reports.
-
     Attributes
     ----------
     connection
@@ -73,12 +66,8 @@ class EngineProcess:
     def maintain_failsafe(self, alive: bool) -> None:
         """Restart the fail-safe process after it died; call this every second.
 
-        The delay between restarts grows while the process dies at once or cannot be started.
-
-        Parameters
-        ----------
-        alive
-            Whether the fail-safe process ran when the engine was last seen running.
+        The delay between restarts grows while the process dies at once or cannot be started. ``alive`` is
+        whether it ran when the engine was last seen running.
         """
         if alive:
             self._backoff.mark_alive()

@@ -33,23 +33,8 @@ _RESTART_REMEDY = "Look at the log, then clear the fault to start the engine aga
 class EngineSupervisor:
     """Starts, monitors and ends the engine process.
 
-    Parameters
-    ----------
-    limits
-        Section ``[server]`` of the configuration.
-    setup
-        Start-up settings of the engine.
-    journal, published
-        Journal and published state of the server.
-    on_message
-        Called with every message of the engine that is no state.
-    on_exit
-        Called when the engine has ended: no pending request will be answered.
-
-    Attributes
-    ----------
-    stopping
-        Whether the server has to end.
+    Messages that are no state go to ``on_message``. ``on_exit`` is called after the end of an engine: pending
+    requests get no reply then. ``stopping`` becomes true when the server has to end.
     """
 
     def __init__(
@@ -143,10 +128,7 @@ class EngineSupervisor:
     def check(self, oldest_safety_request_s: float) -> None:
         """Apply the limits; call this regularly.
 
-        Parameters
-        ----------
-        oldest_safety_request_s
-            Seconds that the oldest unanswered safety request has waited; 0 when there is none.
+        ``oldest_safety_request_s``: seconds that the oldest safety request has waited for its reply, or 0.
         """
         engine, now = self._engine, time.monotonic()
         if engine is None:

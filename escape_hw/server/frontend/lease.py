@@ -80,10 +80,7 @@ class LeaseManager:
     def register_client(self, registration: RegisterClient, route: bytes) -> None:
         """Register a client, also again after its connection was interrupted.
 
-        Raises
-        ------
-        RequestRefused
-            Too many clients, or another connection uses this client number.
+        RequestRefused when there are too many, or another connection uses this client number.
         """
         known = self._clients.get(registration.client)
         if known is not None and known.route != route:
@@ -97,13 +94,7 @@ class LeaseManager:
             known.last_message_s = self._clock()
 
     def record_activity(self, client: str, route: bytes) -> RegisteredClient:
-        """Note a message of a client and return the client.
-
-        Raises
-        ------
-        ClientUnknown
-            The client is not registered, or another connection uses its number.
-        """
+        """Note a message of a client and return the client (ClientUnknown: not registered)."""
         known = self._clients.get(client)
         if known is None or known.route != route:
             raise ClientUnknown("this connection is not registered under that client number; reconnect")
@@ -111,13 +102,7 @@ class LeaseManager:
         return known
 
     def acquire(self, client: RegisteredClient, take_over: bool) -> Lease:
-        """Grant the lease to a client.
-
-        Raises
-        ------
-        LeaseHeld
-            Another client holds it.
-        """
+        """Grant the lease to a client (LeaseHeld: another client holds it)."""
         holder = self._holder
         if holder is not None and holder is not client:
             if not take_over:
@@ -142,13 +127,7 @@ class LeaseManager:
             self._holder, self.released_s = None, self._clock()
 
     def require(self, client: RegisteredClient) -> None:
-        """Check that a client holds the lease.
-
-        Raises
-        ------
-        LeaseHeld
-            It does not.
-        """
+        """Check that a client holds the lease (LeaseHeld: it does not)."""
         if self._holder is client:
             return
         if self._holder is None:

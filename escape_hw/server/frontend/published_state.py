@@ -10,15 +10,7 @@ from escape_hw.server.frontend.transport import ZmqTransport
 
 
 class PublishedState:
-    """Holds and publishes the state.
-
-    Parameters
-    ----------
-    state
-        State before the engine's first message; its ``notes`` stay.
-    leases, transport
-        Sources of what the front end adds.
-    """
+    """Holds and publishes the state; its ``notes`` stay."""
 
     def __init__(self, state: State, leases: LeaseManager, transport: ZmqTransport) -> None:
         self.state, self._leases, self._transport = state, leases, transport

@@ -54,17 +54,7 @@ class StreamSampler:
     def latest(
         self, stream: str, segment: str | None, after: int
     ) -> tuple[dict[str, Any] | None, bytes | None]:
-        """Header and bytes of a stream's newest entry; ``None`` twice when there is no newer one.
-
-        Parameters
-        ----------
-        stream
-            Name of the stream.
-        segment
-            Its shared memory; ``None`` when it has no entry yet.
-        after
-            Index of the entry that the client has.
-        """
+        """Header and bytes of a stream's newest entry; ``None`` when there is none newer than ``after``."""
         reader = self._readers.reader(stream, segment)
         sample = None if reader is None else reader.latest(after)
         if sample is None:
@@ -94,19 +84,7 @@ class PendingRequest:
 
 
 class FrontEnd:
-    """Serves the clients of one system and supervises its engine.
-
-    Parameters
-    ----------
-    config
-        The system.
-    transport
-        Sockets, bound.
-    runs
-        Parent of the run folders.
-    read_folders
-        Further folders that products may be loaded from.
-    """
+    """Serves the clients of one system and supervises its engine."""
 
     def __init__(
         self, config: SystemConfig, transport: ZmqTransport, runs: Path, read_folders: tuple[Path, ...] = ()

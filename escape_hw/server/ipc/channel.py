@@ -69,13 +69,7 @@ class MessageDecoder:
         self._incomplete = b""
 
     def feed(self, data: bytes) -> Iterator[dict[str, Any]]:
-        """Yield the messages that these bytes complete.
-
-        Raises
-        ------
-        ValueError
-            A line is too long or no JSON.
-        """
+        """Yield the messages that these bytes complete (ValueError: A line is too long or no JSON)."""
         *lines, self._incomplete = (self._incomplete + data).split(b"\n")
         if len(self._incomplete) > _MAX_LINE_BYTES:
             raise ValueError(f"a message of more than {_MAX_LINE_BYTES} bytes")

@@ -49,15 +49,7 @@ def forward_log(forward: Callable[[LogLine], object]) -> LogForwarder:
 
 
 class ServerLog:
-    """Numbers, stores and publishes the lines of front end and engine.
-
-    Parameters
-    ----------
-    path
-        The file; older files get a number.
-    publish
-        Called with every line.
-    """
+    """Numbers, stores and publishes the lines of front end and engine."""
 
     def __init__(self, path: Path, publish: Callable[[LogLine], object]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -27,13 +27,7 @@ def server_folder() -> Path:
 
 
 class ServerJournal:
-    """Journal of a system's server; its file exists while the server runs.
-
-    Parameters
-    ----------
-    system
-        Name of the system.
-    """
+    """Journal of a system's server; its file exists while the server runs."""
 
     def __init__(self, system: str) -> None:
         self.system, self.folder = system, server_folder()

@@ -26,15 +26,7 @@ class LimitViolation:
 
 
 class Watchdog:
-    """Checks every state of the engine.
-
-    Parameters
-    ----------
-    limits
-        The configured limits.
-    clock
-        Monotonic seconds.
-    """
+    """Checks every state of the engine against the configured limits."""
 
     def __init__(self, limits: ServerSection, clock: Callable[[], float] = time.monotonic) -> None:
         self._limits, self._clock = limits, clock
