@@ -224,7 +224,7 @@ class ReadOnlyConnection:
         self._registered = True
         with self._changed:
             self._state = State.model_validate(answer)
-        lines, _ = self._ask(ask.GetLog(client=self.client, count=1000))
+        lines, _ = self._request(ask.GetLog, count=1000)
         with self._changed:
             known = {line.number for line in self._log}
             old = [LogLine.model_validate(line) for line in lines if line["number"] not in known]
@@ -281,6 +281,11 @@ class ReadOnlyConnection:
                 self._changed.wait_for(lambda: self._state.serial >= serial, _EVENT_S)
         return answer, data
 
+    def _request(
+        self, kind: type[ask.Request], timeout_s: float = TIMEOUT_S, **fields: Any
+    ) -> tuple[Any, bytes]:
+        return self._ask(ask.build_request(kind, client=self.client, **fields), timeout_s)
+
     def _event(self, topic: str, document: dict[str, Any]) -> None:
         with self._changed:
             if topic == "state":
@@ -324,9 +329,7 @@ class ReadOnlyConnection:
 
     def _latest_over_network(self, stream: str, after: int) -> Sample | None:
         try:
-            head, data = self._ask(
-                ask.build_request(ask.GetLatestSample, client=self.client, stream=stream, after=after)
-            )
+            head, data = self._request(ask.GetLatestSample, stream=stream, after=after)
         except ServerGone:
             return None
         if head is None:
@@ -341,7 +344,7 @@ class ReadOnlyConnection:
         known = self._geometry
         if known is None or known[0] != key:
             try:
-                answer, _ = self._ask(ask.GetGeometry(client=self.client))
+                answer, _ = self._request(ask.GetGeometry)
             except EscapeError:
                 return Geometry() if known is None else known[1]
             known = self._geometry = (key, Geometry.model_validate(answer))
@@ -355,7 +358,7 @@ class ReadOnlyConnection:
     def procedures(self) -> Sequence[ProcedureEntry]:
         """The procedures with their parameters."""
         if self._procedures is None:
-            answer, _ = self._ask(ask.GetProcedures(client=self.client), SLOW_TIMEOUT_S)
+            answer, _ = self._request(ask.GetProcedures, SLOW_TIMEOUT_S)
             self._procedures = tuple(ProcedureEntry.model_validate(entry) for entry in answer)
         return self._procedures
 
@@ -367,10 +370,9 @@ class ReadOnlyConnection:
         ConfigError
             An argument is unknown or out of range.
         """
-        request = ask.build_request(
-            ask.PlanProcedure, client=self.client, procedure=procedure, arguments=arguments or {}
+        answer, _ = self._request(
+            ask.PlanProcedure, SLOW_TIMEOUT_S, procedure=procedure, arguments=arguments or {}
         )
-        answer, _ = self._ask(request, SLOW_TIMEOUT_S)
         return ProcedurePlan.model_validate(answer)
 
     def check(self, procedure: str, arguments: Arguments | None = None) -> ProcedurePlan:
@@ -416,7 +418,7 @@ class Connection(ReadOnlyConnection):
         LeaseHeld
             Another client has control.
         """
-        answer, _ = self._ask(ask.build_request(ask.AcquireLease, client=self.client, take_over=take_over))
+        answer, _ = self._request(ask.AcquireLease, take_over=take_over)
         lease = Lease.model_validate(answer)
         self._set_lease(lease)
         return lease
@@ -424,7 +426,7 @@ class Connection(ReadOnlyConnection):
     def release(self) -> None:
         """Release control; does nothing when the server is gone."""
         try:
-            self._ask(ask.ReleaseLease(client=self.client), 1.0)
+            self._request(ask.ReleaseLease, 1.0)
         except ServerGone:
             return
         self._set_lease(None)
@@ -437,15 +439,15 @@ class Connection(ReadOnlyConnection):
     # ------------------------------------------------------------ safety
     def open_loop(self) -> None:
         """Open the loop; returns when the mirror is flat. Needs no control."""
-        self._ask(ask.OpenLoop(client=self.client), SLOW_TIMEOUT_S)
+        self._request(ask.OpenLoop, SLOW_TIMEOUT_S)
 
     def flatten(self) -> None:
         """Abort all activity; returns when the mirror is flat. Needs no control."""
-        self._ask(ask.Flatten(client=self.client), SLOW_TIMEOUT_S)
+        self._request(ask.Flatten, SLOW_TIMEOUT_S)
 
     def abort(self) -> None:
         """Abort the procedure and save its data; returns when the mirror is flat. Needs no control."""
-        self._ask(ask.AbortProcedure(client=self.client), SLOW_TIMEOUT_S)
+        self._request(ask.AbortProcedure, SLOW_TIMEOUT_S)
 
     # ------------------------------------------------------------ control
     def start(self, procedure: str, **arguments: float | int | bool | str | None) -> RemoteRun:
@@ -472,11 +474,11 @@ class Connection(ReadOnlyConnection):
 
     def pause(self) -> None:
         """Pause the running procedure between two steps, mirror flat."""
-        self._ask(ask.PauseProcedure(client=self.client))
+        self._request(ask.PauseProcedure)
 
     def resume(self) -> None:
         """Resume a paused procedure."""
-        self._ask(ask.ResumeProcedure(client=self.client))
+        self._request(ask.ResumeProcedure)
 
     def close_loop(
         self,
@@ -486,11 +488,8 @@ class Connection(ReadOnlyConnection):
         dropped_modes: int | None = None,
     ) -> None:
         """Close the loop with a matrix of ``state.products`` until it is opened."""
-        request = ask.build_request(
-            ask.CloseLoop, client=self.client,
-            matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes,
-        )  # fmt: skip
-        self._ask(request, SLOW_TIMEOUT_S)
+        settings = {"matrix": matrix, "gain": gain, "leak": leak, "dropped_modes": dropped_modes}
+        self._request(ask.CloseLoop, SLOW_TIMEOUT_S, **settings)
 
     def set_loop(
         self,
@@ -500,29 +499,25 @@ class Connection(ReadOnlyConnection):
         dropped_modes: int | None = None,
     ) -> None:
         """Change parameters of the loop, closed or not; absent ones stay."""
-        request = ask.build_request(
-            ask.SetLoop, client=self.client, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
-        )
-        self._ask(request, SLOW_TIMEOUT_S)
+        settings = {"matrix": matrix, "gain": gain, "leak": leak, "dropped_modes": dropped_modes}
+        self._request(ask.SetLoop, SLOW_TIMEOUT_S, **settings)
 
     def load_product(self, path: str | Path, name: str | None = None) -> ProductEntry:
         """Load a FITS product into the server, by default under its file's name."""
-        answer, _ = self._ask(
-            ask.build_request(ask.LoadProduct, client=self.client, path=str(path), name=name), SLOW_TIMEOUT_S
-        )
+        answer, _ = self._request(ask.LoadProduct, SLOW_TIMEOUT_S, path=str(path), name=name)
         return ProductEntry.model_validate(answer)
 
     def record(self, on: bool) -> None:
         """Start or stop recording telemetry at full rate."""
-        self._ask(ask.build_request(ask.SetRecording, client=self.client, on=on), SLOW_TIMEOUT_S)
+        self._request(ask.SetRecording, SLOW_TIMEOUT_S, on=on)
 
     def clear_fault(self) -> None:
         """Release the latched fault; closed devices are opened again."""
-        self._ask(ask.ClearFault(client=self.client), SLOW_TIMEOUT_S)
+        self._request(ask.ClearFault, SLOW_TIMEOUT_S)
 
     def shutdown(self) -> None:
         """Make the mirror safe and end the server."""
-        self._ask(ask.Shutdown(client=self.client))
+        self._request(ask.Shutdown)
 
 
 def connect(address: str, *, control: bool = False, take_over: bool = False, name: str = "") -> Connection:

@@ -1,4 +1,4 @@
-"""Telemetry on disk: every entry, in order, or counted as dropped; a disk in trouble holds nobody up."""
+"""Telemetry on disk: every entry in order, or counted as dropped; a slow or full disk delays nothing."""
 
 from __future__ import annotations
 

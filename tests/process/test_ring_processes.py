@@ -1,4 +1,4 @@
-"""Rings between processes: nothing torn, nothing leaked, whoever dies."""
+"""Rings between processes: no torn reads and no leaks, whichever process dies."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_a_recorder_in_another_process_gets_frames_whole_and_counts_the_rest() -
 
 
 @pytest.mark.parametrize("end", ["exit", "kill"])
-def test_the_end_of_a_reader_disturbs_nobody(end: str) -> None:
+def test_the_end_of_a_reader_affects_no_other_process(end: str) -> None:
     with RingWriter(segment_name(SYSTEM, "slopes"), 64) as writer, RingReader(writer.name) as other:
         writer.write(np.ones(4), 1)
         with process(READER, writer.name, "go" if end == "exit" else "stay") as reader:

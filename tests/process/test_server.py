@@ -181,7 +181,7 @@ def test_sprint_on_a_stored_matrix(bench: Connection, matrix: str) -> None:
     assert made[f"sprint-{run.id}-im"].startswith("docrime")
 
 
-def test_gains_and_the_matrix_that_they_scale_both_stay_on_the_shelf(bench: Connection, matrix: str) -> None:
+def test_gains_and_the_matrix_that_they_scale_both_stay_in_the_store(bench: Connection, matrix: str) -> None:
     run = bench.start("gains", im=matrix, frames=300, accuracy=0.5, strehl=False)
     run.wait(120)
     kinds = {one.name: one.kind for one in bench.state.products}

@@ -1,4 +1,4 @@
-"""Watchdogs of a served bench behind its real drivers: loop open, mirror flat, latched, told, and cleared."""
+"""Limits of a served bench with its real drivers: loop open, mirror flat, fault latched, published, cleared."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def test_garbage_is_refused_and_counted(raw: zmq.Socket[bytes], parts: list[byte
 
 @given(
     document=st.recursive(
-        st.none() | st.booleans() | st.floats() | st.text(max_size=10) | st.sampled_from(["start", "hello"]),
+        st.none() | st.booleans() | st.floats() | st.text(max_size=10) | st.sampled_from(["start_procedure", "hello"]),
         lambda inner: (
             st.lists(inner, max_size=3)
             | st.dictionaries(
@@ -97,7 +97,7 @@ def test_what_is_too_large_is_refused_or_cut_off(raw: zmq.Socket[bytes], bench: 
     assert bench.state.fault is None
 
 
-def test_who_did_not_say_hello_is_not_heard(raw: zmq.Socket[bytes], bench: Connection) -> None:
+def test_a_client_that_is_not_registered_is_refused(raw: zmq.Socket[bytes], bench: Connection) -> None:
     request = {"verb": "open_loop", "client": bench.client}
     raw.send_multipart([b"1", json.dumps(request).encode()])
     assert "not registered under that client number" in answer(raw)["error"]["message"]
@@ -112,15 +112,15 @@ def test_who_did_not_say_hello_is_not_heard(raw: zmq.Socket[bytes], bench: Conne
         assert f"the client version {version}; use the same version" in answer(raw)["error"]["message"]
 
 
-def test_a_client_that_was_forgotten_says_hello_again(served: Served, bench: Connection) -> None:
+def test_a_client_that_was_removed_registers_again(served: Served, bench: Connection) -> None:
     with served.connect() as late:
-        # To the server it is all one whether it forgot a number or never heard it.
+        # For the server, a removed number is the same as an unknown one.
         late.client = str(uuid.uuid4())
         assert late.procedures()
         wait_for(lambda: bench.state.clients >= 2, "both count")
         before = bench.state.clients
         late.client = str(uuid.uuid4())
-        # It asks for nothing: its sign of life alone makes it known.
+        # It sends no request: its heartbeat alone registers it.
         wait_for(lambda: bench.state.clients > before, "it is counted")
 
 
@@ -143,7 +143,7 @@ def test_slow_and_half_messages_on_a_plain_socket_stop_nothing(bench: Connection
 
 def test_a_flood_leaves_the_server_to_others(raw: zmq.Socket[bytes], bench: Connection) -> None:
     for _ in range(20_000):
-        raw.send_multipart([b"1", b"nonsense"])  # whose answers nobody takes
+        raw.send_multipart([b"1", b"nonsense"])  # replies are not read
     began = bench.state.serial
     assert bench.plan("docrime", {"frames": 500}).frames == 500
     wait_for(lambda: bench.state.serial > began + 3, "states go on")
@@ -204,7 +204,7 @@ def test_from_afar_the_samples_come_over_the_wire(bench: Connection) -> None:
         wait_for(lambda: far.connected and far.state.serial > 1, "events")
 
 
-def test_nobody_is_found_where_no_server_is(served: Served) -> None:
+def test_without_a_server_none_is_found(served: Served) -> None:
     with pytest.raises(
         ServerGone, match=r"no server of 'elsewhere' runs here .*start one with 'escape serve"
     ):
@@ -217,7 +217,7 @@ def test_nobody_is_found_where_no_server_is(served: Served) -> None:
 
 @pytest.fixture
 def homes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
-    """Configuration of whoever serves, and of whoever connects, which is that of this process."""
+    """Key folders of the server and of the client; the latter is that of this process."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "client"))
     return tmp_path / "server", tmp_path / "client"
 
@@ -262,7 +262,7 @@ def test_with_keys_from_another_machine_and_nothing_without(
             assert heard(address, public, hidden, other) == 0
         # Whom the operator lets in is in at once, and out again.
         escape_keys(running_servers, "allow", "stranger", stranger[0].decode())
-        wait_for(lambda: heard(address, *stranger, server) > 0, "the stranger is let in")
+        wait_for(lambda: heard(address, *stranger, server) > 0, "the unknown client is allowed")
         escape_keys(running_servers, "remove", "stranger")
         assert heard(address, *stranger, server) == 0
         escape_keys(running_servers, "remove", "client")

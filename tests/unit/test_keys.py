@@ -1,4 +1,4 @@
-"""Keys: made once, readable by nobody else, asked for before anything listens to other machines."""
+"""Keys: created once, readable for their user only, required before a server listens on the network."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_secret_key_that_others_may_read_is_not_used() -> None:
         keys.own_keys()
 
 
-def test_other_addresses_than_the_loopback_need_keys_and_somebody_to_let_in(escape, document) -> None:
+def test_other_addresses_than_the_loopback_need_keys_and_an_allowed_client(escape, document) -> None:
     serve = ("serve", "razor-shwfs", "--port", 40001, "--bind", "0.0.0.0")
     code, _, said = escape(*serve)
     assert code == 2

@@ -1,4 +1,4 @@
-"""One client may write; it must live, and nobody else can speak for it."""
+"""One client has control while it sends messages, and no other connection can use its number."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def book(clock: Clock) -> LeaseManager:
 
 def comes(book: LeaseManager, number: int, route: bytes | None = None) -> RegisteredClient:
     client = f"{number:08x}-0000"
-    hello = RegisterClient(client=client, schema_version=1, name=f"client {number}", host="here", pid=number)
+    registration = RegisterClient(client=client, schema_version=1, name=f"client {number}", host="here", pid=number)
     route = b"r%d" % number if route is None else route
-    book.register_client(hello, route)
+    book.register_client(registration, route)
     return book.record_activity(client, route)
 
 
@@ -75,13 +75,13 @@ def test_a_holder_that_is_silent_loses_it(book: LeaseManager, clock: Clock) -> N
     assert book.seconds_without_holder() == 0.0
 
 
-def test_nobody_speaks_for_another(book: LeaseManager) -> None:
+def test_no_connection_uses_the_number_of_another(book: LeaseManager) -> None:
     one = comes(book, 1)
     book.acquire(one, False)
     with pytest.raises(RequestRefused, match="belongs to another connection"):
-        comes(book, 1, b"somebody else")
+        comes(book, 1, b"another connection")
     with pytest.raises(RequestRefused, match="not registered under that client number"):
-        book.record_activity(one.registration.client, b"somebody else")
+        book.record_activity(one.registration.client, b"another connection")
     with pytest.raises(RequestRefused, match="not registered under that client number"):
         book.record_activity("0000000f-0000", b"x")
 
