@@ -1,4 +1,4 @@
-"""Limits of a served bench with its real drivers: loop open, mirror flat, fault latched, published, cleared."""
+"""Limits of a served bench with its real drivers: loop open, mirror flat, fault latched, cleared."""
 
 from __future__ import annotations
 

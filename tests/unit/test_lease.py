@@ -28,7 +28,9 @@ def book(clock: Clock) -> LeaseManager:
 
 def comes(book: LeaseManager, number: int, route: bytes | None = None) -> RegisteredClient:
     client = f"{number:08x}-0000"
-    registration = RegisterClient(client=client, schema_version=1, name=f"client {number}", host="here", pid=number)
+    registration = RegisterClient(
+        client=client, schema_version=1, name=f"client {number}", host="here", pid=number
+    )
     route = b"r%d" % number if route is None else route
     book.register_client(registration, route)
     return book.record_activity(client, route)
