@@ -169,24 +169,24 @@ class ResumeProcedure(Request):
     verb: Literal["resume_procedure"] = "resume_procedure"
 
 
-class CloseLoop(Request):
+class _LoopRequest(Request):
+    gain: Gain | None = None
+    leak: Share | None = None
+    dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
+
+
+class CloseLoop(_LoopRequest):
     """Close the loop on a matrix until it is opened."""
 
     verb: Literal["close_loop"] = "close_loop"
     matrix: Name
-    gain: Gain | None = None
-    leak: Share | None = None
-    dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
 
 
-class SetLoop(Request):
+class SetLoop(_LoopRequest):
     """Change parameters of the loop, closed or not; absent ones stay. The transition is bumpless."""
 
     verb: Literal["set_loop"] = "set_loop"
     matrix: Name | None = None
-    gain: Gain | None = None
-    leak: Share | None = None
-    dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
 
 
 class LoadProduct(Request):
@@ -229,25 +229,15 @@ REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)
 
 #: Requests that need the lease.
 LEASE_REQUESTS = (
-    StartProcedure,
-    PauseProcedure,
-    ResumeProcedure,
-    CloseLoop,
-    SetLoop,
-    LoadProduct,
-    SetRecording,
-    ClearFault,
-    Shutdown,
-)
+    StartProcedure, PauseProcedure, ResumeProcedure, CloseLoop, SetLoop, LoadProduct, SetRecording,
+    ClearFault, Shutdown,
+)  # fmt: skip
 #: Requests that are allowed to every client at any time.
 SAFETY_REQUESTS = (OpenLoop, Flatten, AbortProcedure)
 #: Requests that change the state.
 STATE_CHANGING_REQUESTS = (
-    *(kind for kind in LEASE_REQUESTS if kind is not Shutdown),
-    AcquireLease,
-    ReleaseLease,
-    *SAFETY_REQUESTS,
-)
+    *(kind for kind in LEASE_REQUESTS if kind is not Shutdown), AcquireLease, ReleaseLease, *SAFETY_REQUESTS,
+)  # fmt: skip
 
 
 #: Errors that keep their class on the wire, by name; every other one arrives as :class:`EscapeError`.

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from escape_hw.server.engine.main import Engine
-from escape_hw.server.engine.state import EngineState, LoopSettings
+from escape_hw.server.engine.state import EngineState, LoopParameters
 from escape_hw.server.ipc.channel import Channel, encode
 from escape_hw.supervision import BackgroundThread
 
@@ -45,7 +45,7 @@ def test_an_engine_that_had_no_time_to_read_does_not_take_the_front_end_for_sile
     reasons: list[str] = []
     engine: Any = Engine.__new__(Engine)
     engine._channel, engine._front_end_timeout_s = channel, 0.1
-    engine._state = EngineState(LoopSettings())
+    engine._state = EngineState(LoopParameters())
     engine._owner = SimpleNamespace(request_safe_state=reasons.append)
     theirs.sendall(encode({"heartbeat": True}))
     silence = BackgroundThread("silence", engine._check_front_end, period_s=0.02)

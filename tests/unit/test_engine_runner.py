@@ -19,16 +19,16 @@ from escape_hw.remote.state import Finish, FinishedRun, Phase
 from escape_hw.server.engine import loop, runner
 from escape_hw.server.engine.loop import LoopRunner
 from escape_hw.server.engine.runner import ProcedureRunner
-from escape_hw.server.engine.state import EngineState, LoopSettings
+from escape_hw.server.engine.state import EngineState, LoopParameters
 from escape_hw.server.engine.state_publisher import StatePublisher
 from escape_hw.server.frontend.engine_process import EngineProcess
 from escape_hw.supervision import Backoff
 
-CLOSED = LoopSettings("im", 0.3, 0.01, 2)
+CLOSED = LoopParameters("im", 0.3, 0.01, 2)
 
 
 def idle_state() -> EngineState:
-    state = EngineState(LoopSettings(gain=0.4), first_run_id=3)
+    state = EngineState(LoopParameters(gain=0.4), first_run_id=3)
     state.set_phase(Phase.IDLE)
     return state
 

@@ -35,13 +35,9 @@ def systems(json: options.Json = False) -> None:
 
 def _describe(config: SystemConfig) -> dict[str, Any]:
     return {
-        "name": config.system.name,
-        "description": config.system.description,
-        "mode": config.system.mode,
-        "sensor": config.sensor.kind,
-        "n_act": config.devices.dm.n_act,
-        "n_modes": config.basis.n_modes,
-    }
+        "name": config.system.name, "description": config.system.description, "mode": config.system.mode,
+        "sensor": config.sensor.kind, "n_act": config.devices.dm.n_act, "n_modes": config.basis.n_modes,
+    }  # fmt: skip
 
 
 @config_app.command("check")

@@ -81,16 +81,8 @@ def _table(rows: Iterable[StreamStatus]) -> RichTable:
     from escape_hw.report.tables import Table
 
     headings = (
-        "stream",
-        "entries",
-        "Hz",
-        "shape",
-        "MB",
-        "writer",
-        "readers",
-        "age s",
-        "interval us p50/p99/max",
-    )
+        "stream", "entries", "Hz", "shape", "MB", "writer", "readers", "age s", "interval us p50/p99/max",
+    )  # fmt: skip
     cells = tuple(_cells(row) for row in rows)
     title = None if cells else "no streams: no server is running (start one with escape serve SYSTEM)"
     return rich_table(Table(headings, cells), title)

@@ -47,9 +47,7 @@ def install(
         context.show(*_format_changes(changes))
         written: list[Path] = []
         if due and not udev.is_writable(due):
-            context.notify(
-                f"not permitted; run: sudo {Path(sys.argv[0]).absolute()} udev install"
-            )
+            context.notify(f"not permitted; run: sudo {Path(sys.argv[0]).absolute()} udev install")
         elif due and (yes or _confirm(context)):
             written = udev.apply_changes(due)
             context.show(*(f"written: {path}" for path in written))

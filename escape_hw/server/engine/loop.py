@@ -20,7 +20,7 @@ from escape_hw.runtime.procedures.task import load_fitting_matrix, require_hardw
 from escape_hw.server.engine.bench_owner import BenchOwner
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.engine.publisher import StreamPublisher
-from escape_hw.server.engine.state import EngineState, LoopSettings
+from escape_hw.server.engine.state import EngineState, LoopParameters
 from escape_hw.server.engine.state_publisher import StatePublisher
 
 log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ class LoopRunner:
         self._product_store = product_store
         self.model_psf: NDArray[np.float32] | None = None
 
-    def prepare(self, request: CloseLoop | LoopSettings) -> tuple[LoopSettings, LoopControl]:
+    def prepare(self, request: CloseLoop | LoopParameters) -> tuple[LoopParameters, LoopControl]:
         """Load the matrix and compute the reconstructor; nothing moves.
 
         Raises
@@ -79,7 +79,7 @@ class LoopRunner:
         self.post(settings, control, self._state.begin_loop(settings, control), on_closed)
 
     def post(
-        self, settings: LoopSettings, control: LoopControl, stop: SignalSafeFlag, on_closed: OnClosed
+        self, settings: LoopParameters, control: LoopControl, stop: SignalSafeFlag, on_closed: OnClosed
     ) -> None:
         """Queue a loop that the engine's state has accepted."""
         self._owner.post(lambda: self._run(settings, control, stop, on_closed))
@@ -102,7 +102,7 @@ class LoopRunner:
         changes = [f"{key} {old[key]} -> {new}" for key, new in asdict(settings).items() if old[key] != new]
         log.info("loop: %s", ", ".join(changes) or "unchanged")
 
-    def _merge(self, request: CloseLoop | SetLoop | LoopSettings) -> LoopSettings:
+    def _merge(self, request: CloseLoop | SetLoop | LoopParameters) -> LoopParameters:
         requested = {key: getattr(request, key) for key in ("matrix", "gain", "leak", "dropped_modes")}
         return replace(
             self._state.snapshot.loop, **{key: value for key, value in requested.items() if value is not None}
@@ -117,7 +117,7 @@ class LoopRunner:
         return product
 
     def _run(
-        self, settings: LoopSettings, control: LoopControl, stop: SignalSafeFlag, on_closed: OnClosed
+        self, settings: LoopParameters, control: LoopControl, stop: SignalSafeFlag, on_closed: OnClosed
     ) -> None:
         """Keep the loop closed until it is opened; in the main thread."""
         state = self._state
@@ -136,7 +136,7 @@ class LoopRunner:
             if end.fault:
                 # The parameters that led to the fault are not the default of the next loop.
                 matrix = state.snapshot.loop.matrix
-                state.set_loop_settings(LoopSettings.from_config(self._config, matrix))
+                state.set_loop_settings(LoopParameters.from_config(self._config, matrix))
                 self._owner.make_safe(f"the loop was opened: {end.fault}", _REMEDY)
         except Aborted:
             log.info("loop open, mirror flat")

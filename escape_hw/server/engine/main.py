@@ -22,7 +22,7 @@ from escape_hw.server.engine.publisher import StreamPublisher
 from escape_hw.server.engine.recording import TelemetryRecording
 from escape_hw.server.engine.request_handler import RequestHandler, Services
 from escape_hw.server.engine.runner import ProcedureRunner
-from escape_hw.server.engine.state import EngineState, LoopSettings
+from escape_hw.server.engine.state import EngineState, LoopParameters
 from escape_hw.server.engine.state_publisher import StatePublisher
 from escape_hw.server.ipc.channel import Channel, EngineSetup
 from escape_hw.server.ipc.log import forward_log
@@ -39,7 +39,7 @@ class Engine:
         self._failure: Exception | None = None
         config = load_text(setup.config_text)
         bench = System.from_config(config)
-        state = self._state = EngineState(LoopSettings.from_config(config), setup.first_run_id)
+        state = self._state = EngineState(LoopParameters.from_config(config), setup.first_run_id)
         publisher = self._publisher = StreamPublisher(config.system.name)
         store = ProductStore((setup.runs, *setup.read_folders))
         recording = self._recording = TelemetryRecording(setup.runs, publisher)

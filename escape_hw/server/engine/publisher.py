@@ -69,13 +69,9 @@ class StreamPublisher:
     def callbacks(self) -> Callbacks:
         """Callbacks for the bench."""
         return Callbacks(
-            frame=self._frame,
-            science=self._science,
-            slopes=self._slopes,
-            command=self._command,
-            residual=self._residual,
-            geometry=self.set_geometry,
-        )
+            frame=self._frame, science=self._science, slopes=self._slopes, command=self._command,
+            residual=self._residual, geometry=self.set_geometry,
+        )  # fmt: skip
 
     @property
     def entries(self) -> tuple[StreamEntry, ...]:
@@ -153,9 +149,6 @@ class StreamPublisher:
     def _write(
         self, name: str, data: NDArray[Any], index: int, exposed_ns: int = 0, meta: bytes = b""
     ) -> None:
-        ring = self._rings.get(name)
-        if ring is None or data.nbytes > ring.capacity:
-            ring = self._ring(name, data)
-            if ring is None:
-                return
-        ring.write(data, index, exposed_ns, time.monotonic_ns(), meta)
+        ring = self._ring(name, data)
+        if ring is not None:
+            ring.write(data, index, exposed_ns, time.monotonic_ns(), meta)

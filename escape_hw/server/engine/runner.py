@@ -21,7 +21,7 @@ from escape_hw.server.engine.bench_owner import BenchOwner
 from escape_hw.server.engine.loop import LoopRunner
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.engine.publisher import StreamPublisher
-from escape_hw.server.engine.state import EngineState, LoopSettings, RunTicket
+from escape_hw.server.engine.state import EngineState, LoopParameters, RunTicket
 from escape_hw.server.engine.state_publisher import StatePublisher
 
 log = logging.getLogger(__name__)
@@ -160,7 +160,7 @@ class ProcedureRunner:
                 except EscapeError as error:
                     log.error("the product '%s' of run %d is not available: %s", key, finished.id, error)
 
-    def _finish(self, finished: FinishedRun, loop_before: LoopSettings | None) -> None:
+    def _finish(self, finished: FinishedRun, loop_before: LoopParameters | None) -> None:
         """End the run; the loop is closed again as it was, unless the run was stopped or failed."""
 
         def log_refusal(error: EscapeError | None) -> None:

@@ -19,7 +19,7 @@ from escape_hw.remote.state import ActiveRun, FaultState, Finish, FinishedRun, P
 
 
 @dataclass(frozen=True, slots=True)
-class LoopSettings:
+class LoopParameters:
     """Parameters of the loop; ``matrix`` is a name in the product store."""
 
     matrix: str = ""
@@ -28,7 +28,7 @@ class LoopSettings:
     dropped_modes: int = 0
 
     @classmethod
-    def from_config(cls, config: SystemConfig, matrix: str = "") -> LoopSettings:
+    def from_config(cls, config: SystemConfig, matrix: str = "") -> LoopParameters:
         """The configured parameters."""
         loop = config.loop
         return cls(matrix, loop.gain, loop.leak, loop.dropped_modes)
@@ -52,7 +52,7 @@ class EngineSnapshot:
         Newest problem of each device, by its key in ``[devices]``.
     """
 
-    loop: LoopSettings
+    loop: LoopParameters
     phase: Phase = Phase.STARTING
     fault: FaultState | None = None
     active_run: ActiveRun | None = None
@@ -71,7 +71,7 @@ class RunTicket:
 
     run: ActiveRun
     stop: SignalSafeFlag
-    loop_before: LoopSettings | None
+    loop_before: LoopParameters | None
 
 
 S = TypeVar("S", bound="EngineState")
@@ -96,7 +96,7 @@ class EngineState:
     Readers take :attr:`snapshot`. Each transition is one method, atomic under the only lock.
     """
 
-    def __init__(self, loop: LoopSettings, first_run_id: int = 1) -> None:
+    def __init__(self, loop: LoopParameters, first_run_id: int = 1) -> None:
         self._now = EngineSnapshot(loop)
         self._stop = SignalSafeFlag()
         self._next_run_id = first_run_id
@@ -172,7 +172,7 @@ class EngineState:
         return True
 
     # ------------------------------------------------------------ procedures
-    def check_can_start(self, needs_loop: bool) -> LoopSettings | None:
+    def check_can_start(self, needs_loop: bool) -> LoopParameters | None:
         """Check that a procedure can start; returns the loop to close again after it.
 
         RequestRefused when a fault is latched or something else runs.
@@ -219,7 +219,7 @@ class EngineState:
 
     @_atomic
     def finish_run(
-        self, finished: FinishedRun, next_loop: tuple[LoopSettings, LoopControl] | None = None
+        self, finished: FinishedRun, next_loop: tuple[LoopParameters, LoopControl] | None = None
     ) -> SignalSafeFlag | None:
         """End the run and, where ``next_loop`` is given and nothing speaks against it, begin that loop.
 
@@ -281,12 +281,12 @@ class EngineState:
 
     # ------------------------------------------------------------ the loop outside procedures
     @_atomic
-    def begin_loop(self, settings: LoopSettings, control: LoopControl) -> SignalSafeFlag:
+    def begin_loop(self, settings: LoopParameters, control: LoopControl) -> SignalSafeFlag:
         """Reserve the engine for a loop, if it is idle; returns its stop flag."""
         self._require_idle()
         return self._begin_loop(settings, control)
 
-    def _begin_loop(self, settings: LoopSettings, control: LoopControl) -> SignalSafeFlag:
+    def _begin_loop(self, settings: LoopParameters, control: LoopControl) -> SignalSafeFlag:
         self._stop = SignalSafeFlag()
         self._set(loop=settings, loop_control=control, phase=Phase.LOOP, needs_loop=True)
         return self._stop
@@ -302,6 +302,6 @@ class EngineState:
         )  # fmt: skip
 
     @_atomic
-    def set_loop_settings(self, settings: LoopSettings) -> None:
+    def set_loop_settings(self, settings: LoopParameters) -> None:
         """Store the parameters of the loop."""
         self._set(loop=settings)

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from escape_hw.errors import StorageError
-from escape_hw.streams.recording.recorder import MIN_FREE_BYTES, RecordingState, StreamRecorder
+from escape_hw.streams.recording.recorder import MIN_FREE_BYTES, RecordingProgress, StreamRecorder
 from escape_hw.supervision import BackgroundThread, ChildProcess, watch_standard_input
 
 log = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ class RecorderProcess:
         self, folder: Path, streams: Mapping[str, str], *, min_free_bytes: int = MIN_FREE_BYTES
     ) -> None:
         self.folder = folder
-        self._state = RecordingState()
+        self._state = RecordingProgress()
         request = {"folder": str(folder), "streams": dict(streams), "min_free_bytes": min_free_bytes}
         try:
             self._process = ChildProcess(
@@ -53,7 +53,7 @@ class RecorderProcess:
         self._listener.start()
 
     @property
-    def state(self) -> RecordingState:
+    def state(self) -> RecordingProgress:
         """Progress about a second ago."""
         return self._state
 
@@ -62,7 +62,7 @@ class RecorderProcess:
         """Whether the process has not ended."""
         return self._process.running
 
-    def stop(self) -> RecordingState:
+    def stop(self) -> RecordingProgress:
         """Let the process write its queue and end; returns the final state. May be repeated."""
         self._process.stdin.close()
         if not self._process.wait_or_kill(_STOP_TIMEOUT_S):
@@ -76,7 +76,7 @@ class RecorderProcess:
         """Read the states that the process prints, until it ends."""
         with self._process.stdout as out:
             for line in out:
-                self._state = RecordingState(**json.loads(line))
+                self._state = RecordingProgress(**json.loads(line))
         if (code := self._process.wait()) and not self._state.fault:
             self._state.fault = f"{self.folder}: the recorder ended with code {code}"
             log.error(self._state.fault)
@@ -88,7 +88,7 @@ def main() -> None:
     request = json.loads(sys.argv[1])
     stop = watch_standard_input()
 
-    def print_state(state: RecordingState) -> None:
+    def print_state(state: RecordingProgress) -> None:
         try:
             print(json.dumps(asdict(state)), flush=True)
         except BrokenPipeError:

@@ -37,7 +37,7 @@ MIN_FREE_BYTES = 256 << 20
 
 
 @dataclass(slots=True)
-class RecordingState:
+class RecordingProgress:
     """Progress of a recording.
 
     Parameters
@@ -112,7 +112,7 @@ class StreamRecorder:
         self, folder: Path, streams: Mapping[str, str], *, min_free_bytes: int = MIN_FREE_BYTES
     ) -> None:
         self.folder, self._min_free_bytes = folder, min_free_bytes
-        self.state = RecordingState()
+        self.state = RecordingProgress()
         self._queue: queue.SimpleQueue[_Block | None] = queue.SimpleQueue()
         self._queued_bytes, self._lock = 0, threading.Lock()
         folder.mkdir(parents=True, exist_ok=True)
@@ -128,8 +128,8 @@ class StreamRecorder:
     def run(
         self,
         is_stopped: Callable[[], bool],
-        on_state: Callable[[RecordingState], object] = lambda state: None,
-    ) -> RecordingState:
+        on_state: Callable[[RecordingProgress], object] = lambda state: None,
+    ) -> RecordingProgress:
         """Record until ``is_stopped``, a full disk or the end of all streams; ``on_state`` gets the state."""
         writer = BackgroundThread("recorder", self._write)
         writer.start()
