@@ -142,7 +142,7 @@ def running(**changes: Any) -> State:
         "phase": Phase.LOOP,
         "lease": LEASE,
         "devices": DEVICES,
-        "rates": FrameCounters(frame_hz=500.0, frames=123456, lost=2),
+        "rates": FrameCounters(frame_hz=500.0, frames=123456, lost_frames=2),
         "illumination": Illumination(saturated=0.0004, peak=0.97),
         "mirror": MirrorState(rms=0.082, peak=0.412, saturated_share=0.0),
         "latency": LatencyState(p50=312.0, p99=401.0, max=880.0, jitter_p99=64.0),
