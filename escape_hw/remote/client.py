@@ -60,7 +60,7 @@ class RemoteRun:
         Name of the procedure.
     """
 
-    def __init__(self, connection: ReadOnlyConnection, id: int, name: str) -> None:
+    def __init__(self, connection: Connection, id: int, name: str) -> None:
         self._connection, self.id, self.name = connection, id, name
 
     def __repr__(self) -> str:
@@ -164,6 +164,12 @@ def _progress(running: ActiveRun) -> Progress:
     )
 
 
+def _program() -> str:
+    """Default name of this client: the name of its script, or ``notebook``."""
+    name = os.path.basename(sys.argv[0])
+    return "notebook" if name.startswith("ipykernel") else name or "python"
+
+
 #: Longest wait for an ordinary reply, and for one that is sent when the mirror is flat, seconds.
 TIMEOUT_S, SLOW_TIMEOUT_S = 3.0, 30.0
 #: Silence after which a server counts as disconnected; it publishes its state five times a second.
@@ -173,8 +179,10 @@ _LINES = 5000
 _EVENT_S = 10.0
 
 
-class ReadOnlyConnection:
-    """Read-only connection to a server; implements :class:`~escape_hw.remote.source.DataSource`.
+class Connection:
+    """A connection to a server, see :func:`connect`; implements :class:`~escape_hw.remote.source.DataSource`.
+
+    It controls the server while it holds the lease.
 
     Parameters
     ----------
@@ -239,9 +247,14 @@ class ReadOnlyConnection:
 
     # ------------------------------------------------------------ life
     def close(self) -> None:
-        """Close the connection; the server continues."""
+        """Release the lease and close the connection; the server continues.
+
+        A running procedure needs another client in control.
+        """
         if self._closed:
             return
+        if self.holds_lease and self.connected:
+            self.release()
         self._closed = True
         self._link.close()
         self._readers.close()
@@ -392,22 +405,6 @@ class ReadOnlyConnection:
     def _finished_run(self, run: int) -> FinishedRun | None:
         last = self._state.last_run
         return last if last is not None and last.id == run else self._ended.get(run)
-
-
-def _program() -> str:
-    """Default name of this client: the name of its script, or ``notebook``."""
-    name = os.path.basename(sys.argv[0])
-    return "notebook" if name.startswith("ipykernel") else name or "python"
-
-
-class Connection(ReadOnlyConnection):
-    """A connection to a server, see :func:`connect`; it controls the server while it holds the lease."""
-
-    def close(self) -> None:
-        """Release the lease and close the connection; a running procedure needs another client in control."""
-        if self.holds_lease and self.connected:
-            self.release()
-        super().close()
 
     # ------------------------------------------------------------ the lease
     def acquire(self, take_over: bool = False) -> Lease:

@@ -59,26 +59,18 @@ class RingStats:
     ----------
     written
         Entries written since its creation.
-    index, shape, dtype, arrived_ns
+    shape, dtype, arrived_ns
         Of the newest entry; an empty shape, ``""`` and 0 before the first.
     intervals
         Histogram of the intervals between entries in the bins of :mod:`~escape_hw.streams.timing`
         ``(BINS,)``, since its creation.
-    closed
-        Whether the writer has closed the ring.
     """
 
-    name: str
-    pid: int
-    slots: int
-    capacity: int
     written: int
-    index: int
     shape: tuple[int, ...]
     dtype: str
     arrived_ns: int
     intervals: NDArray[np.uint64]
-    closed: bool
 
 
 class RingReader:
@@ -144,7 +136,7 @@ class RingReader:
             if count == 0:
                 return None
             number = count - 1
-            if self._index(number) == after:
+            if self._entry(number)[0] == after:
                 if self.written == count:
                     return None
                 continue  # another entry was written meanwhile
@@ -218,14 +210,11 @@ class RingReader:
         """Statistics, without copying an entry."""
         count = self.written
         entry = self._entry(count - 1) if count else (0,) * 12
-        index, arrived, code, dimensions = entry[0], entry[2], entry[4], entry[5]
+        arrived, code, dimensions = entry[2], entry[4], entry[5]
         shape = entry[8 : 8 + min(dimensions, layout.MAX_DIMENSIONS)]
         dtype = layout.DTYPES[code % len(layout.DTYPES)].str[1:] if count else ""
         intervals = np.array(self._words[layout.INTERVALS : layout.INTERVALS + BINS], dtype=np.uint64)
-        return RingStats(
-            self.name, self.pid, self.slots, self.capacity, count, index, shape, dtype, arrived, intervals,
-            self.closed,
-        )  # fmt: skip
+        return RingStats(count, shape, dtype, arrived, intervals)
 
     def close(self) -> None:
         """Unmap the memory; the ring stays."""
@@ -244,11 +233,7 @@ class RingReader:
         return layout.HEADER_BYTES + (number % self.slots) * self._stride
 
     def _entry(self, number: int) -> tuple[int, ...]:
-        entry: tuple[int, ...] = layout.ENTRY.unpack_from(self._memory, self._at(number) + layout.ENTRY_AT)
-        return entry
-
-    def _index(self, number: int) -> int:
-        return int(self._entry(number)[0])
+        return layout.ENTRY.unpack_from(self._memory, self._at(number) + layout.ENTRY_AT)
 
     def _copy(self, number: int) -> Sample | None:
         """Copy an entry by its number; ``None`` when it was overwritten."""
@@ -302,8 +287,6 @@ class ReaderCache:
             reader.close()
         self._readers.clear()
 
-
-__all__ = ["SLOTS", "RingReader", "RingStats", "RingWriter"]
 
 #: Default number of entries of a ring.
 SLOTS = 8

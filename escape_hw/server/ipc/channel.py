@@ -84,27 +84,19 @@ class Channel:
     ----------
     connection
         A connected socket.
-
-    Attributes
-    ----------
-    dropped
-        Messages that were dropped because the front end reads too slowly.
     """
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
         self._queue: queue.Queue[bytes | None] = queue.Queue(_MAX_QUEUED)
-        self.dropped = 0
         self._last_message_s = time.monotonic()
         self._sender = BackgroundThread("sender", self._send)
         self._sender.start()
 
     def post(self, message: Mapping[str, Any]) -> None:
-        """Queue a message; dropped and counted when the queue is full."""
-        try:
+        """Queue a message; it is dropped when the front end reads too slowly."""
+        with contextlib.suppress(queue.Full):
             self._queue.put_nowait(encode(message))
-        except queue.Full:
-            self.dropped += 1
 
     def messages(self) -> Iterator[dict[str, Any]]:
         """Yield the messages that arrive, until the other side closes the connection."""
