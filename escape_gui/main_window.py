@@ -282,7 +282,7 @@ class MainWindow(QMainWindow):
         for dock in self.docks.values():
             dock.show_health()
         self.state_notifier.update(state, connected=now.connected)
-        telemetry = state.telemetry
+        telemetry = state.recording
         self._set_status(
             "recording",
             f"recording {telemetry.written} frames, {telemetry.dropped} dropped"
@@ -302,7 +302,7 @@ class MainWindow(QMainWindow):
         self.context.session.ask("take control", lambda server: server.acquire(take_over=held))
 
     def toggle_recording(self) -> None:
-        on = not self.context.session.source.state.telemetry.recording
+        on = not self.context.session.source.state.recording.recording
         self.context.session.ask(
             "record telemetry" if on else "stop recording", lambda server: server.record(on)
         )

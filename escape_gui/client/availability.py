@@ -69,12 +69,12 @@ def reason_no_write(now: RequestContext) -> str:
 
 def reason_no_abort(now: RequestContext) -> str:
     """Why there is nothing to abort."""
-    return reason_no_request(now) or ("" if now.state.procedure else "no procedure is running")
+    return reason_no_request(now) or ("" if now.state.active_run else "no procedure is running")
 
 
 def reason_no_pause(now: RequestContext) -> str:
     """Why the procedure cannot be paused or resumed."""
-    return reason_no_write(now) or ("" if now.state.procedure else "no procedure is running")
+    return reason_no_write(now) or ("" if now.state.active_run else "no procedure is running")
 
 
 def reason_no_take_control(now: RequestContext) -> str:

@@ -73,9 +73,9 @@ class LiveSource:
         """Available procedures; empty until they were fetched."""
         return self._procedures
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """Check the arguments of a procedure; blocks until the server answers."""
-        return self.connection.check(procedure, arguments)
+        return self.connection.plan(procedure, arguments)
 
     def fetch(self) -> None:
         """Make the slow requests; called by the thread of :class:`ServerAttachment`."""

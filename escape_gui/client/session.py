@@ -122,7 +122,7 @@ class EmptySource:
     def procedures(self) -> Sequence[ProcedureEntry]:
         return ()
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         raise EscapeError("not connected to a server")
 
 
@@ -159,7 +159,7 @@ class Session(QObject):
 
     def toggle_pause(self) -> None:
         """Request to pause the running procedure, or to resume it if it is paused."""
-        running = self.source.state.procedure
+        running = self.source.state.active_run
         if running is not None and running.paused:
             self.ask("resume", lambda server: server.resume())
         else:

@@ -101,7 +101,7 @@ class CameraPanel(Panel):
         self.quiver.set_geometry(geometry)
 
     def on_state(self, state: State) -> None:
-        light = state.light
+        light = state.illumination
         peak, saturated = f"{100 * light.peak:3.0f} %", f"{100 * light.saturated:5.2f} %"
         if not has_frames(state):
             peak = saturated = UNKNOWN_VALUE

@@ -54,7 +54,7 @@ class GainsPanel(Panel):
         self.setFocusProxy(self.rounds)
 
     def on_state(self, state: State) -> None:
-        self._running = state.procedure is not None
+        self._running = state.active_run is not None
         self.context.session.library.request(state.products)
 
     def on_sample(self, stream: str, sample: Sample) -> None:

@@ -115,7 +115,7 @@ class LoopPanel(Panel):
         self.loop_indicator.set_status(
             Level.ACTIVE if loop.closed else Level.NEUTRAL, "closed" if loop.closed else "open"
         )
-        self.modes.setText(f"{loop.modes} modes controlled" if loop.modes else "")
+        self.modes.setText(f"{loop.n_modes} modes controlled" if loop.n_modes else "")
         values = {
             "matrix": loop.matrix or "none", "gain": f"{loop.gain:.4f}", "leak": f"{loop.leak:.4f}",
             "dropped_modes": str(loop.dropped_modes),
@@ -149,8 +149,8 @@ class LoopPanel(Panel):
             obstacle = "the loop is closed"
         elif not self._matrices:
             obstacle = "there is no interaction matrix yet: calibrate, or load one"
-        elif now.state.procedure is not None:
-            obstacle = f"{now.state.procedure.name} is running"
+        elif now.state.active_run is not None:
+            obstacle = f"{now.state.active_run.name} is running"
         else:
             obstacle = ""
         _set_available(self.close_button, "Close the loop with the setpoints.", reason or obstacle)

@@ -78,7 +78,7 @@ class MirrorPanel(Panel):
         values = {
             "rms": f"{mirror.rms:.4f}",
             "peak": f"{mirror.peak:.4f}",
-            "clipped": f"{100 * mirror.clipped:.2f}",
+            "clipped": f"{100 * mirror.saturated_share:.2f}",
         }
         for name, text in values.items():
             self.readouts[name].show_value(text if is_measured(state) else UNKNOWN_VALUE)

@@ -113,7 +113,7 @@ class ModesPanel(Panel):
     # ------------------------------------------------------------ data
     def on_state(self, state: State) -> None:
         """Request the products; at the end of a measurement its product replaces the live matrix."""
-        running = state.procedure is not None
+        running = state.active_run is not None
         self.dirty |= running != self._running
         self._running = running
         self.context.session.library.request(state.products)

@@ -136,10 +136,10 @@ class ProcedurePanel(Panel):
     def on_state(self, state: State) -> None:
         self._state = state
         self.form.set_matrix_choices(form_text.matrices(state.products))
-        running = state.procedure
+        running = state.active_run
         if running is None:
             self._matrix.clear()
-        share = 0.0 if running is None or not running.total else running.done / running.total
+        share = 0.0 if running is None or not running.total else running.completed / running.total
         self.bar.setVisible(running is not None)
         self.bar.setRange(0, 1000 if running is None or running.total else 0)
         self.bar.setValue(round(1000 * min(1.0, share)))
@@ -148,8 +148,8 @@ class ProcedurePanel(Panel):
         self.pause.setText("Resume" if running is not None and running.paused else "Pause")
         # Hidden during a run, to leave more room for the form.
         self._result_area.setVisible(self._ended is not None and running is None)
-        if state.last is not None and (self._ended is None or state.last.id != self._ended.id):
-            self._show_ended(state.last)
+        if state.last_run is not None and (self._ended is None or state.last_run.id != self._ended.id):
+            self._show_ended(state.last_run)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         self._matrix[stream] = sample.data
@@ -221,7 +221,7 @@ class ProcedurePanel(Panel):
         self._checked_arguments = arguments
         requests.ask(
             "check the arguments",
-            lambda server: server.check(name, arguments),
+            lambda server: server.plan(name, arguments),
             lambda plan: self._on_plan(name, arguments, plan),
             lambda why: self._show_plan(f"⚠ {why}", "bad"),
             quiet=True,
@@ -243,7 +243,7 @@ class ProcedurePanel(Panel):
 
     def _enable(self) -> None:
         now = self.context.session.request_context
-        busy = "a procedure is running" if now.state.procedure is not None else ""
+        busy = "a procedure is running" if now.state.active_run is not None else ""
         not_checked = "" if self._plan is not None else "the arguments are not checked yet"
         for button, tip, reason in (
             (self.check, "Check the arguments and show the plan; nothing moves.", reason_no_request(now)),

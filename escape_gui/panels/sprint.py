@@ -84,8 +84,8 @@ class SprintPanel(Panel):
     # ------------------------------------------------------------ data
     def on_state(self, state: State) -> None:
         """Take convergence and warnings from the result of a run that fitted or tracked a registration."""
-        self._running = state.procedure is not None
-        last = state.last
+        self._running = state.active_run is not None
+        last = state.last_run
         if last is None or last.id == self._last_result_id or self._running:
             return
         self._last_result_id = last.id

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_gui.replay.streams import main_calibration, recorded_streams
+from escape_hw.api.outlines import outlines
 from escape_hw.errors import ConfigError
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
@@ -28,7 +29,6 @@ from escape_hw.remote.state import (
     State,
     StreamEntry,
 )
-from escape_hw.server.engine.bench_status import outlines
 
 if TYPE_CHECKING:
     from escape_hw.report.content import RunContent
@@ -102,7 +102,7 @@ class ReplaySource:
             seed=int(document.get("seed") or 0),
             phase=Phase.STOPPED,
             loop=_loop_state(run),
-            last=FinishedRun(
+            last_run=FinishedRun(
                 id=0,
                 name=name,
                 finish=finish,
@@ -125,7 +125,7 @@ class ReplaySource:
     def procedures(self) -> Sequence[ProcedureEntry]:
         return ()
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """Raise `ConfigError`: no procedure can be started in a replay."""
         raise ConfigError(READ_ONLY_REASON)
 
@@ -142,7 +142,7 @@ def _geometry_of(run: RunContent) -> Geometry:
     if run.layout is not None:
         parts["layout"] = _rows(run.layout)
     if run.places_m is not None:
-        parts["places_m"] = tuple((float(x), float(y)) for x, y in run.places_m)
+        parts["positions_m"] = tuple((float(x), float(y)) for x, y in run.places_m)
     return Geometry.model_validate(parts)
 
 

@@ -47,7 +47,7 @@ class ActuatorImage:
             numbers = np.full(mask.shape, -1)
             numbers[mask] = np.arange(int(mask.sum()))
         else:
-            numbers = _nearest_actuator(np.asarray(geometry.places_m, float).reshape(-1, 2))
+            numbers = _nearest_actuator(np.asarray(geometry.positions_m, float).reshape(-1, 2))
         self.numbers = numbers
         self.n_act = int(numbers.max()) + 1 if numbers.size else 0
 

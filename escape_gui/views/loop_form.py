@@ -49,8 +49,8 @@ class LoopSettingsEdit:
             SetLoop(client=_PLACEHOLDER_CLIENT, **self.changed(loop))
         except ValidationError as error:
             errors += [f"{FIELDS[str(one['loc'][0])]}: {one['msg']}" for one in error.errors()]
-        all_modes = loop.modes + loop.dropped_modes
-        if loop.modes and self.dropped_modes >= all_modes:
+        all_modes = loop.n_modes + loop.dropped_modes
+        if loop.n_modes and self.dropped_modes >= all_modes:
             errors.append(f"dropped modes: {self.dropped_modes} of {all_modes} leaves none to control")
         return tuple(errors)
 

@@ -118,10 +118,10 @@ def plan_lines(plan: ProcedurePlan) -> list[str]:
 
 def progress_line(running: ActiveRun) -> str:
     """How far a procedure is."""
-    many = "s" if (running.total or running.done) != 1 else ""
+    many = "s" if (running.total or running.completed) != 1 else ""
     # What goes on until it is stopped has no total.
     whole = f" of {running.total}" if running.total else ""
-    line = f"{running.stage or running.name}: {running.done}{whole} {running.unit}{many}"
+    line = f"{running.stage or running.name}: {running.completed}{whole} {running.unit}{many}"
     if running.paused:
         return f"Paused. {line}"
     if running.remaining_s is not None and math.isfinite(running.remaining_s):

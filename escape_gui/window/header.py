@@ -110,7 +110,7 @@ class HeaderBar(QWidget):
         latency = state.latency
         values = {
             "rate": f"{state.rates.frame_hz:.1f}",
-            "lost": f"{state.rates.lost:d}",
+            "lost": f"{state.rates.lost_frames:d}",
             "rms": f"{state.mirror.rms:.3f}",
             "peak": f"{state.mirror.peak:.3f}",
             # Zero if no command was sent in the last second.
@@ -133,7 +133,7 @@ class HeaderBar(QWidget):
         if not (known and has_frames(state)):
             self.saturation.set_status(Level.NEUTRAL, f"saturated {UNKNOWN_VALUE}")
             return
-        saturated = state.light.saturated
+        saturated = state.illumination.saturated
         level = Level.GOOD if saturated < SATURATION_WARNING else Level.WARNING
         self.saturation.set_status(
             Level.ERROR if saturated >= SATURATION_ERROR else level, f"saturated {100 * saturated:.2f} %"
@@ -192,6 +192,6 @@ class FaultBanner(QWidget):
         fault = state.fault
         if fault is not None:
             text = f"{fault.reason} · {fault.at_utc}"
-            self._text.setText(f"{text}\n{fault.way_out}" if fault.way_out else text)
+            self._text.setText(f"{text}\n{fault.remedy}" if fault.remedy else text)
         # After the text was set: the height depends on it.
         self.setVisible(fault is not None)

@@ -114,7 +114,7 @@ class StateNotifier:
             return
         if state.fault is not None and state.fault != before.fault:
             self._bar.show_message(Level.ERROR, "Fault, mirror made safe", state.fault.reason)
-        if state.last is not None and state.last != before.last:
-            last = state.last
+        if state.last_run is not None and state.last_run != before.last_run:
+            last = state.last_run
             text = "\n".join(part for part in (last.message, last.folder) if part)
             self._bar.show_message(_LEVELS[last.finish], f"{last.name} {last.finish.value}", text)

@@ -94,7 +94,7 @@ def secondary() -> Geometry:
         angles = 2 * np.pi * np.arange(count) / count
         places += [(0.03 * ring * float(np.cos(a)), 0.03 * ring * float(np.sin(a))) for a in angles]
     pupils = ((45.0, 48.0, 32.0), (128.0, 46.0, 32.0), (65.0, 152.0, 32.0), (130.0, 130.0, 32.0))
-    return Geometry(valid=rows_of(disc(64)), places_m=tuple(places[:336]), outlines_px=pupils, n_modes=100)
+    return Geometry(valid=rows_of(disc(64)), positions_m=tuple(places[:336]), outlines_px=pupils, n_modes=100)
 
 
 def spots(geometry: Geometry, size: int = 400, seed: int = 0) -> NDArray[np.uint16]:
@@ -142,17 +142,17 @@ def running(**changes: Any) -> State:
         "phase": Phase.LOOP,
         "lease": LEASE,
         "devices": DEVICES,
-        "rates": FrameCounters(frame_hz=500.0, frames=123456, lost=2),
-        "light": Illumination(saturated=0.0004, peak=0.97),
-        "mirror": MirrorState(rms=0.082, peak=0.412, clipped=0.0),
-        "latency": LatencyState(p50=312.0, p99=401.0, largest=880.0, jitter_p99=64.0),
+        "rates": FrameCounters(frame_hz=500.0, frames=123456, lost_frames=2),
+        "illumination": Illumination(saturated=0.0004, peak=0.97),
+        "mirror": MirrorState(rms=0.082, peak=0.412, saturated_share=0.0),
+        "latency": LatencyState(p50=312.0, p99=401.0, max=880.0, jitter_p99=64.0),
         "loop": LoopState(
             closed=True,
             matrix="escape",
             gain=0.425,
             leak=0.026,
             dropped_modes=14,
-            modes=80,
+            n_modes=80,
             residual_nm=44.0,
             strehl=0.365,
             strehl_sigma=0.004,
@@ -186,7 +186,7 @@ class ScriptedSource:
 
     def fail(self, reason: str = "no frames for 0.5 s") -> None:
         """Enter the fault state."""
-        fault = FaultState(reason=reason, at_utc="2026-11-21T21:00:00", way_out="look at the camera's cable")
+        fault = FaultState(reason=reason, at_utc="2026-11-21T21:00:00", remedy="look at the camera's cable")
         lost = DEVICES[1].model_copy(update={"health": DeviceHealth.LOST, "message": "unplugged"})
         loop = self.state.loop.model_copy(update={"closed": False})
         self.change(phase=Phase.FAULT, fault=fault, devices=(DEVICES[0], lost, DEVICES[2]), loop=loop)
@@ -201,7 +201,7 @@ class ScriptedSource:
         """Add an entry to every stream that the panels read."""
         rng = np.random.default_rng(seed)
         n_slopes = 2 * sum(row.count("1") for row in self.geometry_data.valid)
-        n_act = sum(row.count("1") for row in self.geometry_data.layout) or len(self.geometry_data.places_m)
+        n_act = sum(row.count("1") for row in self.geometry_data.layout) or len(self.geometry_data.positions_m)
         self.push("frames", spots(self.geometry_data, seed=seed), top=1023.0)
         self.push("slopes", rng.normal(0, 0.4, n_slopes))
         self.push("commands", rng.normal(0, 0.1, n_act))
@@ -211,7 +211,7 @@ class ScriptedSource:
         latencies = rng.gamma(60, 5.2, 4000)
         spacing = rng.normal(2000, 18, 4000)
         self.push("latency_histogram", np.stack([counted(*latencies), counted(*spacing)]))
-        if self.geometry_data.places_m:
+        if self.geometry_data.positions_m:
             self.push("measured_positions", rng.normal(0, 4e-7, n_act))
         line = LogLine(
             number=len(self.lines),
@@ -240,7 +240,7 @@ class ScriptedSource:
         """The procedures set by the test."""
         return self.entries
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """A plan with the requested number of frames."""
         frames = int(arguments.get("frames") or 1000)
         return ProcedurePlan(
@@ -272,7 +272,7 @@ class ScriptedControl:
             raise AttributeError(verb)
         return lambda *args, **kwargs: self._note(verb, **({"args": args} if args else {}), **kwargs)
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """A plan."""
-        self._note("check", procedure=procedure, arguments=arguments)
-        return ScriptedSource().check(procedure, arguments)
+        self._note("plan", procedure=procedure, arguments=arguments)
+        return ScriptedSource().plan(procedure, arguments)

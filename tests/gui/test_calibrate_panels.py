@@ -62,7 +62,7 @@ PROCEDURES = (
 )
 MATRIX = fake.calibration("docrime-whitened", n=24, n_modes=30).matrix
 RUNNING = ActiveRun(
-    id=3, name="escape", arguments={}, stage="DO-CRIME", done=610, total=1000, remaining_s=252.0
+    id=3, name="escape", arguments={}, stage="DO-CRIME", completed=610, total=1000, remaining_s=252.0
 )
 
 
@@ -118,7 +118,7 @@ def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
     panel = calibrate.panels["modes"]
     look(calibrate)
     assert panel.shows_placeholder
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     measure(source, 1e-4)
     look(calibrate)
     assert not panel.shows_placeholder
@@ -180,7 +180,7 @@ def test_tiles_use_the_available_space(width, height, columns):
 
 def test_pages_change(calibrate, source):
     panel = calibrate.panels["modes"]
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     measure(source, 1.0)
     look(calibrate)
     panel.mosaic.setMaximumSize(240, 160)
@@ -201,7 +201,7 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     estimate = fake.registration()
     path = np.array([step.registration.to_array() for step in estimate.iterations])
     norm = np.array([step.step_norm for step in estimate.iterations])
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     source.push("registration", path[:6] * TO_STREAM_UNITS)
     source.push("registration_sigma", np.full(5, np.nan))
     source.push("step_norm", norm[:6])
@@ -212,14 +212,15 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     source.push("step_norm", norm)
     document = calibration_document(fake.calibration("escape"))
     ended = FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document)
-    source.change(phase=Phase.IDLE, procedure=None, last=ended)
+    source.change(phase=Phase.IDLE, active_run=None, last_run=ended)
     look(calibrate)
     assert panel._indicator.text == "converged, 18 iterations"
     assert "±" in panel._values[0].text()
     assert "tangential_scaling is consistent with zero" in panel._notes.text()
     # Runs without a registration do not change the state of the fit.
     for k, name, told in ((4, "push-pull", None), (5, "gains", False)):
-        source.change(last=FinishedRun(id=k, name=name, finish=Finish.ABORTED, document={"converged": told}))
+        ended = FinishedRun(id=k, name=name, finish=Finish.ABORTED, document={"converged": told})
+        source.change(last_run=ended)
         look(calibrate)
         assert panel._indicator.text == "converged, 18 iterations"
     press(panel.units)
@@ -242,7 +243,7 @@ def test_a_drift_is_shown(calibrate, source):
 def test_gains_appear_round_by_round(calibrate, source):
     panel = calibrate.panels["gains"]
     gains = fake.optical_gains(0.7)
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     source.push("gains", gains.value, stage="round 2")
     source.push("gains_sigma", gains.sigma)
     source.push("gains_smooth", gains.trend)
@@ -269,7 +270,7 @@ def test_a_procedure_is_started_from_the_form(calibrate, source, control):
     panel.form.set_value("pokes", "anticorrelated")
     until(panel.start.isEnabled, calibrate)
     arguments = {"frames": 200, "pokes": "anticorrelated"}
-    assert ("check", {"procedure": "escape", "arguments": arguments}) in control.asked
+    assert ("plan", {"procedure": "escape", "arguments": arguments}) in control.asked
     assert "frames" in panel.plan.text()
     assert "% of stroke" in panel.plan.text()
     press(panel.start)
@@ -305,7 +306,7 @@ def test_a_procedure_is_monitored_paused_and_aborted(calibrate, source, control)
     assert not panel.abort.isEnabled()
     assert "no procedure is running" in panel.abort.toolTip()
     measure(source, 1.0)
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     look(calibrate)
     source.change()
     look(calibrate)
@@ -315,7 +316,7 @@ def test_a_procedure_is_monitored_paused_and_aborted(calibrate, source, control)
     assert "a procedure is running" in panel.start.toolTip()
     press(panel.pause)
     until(lambda: ("pause", {}) in control.asked, calibrate)
-    source.change(procedure=RUNNING.model_copy(update={"paused": True}))
+    source.change(active_run=RUNNING.model_copy(update={"paused": True}))
     look(calibrate)
     assert panel.pause.text() == "Resume"
     press(panel.pause)
@@ -328,13 +329,13 @@ def test_the_result_is_compared_with_the_previous_one(calibrate, source):
     panel = calibrate.panels["procedure"]
     document = calibration_document(fake.calibration("escape"))
     first = FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/1", document=document)
-    source.change(last=first)
+    source.change(last_run=first)
     look(calibrate)
     assert panel.outcome.text() == "Done: escape"
     assert "Δ" not in panel.numbers.text()
     assert not panel.report.isVisible()
     second = first.model_copy(update={"id": 2, "products": {"report": "/runs/2/report.html"}})
-    source.change(last=second)
+    source.change(last_run=second)
     look(calibrate)
     assert "(Δ 0.00 ± " in panel.numbers.text()
     assert panel.report.isVisible()

@@ -115,8 +115,8 @@ CHECKS: dict[str, Callable[[Stage], None]] = {
 
 #: Changes of the state that an action needs.
 SETTINGS: dict[str, Callable[[ScriptedSource], None]] = {
-    "abort": lambda s: s.change(procedure=RUN),
-    "pause": lambda s: s.change(procedure=RUN),
+    "abort": lambda s: s.change(active_run=RUN),
+    "pause": lambda s: s.change(active_run=RUN),
     "take_control": lambda s: s.change(lease=SOMEBODY),
     "clear_fault": lambda s: s.change(phase=Phase.FAULT, fault=FAULT),
 }

@@ -109,7 +109,7 @@ def test_camera_counts_and_hatches_saturation(window: MainWindow, source: Script
     frame = np.zeros((400, 400), np.uint16)
     frame[7, 9] = 1023
     source.push("frames", frame, top=1023.0)
-    source.change(light=Illumination(saturated=0.0321, peak=1.0))
+    source.change(illumination=Illumination(saturated=0.0321, peak=1.0))
     camera._histogram_due = 0.0
     window.update_timer.tick(force=True)
     assert "3.21 %" in camera.saturation.text()
@@ -159,7 +159,7 @@ def test_mirror_of_a_secondary_shows_both(session: Session, make_window: MakeWin
 
 
 def test_mirror_shows_peak_and_clipping(window: MainWindow, source: ScriptedSource) -> None:
-    source.change(mirror=MirrorState(rms=0.0812, peak=0.8, clipped=0.031))
+    source.change(mirror=MirrorState(rms=0.0812, peak=0.8, saturated_share=0.031))
     window.show_workspace("align")
     window.update_timer.tick(force=True)
     readouts = panel_of(window, MirrorPanel).readouts
@@ -210,7 +210,7 @@ def test_closing_the_loop_needs_a_held_button(
 ) -> None:
     loop = panel_of(window, LoopPanel)
     assert "the loop is closed" in loop.close_button.toolTip()
-    source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4, leak=0.02, dropped_modes=3, modes=80))
+    source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4, leak=0.02, dropped_modes=3, n_modes=80))
     window.update_timer.tick(force=True)
     qtbot.mouseClick(loop.close_button, Qt.MouseButton.LeftButton)
     qtbot.wait(50)

@@ -202,8 +202,8 @@ def test_actuators_on_a_grid_have_a_square_each() -> None:
 
 
 def test_actuators_without_a_grid_are_at_their_positions() -> None:
-    places = secondary().places_m
-    chart = ActuatorImage(Geometry(places_m=places))
+    places = secondary().positions_m
+    chart = ActuatorImage(Geometry(positions_m=places))
     image = chart.to_image(np.array([x for x, _ in places]))
     # Values increase to the right like the positions, and every actuator is visible.
     rows, columns = np.nonzero(np.isfinite(image))
@@ -239,7 +239,7 @@ def test_history_discards_the_oldest() -> None:
 
 
 def test_what_an_edit_changes() -> None:
-    loop = LoopState(matrix="escape", gain=0.4, leak=0.02, dropped_modes=3, modes=80)
+    loop = LoopState(matrix="escape", gain=0.4, leak=0.02, dropped_modes=3, n_modes=80)
     assert LoopSettingsEdit("escape", 0.4, 0.02, 3).changed(loop) == {}
     edit = LoopSettingsEdit("docrime", 0.4, 0.02, 5)
     assert edit.changed(loop) == {"matrix": "docrime", "dropped_modes": 5}

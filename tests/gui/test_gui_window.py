@@ -126,7 +126,7 @@ def test_a_fault_stays_until_it_is_cleared(
 
 def test_the_end_of_a_run_is_notified(small_window: MainWindow, source: ScriptedSource) -> None:
     source.change(
-        last=FinishedRun(id=1, name="escape", finish=Finish.FAILED, message="too dark", folder="/runs/2")
+        last_run=FinishedRun(id=1, name="escape", finish=Finish.FAILED, message="too dark", folder="/runs/2")
     )
     small_window.refresh()
     note = small_window.notifications.notifications[-1]
@@ -151,7 +151,7 @@ def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: Scri
         "strehl": {"peak": {"value": 0.4}},
     }
     source.change(
-        last=FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/2", document=document)
+        last_run=FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/2", document=document)
     )
     window = make_window(settings=Settings(workspace="calibrate"))
     panel = window.panels["procedure"]
@@ -346,7 +346,8 @@ def test_the_window_fits_a_small_screen(
             parameters=tuple(ProcedureParameter(name=f"number {k}", kind="int", default=k) for k in range(9)),
         ),
     )
-    source.change(last=FinishedRun(id=1, name="escape", finish=Finish.DONE, message="all went well " * 20))
+    ended = FinishedRun(id=1, name="escape", finish=Finish.DONE, message="all went well " * 20)
+    source.change(last_run=ended)
     source.fail()
     window = make_window(settings=Settings(font_scale=scale))
     window.update_timer.tick(force=True)

@@ -45,7 +45,7 @@ def test_images_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         window.show_workspace("calibrate")
         operator.choose("escape", frames="2000")
         save_image(operator, "plan")
-        before = source.source.state.last.id
+        before = source.source.state.last_run.id
         operator.press(operator.procedure.start)
         operator.until(lambda: panels["modes"].matrix_selector.currentData() == "live", "maps fill in")
         save_image(operator, "measuring")

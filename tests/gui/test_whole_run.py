@@ -63,7 +63,7 @@ def test_escape_through_the_buttons(small: Path, tmp_path: Path) -> None:
         operator.until(operator.procedure.abort.isEnabled, "it can be stopped")
         operator.until(lambda: bool(operator.procedure._metrics.text()), "it is under way")
         operator.press(operator.procedure.abort)
-        operator.until(lambda: source.state.last.finish is Finish.ABORTED, "it is stopped")
+        operator.until(lambda: source.state.last_run.finish is Finish.ABORTED, "it is stopped")
         operator.until(lambda: "Aborted" in operator.procedure.outcome.text(), "the outcome is shown")
 
 

@@ -77,11 +77,11 @@ class Operator:
         """Start a procedure with its button, and wait for its end."""
         self.choose(name, **arguments)
         source = self.window.context.session.source
-        before = source.state.last.id if source.state.last is not None else 0
+        before = source.state.last_run.id if source.state.last_run is not None else 0
         self.press(self.procedure.start)
-        self.until(lambda: source.state.procedure is not None, "it runs")
+        self.until(lambda: source.state.active_run is not None, "it runs")
         self.until(lambda: self._watch() and self.ended(before), "it ends")
-        last = source.state.last
+        last = source.state.last_run
         assert last is not None
         self.until(lambda: self.procedure._ended is not None and self.procedure._ended.id == last.id, "told")
         return last
@@ -89,7 +89,7 @@ class Operator:
     def ended(self, before: int) -> bool:
         """Whether a procedure has ended since the one with that number."""
         state = self.window.context.session.source.state
-        return state.procedure is None and state.last is not None and state.last.id != before
+        return state.active_run is None and state.last_run is not None and state.last_run.id != before
 
     def settle(self, seconds: float) -> None:
         """Process events for some time."""

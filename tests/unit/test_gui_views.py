@@ -189,7 +189,7 @@ def test_lengths_of_time(seconds, text):
 
 def test_progress_in_words():
     run = ActiveRun(
-        id=1, name="docrime", arguments={}, stage="DO-CRIME", done=610, total=1000, remaining_s=252
+        id=1, name="docrime", arguments={}, stage="DO-CRIME", completed=610, total=1000, remaining_s=252
     )
     assert form.progress_line(run) == "DO-CRIME: 610 of 1000 frames, 4:12 min left"
     assert form.progress_line(run.model_copy(update={"paused": True})).startswith("Paused")

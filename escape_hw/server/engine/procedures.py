@@ -210,7 +210,7 @@ def _calibration_task(method: str) -> Callable[[Arguments, ProductStore], Task[A
         resume = options.pop("resume")
         control_matrix = options.pop("closed_loop", None)
         if control_matrix is not None and method in CLOSED_LOOP:
-            options["closed_loop"] = str(product_store.matrix(str(control_matrix)))
+            options["closed_loop"] = str(product_store.matrix_path(str(control_matrix)))
         folder = None if resume is None else product_store.readable_path(str(resume))
         if folder is not None:
             saved_settings = _run_settings(folder)
@@ -241,7 +241,7 @@ def _matrix_path(arguments: Arguments, product_store: ProductStore) -> Path:
     name = arguments.pop("im")
     if name is None:
         raise ConfigError("im is missing; name a matrix that the server holds")
-    return product_store.matrix(str(name))
+    return product_store.matrix_path(str(name))
 
 
 def _loop_task(arguments: Arguments, product_store: ProductStore) -> Task[Any]:
