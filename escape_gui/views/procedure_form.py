@@ -24,18 +24,11 @@ from escape_hw.report.tables import TITLES, format_with_error
 
 #: What an argument without a value is called in a list of choices.
 NO_CHOICE = "–"
-#: Words for parameters whose names do not read like words.
-_LABELS = {
-    "snr": "SNR goal", "im": "Matrix", "closed_loop": "In closed loop on", "frames": "Frames", "poke": "Poke",
-    "accuracy": "Accuracy goal", "strehl": "Measure Strehl", "best": "Search best gain",
-    "resume": "Resume run", "plain": "Paper's estimator",
-    "budget": "Strehl budget", "exchange": "Exchange matrix",
-}  # fmt: skip
 
 
 def label(parameter: ProcedureParameter) -> str:
-    """How a parameter is called in the form."""
-    return _LABELS.get(parameter.name, parameter.name.replace("_", " ").capitalize())
+    """Words for a parameter in the form."""
+    return parameter.label or parameter.name.replace("_", " ").capitalize()
 
 
 def parameter_hint(parameter: ProcedureParameter) -> str:

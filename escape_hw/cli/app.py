@@ -1,4 +1,4 @@
-"""The application: names, help and options; the work is imported when a command runs."""
+"""The application with its commands; numerical libraries are imported when a command runs."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli.calibration import calibrate, gains, loop, reproduce, sprint, sweep, track
+from escape_hw.cli.calibration import calibrate, reproduce, sweep
+from escape_hw.cli.calibration.procedure_command import procedure_command
 from escape_hw.cli.devices import asm, camera, discover, dm, emulate, modulator, with_stand_ins
 from escape_hw.cli.products import inspection as products
 from escape_hw.cli.products import interchange
 from escape_hw.cli.system import configuration as systems
 from escape_hw.cli.system import doctor, gui, keys, perf, serve, streams, udev
+from escape_hw.runtime.procedures.calibration import CALIBRATIONS
+from escape_hw.runtime.procedures.registry import PROCEDURES
 
 app = typer.Typer(
     name="escape",
@@ -28,10 +31,9 @@ app = typer.Typer(
 app.command("systems")(systems.systems)
 app.add_typer(systems.config_app, name="config")
 app.command("calibrate")(calibrate.calibrate)
-app.command("sprint")(sprint.sprint)
-app.command("gains")(gains.gains)
-app.command("loop")(loop.loop)
-app.command("track")(track.track)
+for _procedure in PROCEDURES:
+    if _procedure.name not in CALIBRATIONS:
+        app.command(_procedure.name)(procedure_command(_procedure))
 app.command("sweep")(sweep.sweep)
 app.command("serve")(serve.serve)
 app.add_typer(keys.app, name="keys")

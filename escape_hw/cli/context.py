@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -20,15 +21,17 @@ import typer
 from rich.console import Console, RenderableType
 
 from escape_hw.api.concurrency import SignalSafeFlag
+from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError
+from escape_hw.runtime.procedures.declaration import ComputedProcedure
 
 if TYPE_CHECKING:
     from escape_hw.api.procedure import Procedure
+    from escape_hw.cli.calibration.display import Display
     from escape_hw.cli.options import SystemSelection
     from escape_hw.config.system import SystemConfig
     from escape_hw.io.run_folder import RunFolder
-    from escape_hw.runtime.procedures.task import Task
-    from escape_hw.runtime.session.record import BenchRecord
+    from escape_hw.runtime.procedures.declaration import ProcedureSpec
     from escape_hw.runtime.session.system import System
 
 
@@ -218,43 +221,58 @@ class CommandContext:
         """While a result is saved: after an abort, no further Ctrl-C keeps it from its file."""
         return contextlib.nullcontext() if stop is None else self.interrupts.protect_saving()
 
-    def run_task(
+    def run_procedure(
         self,
-        task: Task[T],
+        procedure: ProcedureSpec[T],
         selection: SystemSelection,
         out: Path | None,
-        show: Callable[[T, BenchRecord, dict[str, Any]], object],
+        display: Display,
         resumed_run: Path | None = None,
     ) -> None:
-        """Do a task on the chosen system, keep its result, and show it.
+        """Run a procedure on the selected system, save its result and print it.
 
-        Who goes on with a run is told where the products of this one lie.
+        Parameters
+        ----------
+        procedure
+            The request.
+        selection
+            The system.
+        out
+            Run folder; a dated one by default.
+        display
+            Prints the result.
+        resumed_run
+            Folder of the run that is continued.
 
         Raises
         ------
         Aborted
-            The result is partial; it was kept and shown.
+            The result is partial; it was saved and printed.
         """
-        selection = selection.with_overrides(*task.overrides)
+        selection = selection.with_overrides(*procedure.overrides)
         config = self.load_config(selection)
-        task.load(config)
-        with self.run_folder(config, task.kind, out) as folder:
+        procedure.load(config)
+        with self.run_folder(config, procedure.kind, out) as folder:
             if resumed_run is not None:
-                self.notify(
-                    f"going on with {resumed_run}, which stays as it is; products go to {folder.path}"
-                )
+                self.notify(f"resuming {resumed_run}, which is not changed; products go to {folder.path}")
+            if isinstance(procedure, ComputedProcedure):
+                result = self.run(procedure.compute())
+                saved = procedure.save_computed(folder, result, self.wall_seconds)
+                self.result(saved.document, met=saved.met)
+                display(self, result, config.simulated, saved.document)
+                return
             with self.bench(selection) as bench:
                 from escape_hw.runtime.session.record import BenchRecord
 
                 record = BenchRecord.from_bench(bench)
-                result, stop = self.run_keeping_partial(task.procedure(bench, folder))
+                result, stop = self.run_keeping_partial(procedure.procedure(bench, folder))
             with self.protect_saving(stop):
-                saved = task.save(folder, record, result, self.wall_seconds)
+                saved = procedure.save(folder, record, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
-                show(result, record, saved.document)
+                display(self, result, record.simulated, saved.document)
             if stop is not None:
                 raise stop
-            task.finish()
+            procedure.finish()
 
     @contextmanager
     def run_folder(self, config: SystemConfig, kind: str, out: Path | None) -> Iterator[RunFolder]:
@@ -356,6 +374,23 @@ class CommandContext:
 
 
 @contextmanager
+def print_deprecations(context: CommandContext) -> Iterator[None]:
+    """Print a line on standard error for every name of an earlier version that is used."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RenamedWarning)
+        show_warning = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
+            if issubclass(category, RenamedWarning):
+                context.notify(f"deprecated: {message}")
+            else:
+                show_warning(message, category, *place, **options)
+
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
 def command_context(command: str, *, json: bool = False, quiet: bool = False) -> Iterator[CommandContext]:
     """A command's body; turns every ending into an exit code and at most one document.
 
@@ -364,7 +399,7 @@ def command_context(command: str, *, json: bool = False, quiet: bool = False) ->
     context = CommandContext(command, json, quiet)
     with context.interrupts:
         try:
-            with contextlib.redirect_stdout(sys.stderr):
+            with contextlib.redirect_stdout(sys.stderr), print_deprecations(context):
                 yield context
         except typer.Exit:
             raise

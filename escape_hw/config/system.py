@@ -7,6 +7,15 @@ from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import Field, model_validator
 
+from escape_hw.config.choices import (
+    ActuatorModel,
+    Estimator,
+    ExtraParameter,
+    Loss,
+    ModesChoice,
+    PokePattern,
+    Solver,
+)
 from escape_hw.config.devices import DeviceConfig, DevicesConfig, Mode, derive_tilt_scale
 from escape_hw.config.section import RuleViolation, Section, TomlArray, raise_violations
 from escape_hw.config.sensor import AnySensor, PyramidSection, SensorSection
@@ -99,24 +108,6 @@ S = TypeVar("S", bound=SensorSection)
 
 #: Largest gain of the loop: an integrator above it diverges on any bench.
 MAX_GAIN = 2.0
-
-
-Estimator = Literal["auto", "matrix", "telemetry"]
-#: What SPRINT can fit within ESCAPE.
-ESTIMATORS: tuple[str, ...] = get_args(Estimator)
-PokePattern = Literal["white", "shaped", "equal-snr"]
-Solver = Literal["effects", "light", "frozen", "batches", "diagonal"]
-#: How SPRINT solves.
-SOLVERS: tuple[str, ...] = get_args(Solver)
-ModesChoice = Literal["snr", "first", "d-optimal", "a-optimal"]
-#: How SPRINT chooses its modes.
-MODES_CHOICES: tuple[str, ...] = get_args(ModesChoice)
-ExtraParameter = Literal["anamorphosis", "pupil_shift"]
-Loss = Literal["squares", "huber"]
-#: What SPRINT minimises.
-LOSSES: tuple[str, ...] = get_args(Loss)
-ActuatorModel = Literal["found", "alike"]
-ACTUATOR_MODELS: tuple[str, ...] = get_args(ActuatorModel)
 
 
 class SystemSection(Section):

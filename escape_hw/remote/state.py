@@ -282,7 +282,7 @@ Arguments = dict[str, Annotated[float, Field(allow_inf_nan=False)] | int | bool 
 
 
 class ProcedurePlan(StateDocument):
-    """What a procedure would do, found out before anything moves."""
+    """Duration and poke amplitude of a procedure, computed before anything moves."""
 
     name: str
     arguments: dict[str, Any]
@@ -300,7 +300,7 @@ class ProcedurePlan(StateDocument):
 
 
 class ProcedureParameter(StateDocument):
-    """One argument of a procedure, enough to make a form of it."""
+    """One parameter of a procedure, with all that a form needs."""
 
     name: str
     #: ``int``, ``float``, ``bool``, ``choice``, ``text``, ``matrix`` (a name out of ``State.products``).
@@ -308,6 +308,8 @@ class ProcedureParameter(StateDocument):
     default: float | int | bool | str | None = None
     unit: str = ""
     help: str = ""
+    #: Words for a form; derived from the name if empty.
+    label: str = ""
     choices: tuple[str, ...] = ()
     low: float | None = None
     high: float | None = None

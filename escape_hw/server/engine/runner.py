@@ -23,7 +23,8 @@ from escape_hw.io.provenance import format_utc
 from escape_hw.io.run_folder import RunFolder
 from escape_hw.remote.requests import CloseLoop, SetLoop
 from escape_hw.remote.state import ActiveRun, Finish, FinishedRun, Phase
-from escape_hw.runtime.procedures.task import SavedRun, Task, load_fitting_matrix, require_hardware_matrix
+from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun
+from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.server.engine.state import LoopSettings
 
@@ -38,7 +39,7 @@ LOOP_IS_RESTORED = "it is opened for this, and closed again as it was when this 
 _STORED_PRODUCTS = ("im", "escape", "docrime", "gains", "loop")
 
 
-def config_of_task(engine: Engine, task: Task[Any]) -> SystemConfig:
+def config_of_task(engine: Engine, task: ProcedureSpec[Any]) -> SystemConfig:
     """The configuration that a task runs with."""
     return load_text(engine.setup.config_text, overrides=task.overrides)
 
@@ -70,7 +71,7 @@ def begin_run(engine: Engine, run: int, name: str, arguments: dict[str, Any], lo
 
 
 def run_task(
-    engine: Engine, task: Task[Any], config: SystemConfig, loop_before: LoopSettings | None = None
+    engine: Engine, task: ProcedureSpec[Any], config: SystemConfig, loop_before: LoopSettings | None = None
 ) -> None:
     """Do a task to its end, keep its result, and say how it ended; then the loop is as ``loop_before``."""
     engine_state, bench = engine.engine_state, engine.bench
@@ -100,7 +101,7 @@ def run_task(
     engine.send_flat_replies()
 
 
-def _run(engine: Engine, task: Task[Any], running: ActiveRun) -> FinishedRun:
+def _run(engine: Engine, task: ProcedureSpec[Any], running: ActiveRun) -> FinishedRun:
     """Run in a folder; whatever happens becomes an end with its reason."""
     folder: RunFolder | None = None
     try:
@@ -133,7 +134,7 @@ def _run(engine: Engine, task: Task[Any], running: ActiveRun) -> FinishedRun:
     )  # fmt: skip
 
 
-def _run_and_save(engine: Engine, task: Task[Any], folder: RunFolder) -> tuple[SavedRun, Aborted | None]:
+def _run_and_save(engine: Engine, task: ProcedureSpec[Any], folder: RunFolder) -> tuple[SavedRun, Aborted | None]:
     """Run the procedure and keep what it measured, a partial result as well."""
     if engine.engine_state.fault is not None:
         raise Aborted(f"nothing was begun: {engine.engine_state.fault.reason}")
@@ -169,7 +170,7 @@ def _update_from_result(engine: Engine, result: object) -> None:
         engine.publisher.arrays({"model_psf": psf})
 
 
-def _run_folder_path(engine: Engine, task: Task[Any], run: int) -> Path:
+def _run_folder_path(engine: Engine, task: ProcedureSpec[Any], run: int) -> Path:
     now = datetime.now().astimezone()
     return (
         engine.setup.runs / f"{now:%Y-%m-%d}" / f"{now:%H%M%S}_{engine.config.system.name}_{task.kind}-{run}"
