@@ -57,7 +57,9 @@ def procedure_options(parameters: Iterable[Parameter], optional: bool = False) -
 def _option(one: Parameter) -> Any:
     name = option_name(one.name)
     words = [f"{name}/--no-{name[2:]}"] if one.kind == "bool" else [name]
-    low, high = (one.low, one.high) if one.kind in ("int", "float") else (None, None)
+    low, high = one.low, one.high
+    if one.kind == "int":
+        low, high = (None if limit is None else int(limit) for limit in (low, high))
     metavar = "|".join(one.choices) if one.kind == "choice" else _METAVARS.get(one.kind)
     text = describe(replace(one, choices=() if one.kind == "choice" else one.choices))
     kind = _TYPES[one.kind]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun, parameter
 from escape_hw.runtime.procedures.matrix_input import MODEL_PSF_FRAMES
@@ -44,15 +44,9 @@ class ModelPsfProcedure(ProcedureSpec[ModelPsf]):
 
     def save(self, folder: RunFolder, record: BenchRecord, result: ModelPsf, wall_seconds: float) -> SavedRun:
         """Save peak and total; the image itself is saved with each loop that is compared with it."""
+        from escape_hw.runtime.procedures.products import save_values
+
         image = result.model_psf
-        document: dict[str, Any] = {
-            **record.header_fields(self.name),
-            "title": f"Model PSF of {record.system}",
-            "peak": float(image.max()),
-            "total": float(image.sum(dtype=float)),
-            "partial": False,
-            "products": {},
-            **record.footer_fields(wall_seconds),
-        }
-        folder.write_result(document)
-        return SavedRun({**document, **folder.location_fields()})
+        values = {"peak": float(image.max()), "total": float(image.sum(dtype=float))}
+        title = f"Model PSF of {record.system}"
+        return save_values(folder, record, self.name, title, values, wall_seconds)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun, parameter
 
@@ -36,16 +36,13 @@ class SensorProcedure(ProcedureSpec["SensorSetup"]):
         self, folder: RunFolder, record: BenchRecord, result: SensorSetup, wall_seconds: float
     ) -> SavedRun:
         """Save the number of sub-apertures, the counts and the background."""
+        from escape_hw.runtime.procedures.products import save_values
+
         grid = result.grid
-        document: dict[str, Any] = {
-            **record.header_fields(self.name),
-            "title": f"Sensor of {record.system}",
+        values = {
             "n_sub_apertures": grid.n_valid,
             "counts": grid.counts,
             "background": grid.background,
-            "partial": False,
-            "products": {},
-            **record.footer_fields(wall_seconds),
         }
-        folder.write_result(document)
-        return SavedRun({**document, **folder.location_fields()})
+        title = f"Sensor of {record.system}"
+        return save_values(folder, record, self.name, title, values, wall_seconds)
