@@ -493,15 +493,18 @@ class Connection(ReadOnlyConnection):
         extra_parameters: str | None = None,
         resume: str | None = None,
         progress: bool = False,
+        **arguments: float | int | bool | str | None,
     ) -> Any:
         """Calibrate and wait for the result.
 
         Parameters
         ----------
         method
-            Name of the calibration; not every method has all parameters.
+            Name of the calibration, or of another procedure; not every method has all parameters.
         progress
             Show a bar with the time left.
+        arguments
+            Parameters of a procedure that is not a calibration.
 
         Returns
         -------
@@ -515,14 +518,14 @@ class Connection(ReadOnlyConnection):
         Aborted, CalibrationError, ServerGone
             See :meth:`RemoteRun.wait`.
         """
-        arguments = {
+        declared = {
             "frames": frames, "poke": poke, "snr": snr, "accuracy": accuracy, "closed_loop": closed_loop,
             "pokes": pokes, "whiten": whiten, "estimator": estimator, "solver": solver,
             "modes_choice": modes_choice, "loss": loss, "extra_parameters": extra_parameters,
             "resume": resume,
         }  # fmt: skip
-        given = {name: value for name, value in arguments.items() if value is not None}
-        return self.start(method, **given).wait(progress=progress)
+        given = {name: value for name, value in declared.items() if value is not None}
+        return self.start(method, **given, **arguments).wait(progress=progress)
 
     def pause(self) -> None:
         """Halt the running procedure between two steps, mirror flat."""
