@@ -501,8 +501,6 @@ class Connection(ReadOnlyConnection):
         ----------
         method
             Name of the calibration, or of another procedure; not every method has all parameters.
-        progress
-            Show a bar with the time left.
         arguments
             Parameters of a procedure that is not a calibration.
 

@@ -40,7 +40,7 @@ def _frames(config_key: str, help: str = "Frames to measure with.") -> Any:
 
 def _poke(config_key: str) -> Any:
     return parameter(
-        default=None, help="Poke of each mode, rms surface.", unit="of full stroke", low=1e-6, high=1,
+        default=None, help="Poke of each mode, rms surface as fraction of full stroke.", unit="of full stroke", low=1e-6, high=1,
         config_key=config_key,
     )  # fmt: skip
 

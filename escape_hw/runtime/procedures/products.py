@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,10 @@ def product_key(label: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", label.lower().replace("do-crime", "docrime")).strip("_")
 
 
+def _checksums(parents: Iterable[Path]) -> dict[str, str]:
+    return {path.name: file_sha256(path) for path in parents}
+
+
 def add_calibration(
     folder: RunFolder,
     record: BenchRecord,
@@ -37,69 +41,41 @@ def add_calibration(
     Raises
     ------
     StorageError
-        The file cannot be written.
+        The file cannot be written; as for the other functions of this module.
     """
-    known = {path.name: file_sha256(path) for path in (parents or {}).values()}
-    return folder.add_product(name, save_matrix(folder.file(f"{name}.fits"), result, record.origin(known)))
+    origin = record.origin(_checksums((parents or {}).values()))
+    return folder.add_product(name, save_matrix(folder.file(f"{name}.fits"), result, origin))
 
 
 def add_loop(
     folder: RunFolder, record: BenchRecord, name: str, result: LoopResult, matrix: Path | None = None
 ) -> Path:
-    """Save a closed-loop run as ``NAME.fits``, with its control matrix as parent.
-
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
-    """
-    parents = {} if matrix is None else {matrix.name: file_sha256(matrix)}
+    """Save a closed-loop run as ``NAME.fits``, with its control matrix as parent."""
+    origin = record.origin(_checksums([] if matrix is None else [matrix]))
     path = folder.file(f"{name}.fits")
-    saved = save_loop(path, result, record.system, record.simulated, record.origin(parents))
-    return folder.add_product(name, saved)
+    return folder.add_product(name, save_loop(path, result, record.system, record.simulated, origin))
 
 
 def add_telemetry(
     folder: RunFolder, record: BenchRecord, name: str, telemetry: LoopTelemetry, matrix: Path
 ) -> Path:
-    """Save a loop's telemetry as ``NAME.fits``, with its control matrix as parent.
-
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
-    """
-    origin = record.origin({matrix.name: file_sha256(matrix)})
-    path = folder.file(f"{name}.fits")
+    """Save a loop's telemetry as ``NAME.fits``, with its control matrix as parent."""
+    origin, path = record.origin(_checksums([matrix])), folder.file(f"{name}.fits")
     return folder.add_product(name, save_telemetry(path, telemetry, record.system, record.simulated, origin))
 
 
 def add_gains(
     folder: RunFolder, record: BenchRecord, name: str, result: GainsResult, parents: Mapping[str, Path]
 ) -> Path:
-    """Save optical gains as ``NAME.fits``, with the matrices used as parents.
-
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
-    """
-    known = {path.name: file_sha256(path) for path in parents.values()}
-    path = folder.file(f"{name}.fits")
-    return folder.add_product(
-        name, save_gains(path, result, record.system, record.simulated, record.origin(known))
-    )
+    """Save optical gains as ``NAME.fits``, with the matrices used as parents."""
+    origin, path = record.origin(_checksums(parents.values())), folder.file(f"{name}.fits")
+    return folder.add_product(name, save_gains(path, result, record.system, record.simulated, origin))
 
 
 def write_run_result(folder: RunFolder, document: Mapping[str, Any]) -> dict[str, Any]:
     """Write ``result.json``, build the report, and return the document with the paths of the products.
 
     An aborted run gets no report, because that takes seconds; ``escape report`` builds it.
-
-    Raises
-    ------
-    StorageError
-        A file cannot be written.
     """
     if document.get("partial"):
         folder.write_result(document)
@@ -138,11 +114,6 @@ def save_values(
         The numbers, as they appear in ``result.json`` and with ``--json``.
     wall_seconds
         Duration of the run.
-
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
     """
     document = {
         **record.header_fields(name),

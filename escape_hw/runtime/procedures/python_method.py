@@ -13,6 +13,7 @@ from escape_hw.runtime.procedures.declaration import Parameter, ProcedureSpec, p
 
 P = ParamSpec("P")
 T = TypeVar("T")
+_PROGRESS = Parameter("progress", "bool", False, help="Show a bar with the time left.")
 
 
 def procedure_method(
@@ -20,9 +21,8 @@ def procedure_method(
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Decorate a method that runs one of these procedures.
 
-    Parameters of the method with a declared name are documented by the declaration, in the section
-    "Parameters" of the docstring, and accept the names of earlier versions. Parameters without a declared
-    name exist in Python only.
+    Parameters with a declared name are documented by the declaration and accept the names of earlier
+    versions. The others exist in Python only; ``progress`` shows a bar.
 
     Parameters
     ----------
@@ -48,29 +48,30 @@ def procedure_method(
                     present[new] = present.pop(old)
             return method(*args, **present)
 
-        wrapper.__doc__ = _with_parameters(inspect.getdoc(method), own)
+        wrapper.__doc__ = _with_parameters(inspect.getdoc(method), [*own, _PROGRESS])
         return wrapper
 
     return decorate
 
 
 def _with_parameters(doc: str | None, parameters: list[Parameter]) -> str | None:
-    """The docstring with the declared parameters at the end of its section "Parameters"."""
-    heading = "Parameters\n----------\n"
-    if doc is None or heading not in doc:
+    """The docstring with these parameters at the end of its section "Parameters", before "Returns"."""
+    if doc is None:
         return doc
+    heading = "Parameters\n----------\n"
+    before, _, after = doc.partition("Returns\n-------\n")
     entries = "".join(
         f"{one.name}\n{textwrap.fill(describe(one), 106, initial_indent='    ', subsequent_indent='    ')}\n"
         for one in parameters
     )
-    before, _, after = doc.partition(heading)
-    section, blank, rest = after.partition("\n\n")
-    return f"{before}{heading}{section}\n{entries.rstrip()}{blank}{rest}"
+    section = before.rstrip() + ("\n" if heading in before else f"\n\n{heading}") + entries
+    return f"{section}\nReturns\n-------\n{after}"
 
 
 def describe(one: Parameter) -> str:
     """Help of a parameter with unit, choices and a default that the signature does not show."""
-    text = f"{one.help.removesuffix('.')} ({one.unit})." if one.unit not in ("", "frame") else one.help
+    is_clear = one.unit in one.help or one.unit == "frame"
+    text = one.help if is_clear else f"{one.help.removesuffix('.')} ({one.unit})."
     if one.choices:
         text += f" One of {', '.join(one.choices)}."
     return f"{text} As configured by default." if one.config_key and one.default is None else text

@@ -36,7 +36,7 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
 
     seconds: float = parameter(default=60.0, help="Duration.", unit="s", low=1, high=1e6)
     poke: float | None = parameter(
-        default=None, help="Pokes of each mode, rms surface.", unit="of full stroke", low=1e-6, high=1,
+        default=None, help="Pokes of each mode, rms surface as fraction of full stroke.", unit="of full stroke", low=1e-6, high=1,
         config_key="tracking.poke", sets_config=True,
     )  # fmt: skip
     forgetting_time_s: float | None = parameter(

@@ -144,11 +144,6 @@ class System(Bench):
     def take_model_psf(self, *, frames: int = 20, progress: bool = False) -> NDArray[np.float32]:
         """Measure the PSF of the flat mirror without turbulence, the reference of Strehl ratios.
 
-        Parameters
-        ----------
-        progress
-            Show a bar with the time left.
-
         Returns
         -------
         ndarray of float32, ``(rows, columns)``
@@ -184,8 +179,6 @@ class System(Bench):
             A calibration from :meth:`calibrate` or ``escape_hw.load_matrix``; or a matrix and its grid.
         model_psf
             From :meth:`take_model_psf`; needed for the Strehl ratios.
-        progress
-            Show a bar with the time left.
 
         Returns
         -------
@@ -273,8 +266,6 @@ class System(Bench):
             From :meth:`calibrate`, preferably with ``"escape"``, or ``escape_hw.load_matrix``.
         model_psf
             From :meth:`take_model_psf`; every round then measures the Strehl ratio.
-        progress
-            Show a bar with the time left.
 
         Returns
         -------
@@ -378,8 +369,6 @@ class System(Bench):
             :meth:`find_optical_gains`; a missing registration is estimated from the matrix.
         model_psf
             From :meth:`take_model_psf`; the Strehl ratio is then followed too.
-        progress
-            Show a bar with the time left.
 
         Returns
         -------
@@ -411,10 +400,10 @@ class System(Bench):
     def find_sensor(self, *, frames: int = 200, progress: bool = False) -> SensorSetup:
         """Find the geometry of the sensor on averaged frames; the mirror is not moved.
 
-        Parameters
-        ----------
-        progress
-            Show a bar with the time left.
+        Returns
+        -------
+        SensorSetup
+            ``grid`` is the geometry.
 
         Raises
         ------
@@ -467,8 +456,6 @@ class System(Bench):
             Stop at this signal-to-noise ratio or accuracy.
         checkpoint
             File for the state of the run, and the state to resume from.
-        progress
-            Show a bar with the time left.
 
         Returns
         -------
