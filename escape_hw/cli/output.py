@@ -37,7 +37,7 @@ class FaultTolerantStream:
         self._absent = inner is None
         if inner is None:
             _reserve_descriptor(descriptor)
-            inner = open(os.devnull, "w", encoding="utf-8")
+            inner = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
         self.inner = inner
 
     def write(self, text: str) -> int:

@@ -40,8 +40,8 @@ def _frames(config_key: str, help: str = "Frames to measure with.") -> Any:
 
 def _poke(config_key: str) -> Any:
     return parameter(
-        default=None, help="Poke of each mode, rms surface as fraction of full stroke.", unit="of full stroke", low=1e-6, high=1,
-        config_key=config_key,
+        default=None, help="Poke of each mode, rms surface as fraction of full stroke.",
+        unit="of full stroke", low=1e-6, high=1, config_key=config_key,
     )  # fmt: skip
 
 
@@ -259,8 +259,8 @@ class EscapeProcedure(DocrimeProcedure, SprintParameters["CalibrationResult"]):
     )
 
     accuracy: float | None = parameter(
-        default=None, help="Stop when the standard errors of the shifts are this small.", label="Accuracy goal",
-        unit="% of a sub-aperture", low=1e-6,
+        default=None, help="Stop when the standard errors of the shifts are this small.",
+        label="Accuracy goal", unit="% of a sub-aperture", low=1e-6,
     )  # fmt: skip
     estimator: str | None = parameter(
         default=None, help="Data that SPRINT fits; telemetry needs the fewest frames.", choices=ESTIMATORS,
@@ -361,8 +361,8 @@ def saved_request(folder: Path) -> dict[str, Any]:
         )
     if not path.is_file():
         raise ProductError(
-            f"{path}: does not exist; {folder} is not the folder of a run, or the run was stopped in its first "
-            "seconds, or it is complete"
+            f"{path}: does not exist; {folder} is not the folder of a run, or the run was stopped in its "
+            "first seconds, or it is complete"
         )
     request = {name: value for name, value in load_state(path).values["request"].items() if value is not None}
     if "plain" in request:
@@ -418,7 +418,8 @@ def calibrate_with_method(
         The method is unknown, or the options exclude each other; nothing has moved.
     TooFewFrames, CalibrationError, Aborted
         See :func:`~escape_hw.calibration.push_pull.procedure.push_pull`,
-        :func:`~escape_hw.calibration.docrime.open_loop.docrime`, :func:`~escape_hw.calibration.escape.method.escape`.
+        :func:`~escape_hw.calibration.docrime.open_loop.docrime`,
+        :func:`~escape_hw.calibration.escape.method.escape`.
     """
     from escape_hw.runtime.session.record import without_turbulence
 

@@ -38,7 +38,8 @@ class GainsProcedure(MatrixProcedure["GainsRun"]):
 
     poke: float = parameter(
         default=0.002,
-        help="Last poke of each mode, rms surface as fraction of full stroke; lowered to the allowed Strehl loss.",
+        help="Last poke of each mode, rms surface as fraction of full stroke; lowered to the allowed "
+        "Strehl loss.",
         unit="of full stroke", low=1e-6, high=1,
     )  # fmt: skip
     accuracy: float = parameter(

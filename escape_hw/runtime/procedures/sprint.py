@@ -68,7 +68,7 @@ class SprintProcedure(ComputedProcedure["CalibrationResult"], SprintParameters["
         return self._config, self._product
 
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
-        """Read the matrix; its number of modes, its basis and its mode may differ from the configured ones."""
+        """Read the matrix; number of modes, basis and mode may differ from the configuration."""
         from escape_hw.io.fits.matrix import load_matrix
 
         self._config = config

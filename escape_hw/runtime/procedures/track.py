@@ -36,8 +36,8 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
 
     seconds: float = parameter(default=60.0, help="Duration.", unit="s", low=1, high=1e6)
     poke: float | None = parameter(
-        default=None, help="Pokes of each mode, rms surface as fraction of full stroke.", unit="of full stroke", low=1e-6, high=1,
-        config_key="tracking.poke", sets_config=True,
+        default=None, help="Pokes of each mode, rms surface as fraction of full stroke.",
+        unit="of full stroke", low=1e-6, high=1, config_key="tracking.poke", sets_config=True,
     )  # fmt: skip
     forgetting_time_s: float | None = parameter(
         default=None, help="Time in which the weight of a frame falls to 1/e.", unit="s", low=1, high=1e5,
@@ -138,7 +138,7 @@ class InjectedRegistration:
         return replace(moved, anamorphosis_angle=self.start.anamorphosis_angle)
 
     def trajectory(self, began: float, seconds: Sequence[float]) -> dict[str, list[float]]:
-        """Every parameter by name, scalings along x and y, ``seconds`` after time ``began`` of the twin's clock."""
+        """Parameters by name, scalings along x and y, ``seconds`` after ``began`` on the twin's clock."""
         import numpy as np
 
         from escape_hw.api.registration import PARAMETERS

@@ -450,8 +450,8 @@ class System(Bench):
             ``"modulated"`` (with or without a source), ``"push-pull-fast"``, ``"docrime"`` or ``"escape"``
             (these three under turbulence, in open or closed loop).
         grid
-            Geometry of the sensor, if it is known already; found on the frames by default. ``closed_loop`` is a
-            calibration here, whose matrix closes the loop.
+            Geometry of the sensor, if it is known already; found on the frames by default. ``closed_loop`` is
+            a calibration here, whose matrix closes the loop.
         until
             Stop at this signal-to-noise ratio or accuracy.
         checkpoint
@@ -475,7 +475,8 @@ class System(Bench):
 
         procedure = calibrate_with_method(
             self, method, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator,
-            closed_loop=None if closed_loop is None else as_calibration(closed_loop), until=until, checkpoint=checkpoint,
+            closed_loop=None if closed_loop is None else as_calibration(closed_loop), until=until,
+            checkpoint=checkpoint,
         )  # fmt: skip
         return self.run(procedure, progress=progress)
 
