@@ -374,18 +374,20 @@ class CommandContext:
 
 
 @contextmanager
-def print_deprecations(context: CommandContext) -> Iterator[None]:
-    """Print a line on standard error for every name of an earlier version that is used."""
+def _deprecations_as_lines(notify: Callable[[str], None]) -> Iterator[None]:
+    """Report each old name that is used as one line, instead of as a Python warning."""
+    reported: set[str] = set()
+    show_others = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if not issubclass(category, RenamedWarning):
+            show_others(message, category, *where, **more)
+        elif str(message) not in reported:
+            reported.add(str(message))
+            notify(f"deprecated: {message}")
+
     with warnings.catch_warnings():
         warnings.simplefilter("always", RenamedWarning)
-        show_warning = warnings.showwarning
-
-        def show(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
-            if issubclass(category, RenamedWarning):
-                context.notify(f"deprecated: {message}")
-            else:
-                show_warning(message, category, *place, **options)
-
         warnings.showwarning = show
         yield
 
@@ -397,9 +399,9 @@ def command_context(command: str, *, json: bool = False, quiet: bool = False) ->
     Output of libraries to standard output is redirected to standard error.
     """
     context = CommandContext(command, json, quiet)
-    with context.interrupts:
+    with context.interrupts, _deprecations_as_lines(context.notify):
         try:
-            with contextlib.redirect_stdout(sys.stderr), print_deprecations(context):
+            with contextlib.redirect_stdout(sys.stderr):
                 yield context
         except typer.Exit:
             raise

@@ -155,6 +155,24 @@ def test_names_of_earlier_versions_are_accepted_with_a_warning() -> None:
     assert arguments["allowed_strehl_loss"] == 0.02
 
 
+def test_options_of_earlier_versions_work_and_name_the_present_ones(
+    escape: Any, bench: Any, im: Path, tmp_path: Path
+) -> None:
+    words = ("loop", "razor-shwfs", "--im", im, "--no-strehl", "--drop", 3, "--out", tmp_path / "loop")
+    code, _, err = escape(*words)
+    assert code == 0, err
+    assert bench.benches[-1].config.loop.dropped_modes == 3
+    assert "deprecated: --drop is called --dropped-modes" in err
+    words = ("calibrate", "razor-shwfs", "--method", "docrime", "--plain", "--out", tmp_path / "run")
+    code, _, err = escape(*words)
+    assert code == 0, err
+    assert bench.calls[-1] == ("docrime", {"whiten": False})
+    assert "deprecated: --plain is called --whiten (with the opposite meaning)" in err
+    code, _, err = escape("calibrate", "razor-shwfs", "--method", "modulated", "--accuracy", 1)
+    assert code == 2
+    assert "--accuracy: it needs --method escape, not modulated" in err
+
+
 def test_python_methods_accept_names_of_earlier_versions() -> None:
     class Opened(escape_hw.System):
         def __init__(self) -> None:
