@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T", bound=type)
 
 _PACKAGES = ("escape_hw", "escape_gui", "escape_drivers", "escape_sim")
 #: Version with the new names, and the version in which the old ones are removed.
@@ -26,7 +28,7 @@ def warn_renamed(message: str) -> None:
 
     Python hides deprecation warnings that are attributed to a library.
     """
-    level, frame = 1, sys._getframe()
+    level, frame = 1, sys._getframe()  # noqa: SLF001
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _PACKAGES:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, RenamedWarning, stacklevel=level)
@@ -50,3 +52,34 @@ def renamed_attributes(module: str, names: Mapping[str, str]) -> Callable[[str],
         return getattr(sys.modules[module], names[name])
 
     return __getattr__
+
+
+def renamed_members(**names: str) -> Callable[[T], T]:
+    """Class decorator that keeps old names of attributes and methods, with a :class:`RenamedWarning`.
+
+    Parameters
+    ----------
+    names
+        Old name -> present name.
+    """
+
+    def decorate(owner: T) -> T:
+        for old, new in names.items():
+            setattr(owner, old, _member_alias(owner.__name__, old, new))
+        return owner
+
+    return decorate
+
+
+def _member_alias(owner: str, old: str, new: str) -> property:
+    message = renamed_text(f"{owner}.{old}", f"{owner}.{new}")
+
+    def read(instance: Any) -> Any:
+        warn_renamed(message)
+        return getattr(instance, new)
+
+    def write(instance: Any, value: Any) -> None:
+        warn_renamed(message)
+        setattr(instance, new, value)
+
+    return property(read, write, doc=f"Old name of :attr:`{new}`.")
