@@ -23,8 +23,8 @@ from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix
 from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.config.choices import Solver
 from escape_hw.config.loader import load_system
-from escape_hw.config.system import Solver
 from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, surface_nodes
 from escape_sim.models.pyramid import nominal_pupils
 from escape_sim.models.shack_hartmann import NODES, make_model, nominal_grid
