@@ -11,10 +11,10 @@ from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix, zonal_jacobian
 from escape_hw.config.loader import load_system
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, actuator_positions, pitch_on_pupil
 from escape_sim.mirror.mode_surfaces import gaussian_factors, mode_derivatives, mode_surfaces
 from escape_sim.models.shack_hartmann import ShackHartmannModel, make_model
-from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import pupil_geometry
 
 #: The paper's laboratory case, and one with everything far out.
 PLACES = [Registration(-16.0, -71.0, -0.77, 2.9, 0.0), Registration(310.0, -190.0, 9.0, -6.0, 7.0)]

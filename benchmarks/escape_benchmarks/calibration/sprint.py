@@ -25,10 +25,11 @@ from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.config.loader import load_system
 from escape_hw.config.system import Solver
+from escape_sim.mirror.influence_functions import pitch_on_pupil
 from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, surface_nodes
 from escape_sim.models.pyramid import nominal_pupils
 from escape_sim.models.shack_hartmann import NODES, make_model, nominal_grid
-from escape_sim.optics.pupil import pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import pupil_geometry
 
 if TYPE_CHECKING:
     from escape_hw.api.sensor import SensorGeometry

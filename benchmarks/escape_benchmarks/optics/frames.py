@@ -11,8 +11,9 @@ import numpy as np
 from escape_hw.api.modulator import Modulation
 from escape_hw.bench import Bench
 from escape_hw.config.sensor import PyramidSection
+from escape_sim.mirror.influence_functions import actuator_positions, pitch_on_pupil
 from escape_sim.oopao.library import SourceAndTelescope, make_pyramid, make_source, oopao, quiet
-from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import pupil_geometry
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig

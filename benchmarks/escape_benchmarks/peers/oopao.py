@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.config.sensor import PyramidSection
+from escape_sim.mirror.influence_functions import actuator_positions, pitch_on_pupil
 from escape_sim.models.pyramid import nominal_pupils
 from escape_sim.oopao.library import SourceAndTelescope, make_source, mis_registration, oopao, quiet
 from escape_sim.oopao.optics import OOPAOPyramid
 from escape_sim.optics.modulation import ModulationPath
-from escape_sim.optics.pupil import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import PupilGeometry, pupil_geometry
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig

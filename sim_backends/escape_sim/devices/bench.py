@@ -17,13 +17,15 @@ from escape_sim.mirror.dynamics import MirrorDynamics
 from escape_sim.mirror.influence_functions import (
     InfluenceFunctions,
     MeasuredInfluenceFunctions,
+    actuator_positions,
+    pitch_on_pupil,
     read_influence_functions,
 )
 from escape_sim.mirror.surface import DriftingSurface, Flexure, InfluenceModel
 from escape_sim.optics.detector import Detector
 from escape_sim.optics.focal_plane import FocalPlane
 from escape_sim.optics.modulation import BeamPath
-from escape_sim.optics.pupil import actuator_positions, contaminated_pupil, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import contaminated_pupil, pupil_geometry
 from escape_sim.optics.sensor import ModulatedOptics, SensorOptics, make_sensor_optics
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.config.sensor import PyramidSection
 from escape_sim.atmosphere.von_karman import structure_function
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, actuator_positions, pitch_on_pupil
 from escape_sim.mirror.mode_surfaces import (
     N_DERIVATIVES,
     GaussianFactors,
@@ -33,7 +33,7 @@ from escape_sim.models.pyramid_turbulence import (
 )
 from escape_sim.optics.fourier_filter import next_fast_length
 from escape_sim.optics.modulation import ModulationPath
-from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_from_images, pupil_geometry
+from escape_sim.optics.pupil import pupil_from_images, pupil_geometry
 from escape_sim.optics.pyramid import GridRegion, Prism, PyramidOptics
 
 if TYPE_CHECKING:

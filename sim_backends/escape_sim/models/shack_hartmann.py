@@ -16,9 +16,9 @@ from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, require_kind
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, actuator_positions, pitch_on_pupil
 from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, gaussian_factors, mode_surfaces
-from escape_sim.optics.pupil import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import PupilGeometry, pupil_geometry
 from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
 
 if TYPE_CHECKING:

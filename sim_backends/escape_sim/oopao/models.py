@@ -15,6 +15,7 @@ from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
+from escape_sim.mirror.influence_functions import actuator_positions, pitch_on_pupil
 from escape_sim.models.shack_hartmann import nominal_grid
 from escape_sim.oopao.library import (
     SourceAndTelescope,
@@ -26,13 +27,7 @@ from escape_sim.oopao.library import (
 )
 from escape_sim.oopao.optics import SAMPLING, OOPAOPyramid, window_moments
 from escape_sim.optics.modulation import ModulationPath
-from escape_sim.optics.pupil import (
-    PupilGeometry,
-    actuator_positions,
-    pitch_on_pupil,
-    pupil_from_images,
-    pupil_geometry,
-)
+from escape_sim.optics.pupil import PupilGeometry, pupil_from_images, pupil_geometry
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
