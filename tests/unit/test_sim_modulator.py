@@ -29,7 +29,7 @@ def test_a_turn_is_a_whole_number_of_servo_steps() -> None:
         for asked, steps in ((303.03, 66), (300.0, 67), (500.0, 40), (0.5, 40_000)):
             assert stage.check(Modulation(RADIUS, asked)).frequency_hz == pytest.approx(1 / (steps * 50e-6))
         for asked in (2000.0, 1e-3):
-            with pytest.raises(SettingRejected, match=r"it does 0\.076 to 1000 Hz"):
+            with pytest.raises(SettingRejected, match=r"must lie in 0\.076\.\.1000 Hz"):
                 stage.check(Modulation(RADIUS, asked))
 
 

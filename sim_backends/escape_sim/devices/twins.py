@@ -1,4 +1,4 @@
-"""Simulated devices of a bench: mirror, wavefront-sensor camera, science camera, phase screens, modulator, adaptive secondary; their entry points."""
+"""Simulated devices of a bench: mirrors, cameras, phase screens, modulator; their entry points."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ from escape_sim.optics.focal_plane import FocalPlane
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
-
 _BENCH_KEY = "simulated bench"
 
 
 def shared_bench(config: SystemConfig, shared: dict[str, object]) -> SimBench:
-    """The one simulated bench behind all twins of an opened system."""
+    """The simulated bench shared by all simulated devices of an opened system."""
     bench = shared.setdefault(_BENCH_KEY, None) or SimBench(config)
     if not isinstance(bench, SimBench):
         raise TypeError(f"shared[{_BENCH_KEY!r}] holds a {type(bench).__name__}, not a SimBench")
@@ -37,7 +36,7 @@ def shared_bench(config: SystemConfig, shared: dict[str, object]) -> SimBench:
 
 
 def existing_bench(shared: dict[str, object]) -> SimBench | None:
-    """The simulated bench of an opened system, if any of its devices is a twin that has been made."""
+    """The simulated bench of an opened system, or None if no simulated device was made yet."""
     bench = shared.get(_BENCH_KEY)
     return bench if isinstance(bench, SimBench) else None
 
@@ -62,8 +61,18 @@ def make_screen(name: str, config: SystemConfig, shared: dict[str, object]) -> S
     return SimPhaseScreen(name, shared_bench(config, shared))
 
 
+def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> SimModulator:
+    """Entry point ``sim-e727``."""
+    return SimModulator(name, shared_bench(config, shared))
+
+
+def make_secondary(name: str, config: SystemConfig, shared: dict[str, object]) -> SimAdaptiveSecondary:
+    """Entry point ``sim-asm``."""
+    return SimAdaptiveSecondary(name, shared_bench(config, shared))
+
+
 class SimMirror(DeformableMirror):
-    """Twin of the ALPAO DM97: latency, settling, creep, gain scatter, saturation."""
+    """Simulated ALPAO DM97: latency, settling, creep, gain scatter, saturation."""
 
     def __init__(self, name: str, bench: SimBench) -> None:
         super().__init__(name, bench.config.devices.dm.limits.to_limits())
@@ -77,7 +86,7 @@ class SimMirror(DeformableMirror):
 
     @property
     def twin(self) -> SimBench:
-        """The simulated bench, hidden truth and all; for tests and benchmarks alone."""
+        """The simulated bench with its true state; for tests and benchmarks only."""
         return self._bench
 
     def now_ns(self) -> int:
@@ -95,7 +104,7 @@ class SimMirror(DeformableMirror):
 
 
 class _SimCamera(Camera):
-    """What both simulated cameras share: settings and limits of the sensor."""
+    """Settings, limits and frame times common to both simulated cameras."""
 
     def __init__(
         self, name: str, bench: SimBench, info: CameraInfo, settings: CameraSettings, step_s: float
@@ -111,7 +120,7 @@ class _SimCamera(Camera):
 
     @property
     def settings(self) -> CameraSettings:
-        """The settings in force."""
+        """Settings in force."""
         return self._settings
 
     def now_ns(self) -> int:
@@ -128,10 +137,10 @@ class _SimCamera(Camera):
         self._start_s, self._next_index = self._bench.now_s, 0
 
     def _stop(self) -> None:
-        """The clock simply runs on."""
+        """Nothing to stop."""
 
     def _fastest_hz(self, region: Region) -> float:
-        """Highest frame rate for a region; rows cost time, columns do not."""
+        """Highest frame rate for a region: readout time per row."""
         return 1.0 / (20e-6 + 4.65e-6 * region.height)
 
     def _check(self, want: CameraSettings) -> CameraSettings:
@@ -152,7 +161,7 @@ class _SimCamera(Camera):
         self._settings = settings
 
     def _next_frame_index(self, arrival_delay_s: float) -> int:
-        """Number of the frame to deliver next: a late reader gets the newest complete one."""
+        """Index of the next frame to deliver: for a late reader the newest complete one."""
         period = 1 / self.settings.frame_rate_hz
         n_complete = int((self._bench.now_s - self._start_s - arrival_delay_s) / period + 1e-9)
         return max(self._next_index, n_complete)
@@ -170,10 +179,10 @@ class _SimCamera(Camera):
 
 
 class SimWavefrontSensorCamera(_SimCamera):
-    """Twin of the XIMEA camera behind lenslets or pyramid: rate limits, noise, lost frames.
+    """Simulated XIMEA camera behind lenslets or pyramid: rate limits, noise, lost frames.
 
-    A modulator triggers it once per turn, or once in so many turns as its own rate comes nearest to;
-    then it exposes whole turns.
+    While a modulator runs, it triggers the camera once per cycle or once per several cycles, whichever
+    is nearest to the configured rate; an exposure lasts whole cycles.
     """
 
     def __init__(self, name: str, bench: SimBench) -> None:
@@ -190,11 +199,11 @@ class SimWavefrontSensorCamera(_SimCamera):
 
     @property
     def settings(self) -> CameraSettings:
-        """The settings in force."""
+        """Settings in force, with the modulator's trigger."""
         return self._with_trigger_period(self._settings)
 
     def _with_trigger_period(self, settings: CameraSettings) -> CameraSettings:
-        """The settings as the modulator's trigger changes them."""
+        """Settings as changed by the modulator's trigger."""
         cycle_s = self._bench.beam_path.cycle_period_s
         if cycle_s is None:
             return settings
@@ -209,7 +218,7 @@ class SimWavefrontSensorCamera(_SimCamera):
             or want.region.y + want.region.height > self._nominal.y + self._nominal.height
         ):
             raise SettingRejected(
-                self.name, f"region {want.region} leaves the lit part of the sensor, {self._nominal}"
+                self.name, f"region {want.region} is not inside the configured region {self._nominal}"
             )
         return self._with_trigger_period(super()._check(want))
 
@@ -218,7 +227,7 @@ class SimWavefrontSensorCamera(_SimCamera):
         self._period, self._first = 1 / self.settings.frame_rate_hz, 0
 
     def _update_trigger_period(self) -> None:
-        """Count on from here when the modulator has started, stopped or changed its pace."""
+        """Restart the frame times if the modulator has started, stopped or changed its frequency."""
         period = 1 / self.settings.frame_rate_hz
         if period != self._period:
             self._first, self._period = self._first + self._next_index, period
@@ -249,7 +258,7 @@ class SimWavefrontSensorCamera(_SimCamera):
 
 
 class SimScienceCamera(_SimCamera):
-    """Twin of the science camera: integrates the focal plane beside the running loop."""
+    """Simulated science camera, which integrates the focal plane while the loop runs."""
 
     def __init__(self, name: str, bench: SimBench) -> None:
         c = bench.config.devices.science
@@ -296,7 +305,7 @@ class SimScienceCamera(_SimCamera):
 
 
 class SimPhaseScreen(PhaseScreen):
-    """Twin of the changer with rotating phase screens."""
+    """Simulated changer with rotating phase screens."""
 
     def __init__(self, name: str, bench: SimBench) -> None:
         super().__init__(name)
@@ -310,13 +319,13 @@ class SimPhaseScreen(PhaseScreen):
 
     @property
     def state(self) -> ScreenState:
-        """The present state."""
+        """Present state."""
         b = self._bench
         return ScreenState(b.plates.number, b.plates.inserted, b.plates.speed_m_s, b.beam_blocked)
 
     @property
     def n_screens(self) -> int:
-        """How many screens the changer holds."""
+        """Number of screens in the changer."""
         screen = self._bench.config.devices.screen
         return len(screen.screens_r0_m) if screen else 0
 
@@ -324,7 +333,7 @@ class SimPhaseScreen(PhaseScreen):
         """Nothing to connect."""
 
     def _close(self) -> None:
-        """The plate keeps turning."""
+        """Nothing to release; the plate keeps rotating."""
 
     def _set(self, want: ScreenState) -> None:
         b = self._bench
@@ -332,22 +341,17 @@ class SimPhaseScreen(PhaseScreen):
         b.plates.set_speed(want.speed_m_s, b.now_s)
 
 
-#: Servo clock of the controller; a turn is a whole number of its steps.
+#: Servo period of the controller in seconds; a modulation cycle is a whole number of them.
 SERVO_S = 50e-6
-#: Fewest and most steps of a turn: a kilohertz is all that a loaded stage does, and its memory ends.
+#: Fewest and most servo periods of a cycle: limits of a loaded stage and of the wave tables.
 _CYCLE_STEPS = (20, 262_144)
 
 
-def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> SimModulator:
-    """Entry point ``sim-e727``."""
-    return SimModulator(name, shared_bench(config, shared))
-
-
 class SimModulator(TipTiltModulator):
-    """Twin of the PI S-330 with its E-727: a frequency that the servo clock rounds, a slow start.
+    """Simulated PI S-330 with E-727: the frequency is rounded to the servo clock, starting takes time.
 
-    It says what it was told to do, as the real one does: the ellipse, the lag between its axes and
-    the drift of its centre are seen by the beam only (``twin.pyramid``).
+    It reports the commanded modulation. Ellipticity, phase lag and centre drift (``twin.pyramid``) affect
+    only the beam.
     """
 
     def __init__(self, name: str, bench: SimBench) -> None:
@@ -363,12 +367,12 @@ class SimModulator(TipTiltModulator):
 
     @property
     def info(self) -> ModulatorInfo:
-        """Identity and reach."""
+        """Identity and range."""
         return self._info
 
     @property
     def modulation(self) -> Modulation | None:
-        """The modulation in force."""
+        """Modulation in force."""
         return self._bench.beam_path.modulation
 
     def now_ns(self) -> int:
@@ -383,12 +387,12 @@ class SimModulator(TipTiltModulator):
 
     def _check(self, want: Modulation) -> Modulation:
         steps = round(1 / (want.frequency_hz * SERVO_S))
-        least, most = _CYCLE_STEPS
-        if not least <= steps <= most:
+        fewest, most = _CYCLE_STEPS
+        if not fewest <= steps <= most:
             raise SettingRejected(
                 self.name,
-                f"frequency_hz is {want.frequency_hz:g}; it does {1 / (most * SERVO_S):.2g} to "
-                f"{1 / (least * SERVO_S):g} Hz",
+                f"frequency_hz is {want.frequency_hz:g}; it must lie in {1 / (most * SERVO_S):.2g}.."
+                f"{1 / (fewest * SERVO_S):g} Hz",
             )
         return replace(want, frequency_hz=1 / (steps * SERVO_S))
 
@@ -401,16 +405,10 @@ class SimModulator(TipTiltModulator):
         self._bench.beam_path.modulation = None
 
 
-def make_secondary(name: str, config: SystemConfig, shared: dict[str, object]) -> SimAdaptiveSecondary:
-    """Entry point ``sim-asm``."""
-    return SimAdaptiveSecondary(name, shared_bench(config, shared))
-
-
 class SimAdaptiveSecondary(AdaptiveSecondary):
-    """Twin of the MMT's 336-actuator mirror: dynamics and latency as any twin, and a shell that floats.
+    """Simulated 336-actuator secondary of the MMT: mirror dynamics, latency, and a floating shell.
 
-    The option ``lift`` of its device section, true by default, says whether opening it leads to
-    ``RUNNING``. :meth:`trip` plays a fault.
+    ``lift`` in the options of its device section (default true): opening it leads to ``RUNNING``.
     """
 
     def __init__(self, name: str, bench: SimBench) -> None:
@@ -431,14 +429,14 @@ class SimAdaptiveSecondary(AdaptiveSecondary):
         return self._bench.now_ns
 
     def trip(self, reason: str) -> None:
-        """Play a fault: coils off, the shell falls back on its reference body, latched."""
+        """Simulate a latched fault: coils off, the shell on its reference body."""
         self._shell.trip(reason)
 
     def _open(self) -> None:
         """Nothing to connect."""
 
     def _close(self) -> None:
-        """The mirror stays as it is."""
+        """Nothing to release; the shell keeps its state."""
 
     def _send_to_shell(self, command: NDArray[np.float64]) -> None:
         self._bench.drive(command)
