@@ -13,7 +13,8 @@ from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix
 from escape_hw.config.loader import load_system
 from escape_sim.mirror.influence_functions import InfluenceFunctions, actuator_positions, pitch_on_pupil
 from escape_sim.mirror.mode_surfaces import gaussian_factors, mode_derivatives, mode_surfaces
-from escape_sim.models.shack_hartmann import ShackHartmannModel, make_model
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import ShackHartmannModel
 from escape_sim.optics.pupil import pupil_geometry
 
 #: The paper's laboratory case, and one with everything far out.
@@ -40,7 +41,7 @@ class Plain:
 
 @pytest.fixture(scope="module")
 def model() -> ShackHartmannModel:
-    return make_model(load_system("razor-shwfs"), None)
+    return make_fast_model(load_system("razor-shwfs"), None)
 
 
 def difference(a, b):

@@ -17,10 +17,10 @@ from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 from escape_sim.atmosphere.von_karman import structure_function
 from escape_sim.mirror.mode_surfaces import surface_nodes
+from escape_sim.models.factory import make_fast_model
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
 from escape_sim.models.pyramid_response import slope_response
 from escape_sim.models.pyramid_turbulence import estimate_strength, sample_distances
-from escape_sim.models.shack_hartmann import make_model
 from escape_sim.oopao import models as oopao_model
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import Prism, PyramidOptics, frequencies
@@ -182,7 +182,7 @@ def test_matrices_equal_those_of_oopao(variety):
     for registration, width in ((Registration(), 1.0), (PLANTED, 1.1)):
         ours, theirs = (
             module(config, None).zonal_matrix(registration, width)
-            for module in (make_model, oopao_model.make_model)
+            for module in (make_fast_model, oopao_model.make_model)
         )
         assert ours.shape == theirs.shape
         assert np.linalg.norm(ours - theirs) < 2e-5 * np.linalg.norm(theirs)
@@ -334,7 +334,7 @@ def test_found_images_count_and_not_the_design():
     assert np.linalg.norm(one - two) > 1e-3 * np.linalg.norm(one)
 
 
-@pytest.mark.parametrize("make", [make_model, oopao_model.make_model])
+@pytest.mark.parametrize("make", [make_fast_model, oopao_model.make_model])
 def test_pupils_of_another_size_are_refused(make):
     config = configuration()
     pupils = nominal_pupils(config)

@@ -1,4 +1,4 @@
-"""The emulated controller on USB: stands in for libusb below pyusb, for a driver in the same process."""
+"""A pyusb backend with the emulated controller on its bus, for a driver in the same process."""
 
 from __future__ import annotations
 
@@ -11,22 +11,17 @@ import usb.core
 
 from escape_sim.emulators.e727.transports import UsbPipe
 
-#: Vendor's number, and one for a product whose own is not public.
+#: PI's vendor number, and a product number in place of one that is not public.
 VENDOR, PRODUCT = 0x1A72, 0x1000
 _OUT, _IN, _BULK, _PACKET = 0x02, 0x81, 0x02, 64
-#: Request of a string descriptor, and the number of the serial number's string.
+#: Request for a string descriptor, and index of the serial number's string.
 _GET_DESCRIPTOR, _STRING, _SERIAL = 0x06, 0x03, 3
 
 
 class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
-    """A bus with one controller on it; hand it to pyusb as ``backend``.
+    """A bus with one controller, to be passed to pyusb as ``backend``.
 
-    Parameters
-    ----------
-    pipe
-        The controller's endpoints.
-    busy
-        A driver of the kernel holds the interface until it is detached.
+    ``kernel_driver_active``: a kernel driver holds the interface until it is detached.
     """
 
     def __init__(self, pipe: UsbPipe, *, kernel_driver_active: bool = False) -> None:
@@ -35,11 +30,11 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         self.claimed = False
 
     def enumerate_devices(self) -> Any:
-        """The one device, unless it is unplugged."""
+        """The device, unless it is unplugged."""
         return iter([self] if self._pipe.is_plugged else [])
 
     def get_device_descriptor(self, dev: Any) -> Any:
-        """Numbers of the device."""
+        """Device descriptor."""
         return SimpleNamespace(
             bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0xFF, bDeviceSubClass=0,
             bDeviceProtocol=0, bMaxPacketSize0=_PACKET, idVendor=VENDOR, idProduct=PRODUCT, bcdDevice=0x0100,
@@ -48,7 +43,7 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: Any, config: int) -> Any:
-        """Its only configuration."""
+        """Descriptor of the only configuration."""
         if config:
             raise IndexError(config)
         return SimpleNamespace(
@@ -57,7 +52,7 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_interface_descriptor(self, dev: Any, intf: int, alt: int, config: int) -> Any:
-        """Its only interface."""
+        """Descriptor of the only interface."""
         if intf or alt:
             raise IndexError(intf)
         return SimpleNamespace(
@@ -67,51 +62,51 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_endpoint_descriptor(self, dev: Any, ep: int, intf: int, alt: int, config: int) -> Any:
-        """Bulk out, bulk in."""
+        """Descriptors of the bulk endpoints: out, in."""
         return SimpleNamespace(
             bLength=7, bDescriptorType=5, bEndpointAddress=(_OUT, _IN)[ep], bmAttributes=_BULK,
             wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
         )  # fmt: skip
 
     def open_device(self, dev: Any) -> Any:
-        """A handle."""
+        """Handle of the device."""
         return self
 
     def close_device(self, dev_handle: Any) -> None:
-        """The client has gone."""
+        """The client has disconnected."""
         self._pipe.client_session.finish()
 
     def get_configuration(self, dev_handle: Any) -> int:
-        """The only one."""
+        """Number of the only configuration."""
         return 1
 
     def set_configuration(self, dev_handle: Any, config_value: int) -> None:
-        """The only one."""
+        """Select the only configuration."""
 
     def claim_interface(self, dev_handle: Any, intf: int) -> None:
-        """For one owner, once the kernel's driver has let go."""
+        """Claim the interface; fails while a kernel driver or another owner holds it."""
         if self.kernel_driver or self.claimed:
             raise usb.core.USBError("Resource busy", -6, errno.EBUSY)
         self.claimed = True
 
     def release_interface(self, dev_handle: Any, intf: int) -> None:
-        """Let go."""
+        """Release the interface."""
         self.claimed = False
 
     def is_kernel_driver_active(self, dev_handle: Any, intf: int) -> bool:
-        """Whether the kernel holds it."""
+        """Whether a kernel driver holds the interface."""
         return self.kernel_driver
 
     def detach_kernel_driver(self, dev_handle: Any, intf: int) -> None:
-        """Take it from the kernel."""
+        """Detach the kernel driver."""
         self.kernel_driver = False
 
     def attach_kernel_driver(self, dev_handle: Any, intf: int) -> None:
-        """Give it back."""
+        """Attach the kernel driver again."""
         self.kernel_driver = True
 
     def bulk_write(self, dev_handle: Any, ep: int, intf: int, data: Any, timeout: int) -> int:
-        """To the controller."""
+        """Transfer to the controller."""
         try:
             self._pipe.write(bytes(data))
         except ConnectionError:
@@ -119,7 +114,7 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         return len(data)
 
     def bulk_read(self, dev_handle: Any, ep: int, intf: int, buff: Any, timeout: int) -> int:
-        """From the controller."""
+        """Transfer from the controller."""
         try:
             data = self._pipe.read(len(buff), timeout / 1000)
         except ConnectionError:
@@ -139,15 +134,15 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         data: Any,
         timeout: int,
     ) -> int:
-        """String descriptors only."""
+        """String descriptors; other requests fail."""
         kind, number = divmod(wValue, 256)
         if bRequest != _GET_DESCRIPTOR or kind != _STRING:
             raise usb.core.USBError("Pipe error", -9, errno.EPIPE)
         text = {1: "PI", 2: "E-727", _SERIAL: self._pipe.serial}.get(number, "")
         body = text.encode("utf-16-le") if number else b"\x09\x04"
-        answer = bytes([len(body) + 2, _STRING]) + body
-        data[: len(answer)] = type(data)(data.typecode, answer)
-        return len(answer)
+        reply = bytes([len(body) + 2, _STRING]) + body
+        data[: len(reply)] = type(data)(data.typecode, reply)
+        return len(reply)
 
 
 def _no_device_error() -> Any:
