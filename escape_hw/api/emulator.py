@@ -41,8 +41,8 @@ class EmulatorRequest:
 class Emulator(abc.ABC):
     """A device that answers on its own wire; usable as a context manager.
 
-    It is strict: whatever a careless driver gets away with on the bench for a while (a wrong order, an
-    error never asked for, a value out of range, a second owner) is written down in ``complaints``.
+    It is strict: violations of the protocol that a real device may tolerate for a while (a wrong order, an
+    error never queried, a value out of range, a second owner) are recorded in ``violations``.
     """
 
     @abc.abstractmethod
@@ -61,8 +61,8 @@ class Emulator(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def complaints(self) -> tuple[str, ...]:
-        """What clients did that a careful driver would not, in order."""
+    def violations(self) -> tuple[str, ...]:
+        """Violations of the protocol by clients, in order."""
 
     @abc.abstractmethod
     def report(self) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def test_every_call_of_a_session_in_order(arv) -> None:
         "arv_camera_create_stream", "arv_camera_start_acquisition", "arv_camera_stop_acquisition",
         "g_object_unref stream", "g_object_unref camera",
     ]  # fmt: skip
-    assert not arv.complaints
+    assert not arv.violations
     assert arv.library.escape_stand_in_leaks() == 0
 
 
@@ -68,7 +68,7 @@ def test_the_older_name_of_the_rate_switch_is_found(arv) -> None:
     with make("aravis") as camera:
         assert "arv_camera_set_boolean AcquisitionFrameRateEnabled 1" in arv.calls
         camera.next_frame(1.0)
-    assert not arv.complaints
+    assert not arv.violations
 
 
 def test_block_65535_is_followed_by_1_and_nothing_is_lost(arv) -> None:
@@ -115,7 +115,7 @@ def test_newest_skips_what_waits(arv) -> None:
         first = camera.next_frame(1.0).index
         time.sleep(0.05)
         assert camera.next_frame(1.0).index - first > 10
-    assert not arv.complaints
+    assert not arv.violations
 
 
 def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
@@ -129,7 +129,7 @@ def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
                 replace(before, region=Region(0, 0, 720, 540), exposure_s=1e-3, frame_rate_hz=500)
             )
         assert camera.settings == before
-    assert not arv.complaints
+    assert not arv.violations
 
 
 def test_what_is_wrong_at_opening(arv) -> None:
@@ -175,11 +175,11 @@ def test_a_long_time_out_never_outlasts_close(arv) -> None:
     waiter.join(10)
     assert not waiter.is_alive()
     assert isinstance(outcome[0], NotOpen)
-    assert not arv.complaints
+    assert not arv.violations
 
 
 @pytest.mark.parametrize(
-    ("misuse", "complaint"),
+    ("misuse", "violation"),
     [
         (("g_object_unref camera", "g_object_unref camera"), "g_object_unref: no such object"),
         (("stream", "g_object_unref camera"), "the camera goes before its stream"),
@@ -189,7 +189,7 @@ def test_a_long_time_out_never_outlasts_close(arv) -> None:
         (("region",), "region 1 0 100 100 does not fit the sensor"),
     ],
 )
-def test_the_stand_in_catches_what_the_real_library_leaves_undefined(arv, misuse, complaint) -> None:
+def test_the_stand_in_catches_what_the_real_library_leaves_undefined(arv, misuse, violation) -> None:
     library = AravisLibrary("science", str(arv.path))
     library.open("SIMSCI")
     library.call("camera_set_boolean", b"AcquisitionFrameRateEnable", 1)
@@ -208,7 +208,7 @@ def test_the_stand_in_catches_what_the_real_library_leaves_undefined(arv, misuse
                 library.call("camera_set_region", 1, 0, 100, 100)
         else:
             c.g_object_unref(made[step.split()[1]])
-    assert any(complaint in line for line in arv.complaints), arv.complaints
+    assert any(violation in line for line in arv.violations), arv.violations
 
 
 # ---- Aravis's own simulated camera, where the library is installed --------------------------------------

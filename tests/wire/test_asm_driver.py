@@ -49,9 +49,9 @@ def on_the_twin() -> AsmMirror:
 @parametrize_device_checks({"asm": on_the_wire})
 def test_contract(factory: Factory, check: Check) -> None:
     factory()  # starts the emulator
-    before = len(_SHARED[0].complaints)
+    before = len(_SHARED[0].violations)
     check(factory)
-    assert not _SHARED[0].complaints[before:]
+    assert not _SHARED[0].violations[before:]
 
 
 def test_an_emulator_joins_the_twin() -> None:
@@ -78,7 +78,7 @@ def test_every_call_of_a_session_arrives_in_order() -> None:
             mirror.send(shape)
             mirror.send(0.5 * shape)
         calls = [(name, what) for name, what in made.server.calls if name != "HEARTBEAT"]
-        assert made.complaints == ()
+        assert made.violations == ()
     names = [name for name, _ in calls]
     assert names == [
         "SET_STATE", "SET_STATE", "SET_STATE", "COMMAND", "COMMAND", "COMMAND", "SET_STATE", "SET_STATE",
@@ -122,7 +122,7 @@ def test_acknowledgements_bring_positions_and_times() -> None:
 
 def test_a_blind_sensor_is_nan_and_no_other() -> None:
     with emulator() as made, driver(port_of(made)) as mirror:
-        made.inject("stuck:5")
+        made.inject("unreadable:5")
         wait_for(lambda: bool(np.isnan(mirror.measured_positions()[5])), "the sensor went blind")
         assert np.isnan(mirror.measured_positions()).sum() == 1
 
@@ -165,7 +165,7 @@ def test_a_mirror_left_set_stays_set_and_is_found_so() -> None:
         assert made.controller.shell.state is ShellState.SET
         with driver(port_of(made), lift=False) as again:
             assert again.state is ShellState.SET
-        assert made.complaints == ()
+        assert made.violations == ()
 
 
 def test_many_may_look_while_one_controls() -> None:
@@ -177,14 +177,14 @@ def test_many_may_look_while_one_controls() -> None:
             assert "pid" in health.owner
             assert health.contaminated == owner.limits.disabled
         assert owner.send(np.zeros(336)).guard.is_unchanged
-        assert made.complaints == ()
+        assert made.violations == ()
 
 
 def test_nobody_looks_at_another_mirror_than_configured() -> None:
     with emulator() as made:
         with pytest.raises(DeviceError, match=r"is 'SIM336', not 'MMT336'; correct devices.dm.serial"):
             driver(port_of(made), "devices.dm.serial=MMT336").observe_health()
-        assert made.complaints == ()
+        assert made.violations == ()
 
 
 def test_a_second_owner_is_refused_and_told_who_has_it() -> None:
@@ -226,7 +226,7 @@ def test_another_mirror_than_configured_is_refused(
 
 
 def test_fresh_dust_is_told_with_the_line_to_configure() -> None:
-    with emulator(dust="17") as made, pytest.raises(SettingRejected, match=r"disabled = \[17, 248"):
+    with emulator(contaminated="17") as made, pytest.raises(SettingRejected, match=r"disabled = \[17, 248"):
         driver(port_of(made)).open()
 
 
@@ -247,7 +247,7 @@ def test_wrong_options_are_refused(word: str, message: str) -> None:
 
 
 def test_a_version_that_the_mirror_does_not_speak_is_named() -> None:
-    with emulator(versions="2,3") as made, pytest.raises(DeviceError, match="versions 2 to 3 are spoken"):
+    with emulator(versions="2,3") as made, pytest.raises(DeviceError, match="versions 2 to 3 are supported"):
         driver(port_of(made)).open()
 
 
@@ -298,7 +298,7 @@ def test_observers_see_what_the_owner_does() -> None:
                     observer.sample(30.0)
                 assert observer.fault.text == "panic, as arranged"
         owner.recover()
-        assert made.complaints == ()
+        assert made.violations == ()
 
 
 def test_an_observer_that_sleeps_gets_the_newest() -> None:

@@ -57,7 +57,7 @@ def test_real_drivers_calibrate_and_close_the_loop_as_the_twins_devices_do(serve
     assert through_drivers[1].lost == twin[1].lost
     assert server.requests[RequestKind.SEND] > 300
     for name in ("asdk", "m3api", "aravis"):
-        assert not stand_in(name).complaints
+        assert not stand_in(name).violations
 
 
 def test_the_science_camera_sees_the_same_beam(server) -> None:

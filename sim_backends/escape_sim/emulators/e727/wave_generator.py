@@ -197,7 +197,7 @@ class WaveGenerators:
             self._state.report_violation(f"WGO {name} starts with a jump of {jump:.1f} urad; MOV there first")
         if running:
             self._state.report_violation(
-                f"WGO {name} starts while {' and '.join(running)} runs: the phase between the axes is undefined"
+                f"WGO {name} starts while {' and '.join(running)} runs: their phase is undefined"
             )
 
     def queries(self) -> dict[str, Callable[[Sequence[str]], str]]:
