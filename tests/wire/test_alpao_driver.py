@@ -92,7 +92,7 @@ def test_another_library_is_told_from_the_sdk() -> None:
 
 @pytest.mark.parametrize("peeks", [0, 1])
 def test_a_failed_init_says_why_and_is_never_reset(asdk, peeks) -> None:
-    asdk.script(f"set peeks {peeks}; asdkInit 1 error 0x22; asdkInit 2 half 0x20")
+    asdk.script(f"set errors_stay {peeks}; asdkInit 1 error 0x22; asdkInit 2 invalid_handle 0x20")
     dm = make("alpao")
     with pytest.raises(DeviceError, match=r"error 0x22, no interface in the configuration.*ACECFG"):
         dm.open()

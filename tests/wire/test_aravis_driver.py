@@ -72,7 +72,7 @@ def test_the_older_name_of_the_rate_switch_is_found(arv) -> None:
 
 
 def test_block_65535_is_followed_by_1_and_nothing_is_lost(arv) -> None:
-    arv.script("set first 65530")
+    arv.script("set first_frame 65530")
     with make("aravis", "devices.science.frame_rate_hz=200", "devices.science.exposure_s=1e-3") as camera:
         indices = [camera.next_frame(1.0).index for _ in range(12)]
         assert indices == list(range(65530, 65542))
@@ -80,7 +80,7 @@ def test_block_65535_is_followed_by_1_and_nothing_is_lost(arv) -> None:
 
 
 def test_lost_and_damaged_frames_are_counted(arv) -> None:
-    arv.script("arv_stream_timeout_pop_buffer 2 lose 3; arv_stream_timeout_pop_buffer 3 error 3")
+    arv.script("arv_stream_timeout_pop_buffer 2 drop 3; arv_stream_timeout_pop_buffer 3 error 3")
     with make("aravis", "devices.science.frame_rate_hz=500", "devices.science.exposure_s=1e-3") as camera:
         indices = [camera.next_frame(1.0).index for _ in range(3)]
         assert np.diff(indices).tolist() == [4, 2]
@@ -119,7 +119,7 @@ def test_newest_skips_what_waits(arv) -> None:
 
 
 def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
-    arv.script("set step 4")
+    arv.script("set increment 4")
     with make("aravis") as camera:
         made = camera.configure(replace(camera.settings, region=Region(3, 5, 101, 33), frame_rate_hz=20))
         assert made.region == Region(0, 4, 100, 32)
@@ -182,9 +182,12 @@ def test_a_long_time_out_never_outlasts_close(arv) -> None:
     ("misuse", "violation"),
     [
         (("g_object_unref camera", "g_object_unref camera"), "g_object_unref: no such object"),
-        (("stream", "g_object_unref camera"), "the camera goes before its stream"),
+        (("stream", "g_object_unref camera"), "the camera is released before its stream"),
         (("start",), "arv_camera_start_acquisition: no stream, or no buffer in it"),
-        (("stream", "push", "start", "g_object_unref stream"), "the stream goes while the camera acquires"),
+        (
+            ("stream", "push", "start", "g_object_unref stream"),
+            "the stream is released while the camera acquires",
+        ),
         (("stream", "push", "push again"), "a buffer pushed twice"),
         (("region",), "region 1 0 100 100 does not fit the sensor"),
     ],

@@ -69,7 +69,7 @@ def test_the_order_of_calls_is_watched(asdk, c, calls, violation) -> None:
 
 
 def test_reset_after_a_failed_init_is_the_crash_of_the_real_library(asdk, c) -> None:
-    asdk.script("asdkInit 1 half 0x20")
+    asdk.script("asdkInit 1 invalid_handle 0x20")
     handle = init(c)
     c.asdkReset(handle)
     assert asdk.violations == ["asdkReset: asdkInit had failed; the real library may crash here"]
@@ -121,7 +121,7 @@ def test_the_error_stack_goes_by_reading_the_text_only(asdk, c) -> None:
     assert last(c, size=0) == (0, 0x24)
     assert last(c) == (0, 0x24)
     assert last(c)[0] == -1
-    asdk.script("set peeks 1")
+    asdk.script("set errors_stay 1")
     c.asdkInit(b"OTHER")
     assert [last(c) for _ in range(3)] == [(0, 0x24)] * 3
 
@@ -150,7 +150,7 @@ def test_a_fault_may_count_every_call(asdk, c) -> None:
     "rule", ["asdkSend 0 ignore", "asdkSend 1 explode", "asdkSend", "set range wide", "* 1 error x"]
 )
 def test_a_rule_that_means_nothing_is_refused(asdk, rule) -> None:
-    with pytest.raises(ValueError, match="rule 2 of the script means nothing"):
+    with pytest.raises(ValueError, match="rule 2 of the script is invalid"):
         asdk.script(f"# a comment\n{rule}")
 
 
@@ -181,3 +181,9 @@ def test_the_cache_lies_outside_the_package(asdk) -> None:
     assert "site-packages" not in str(asdk.path)
     assert not (asdk.path.parent / "asdk.c").exists()
     assert build_library("asdk") == asdk.path
+
+
+def test_script_words_of_version_0_1_0_are_accepted(asdk, capfd) -> None:
+    asdk.script("set peeks 1; asdkInit 1 half 0x20")
+    assert "deprecated: 'peeks' is now 'errors_stay'; the old word will be removed" in capfd.readouterr().err
+    asdk.script("asdkSend 1 lose 2")

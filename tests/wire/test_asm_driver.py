@@ -296,7 +296,7 @@ def test_observers_see_what_the_owner_does() -> None:
             for observer in observers:
                 while observer.fault is None:
                     observer.sample(30.0)
-                assert observer.fault.text == "panic, as arranged"
+                assert observer.fault.text == "panic (scripted)"
         owner.recover()
         assert made.violations == ()
 

@@ -55,7 +55,7 @@ def test_the_structure_is_laid_out_as_in_the_header() -> None:
 def test_a_wrong_size_of_the_structure_is_caught(xi, camera, size) -> None:
     camera.start()
     assert get(camera, image(size)) == 11
-    assert xi.violations == [f"xiGetImage: XI_IMG of {size} bytes is of no version of this library"]
+    assert xi.violations == [f"xiGetImage: no version of this library has an XI_IMG of {size} bytes"]
 
 
 @pytest.mark.parametrize("size", [36, 48, 52, 56, 64, 68, 180, 192, 200, 204, 228, 240, 252, 272, 280, 284])

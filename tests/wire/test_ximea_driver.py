@@ -139,7 +139,7 @@ def test_frames_are_copied_before_the_ring_turns(xi) -> None:
 
 @pytest.mark.parametrize("newest", ["true", "false"])
 def test_lost_frames_are_counted_from_the_cameras_counter(xi, newest) -> None:
-    xi.script("xiGetImage 3 lose 7")
+    xi.script("xiGetImage 3 drop 7")
     with make("ximea", f"devices.wfs.options.newest={newest}") as camera:
         first = camera.next_frame(1.0).index
         frames = [camera.next_frame(1.0) for _ in range(4)]
@@ -153,7 +153,7 @@ def test_lost_frames_are_counted_from_the_cameras_counter(xi, newest) -> None:
 
 @pytest.mark.parametrize("first", [0, 1, 2**31 - 1])
 def test_the_counter_may_begin_anywhere(xi, first) -> None:
-    xi.script(f"set first {first}")
+    xi.script(f"set first_frame {first}")
     with make("ximea") as camera:
         assert camera.next_frame(1.0).index >= first
         camera.next_frame(1.0)
