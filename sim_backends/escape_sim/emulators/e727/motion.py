@@ -6,12 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from escape_sim.emulators.e727.gcs import (
-    GcsError,
-    group_arguments,
-    parse_integer,
-    parse_number,
-)
+from escape_sim.emulators.e727.gcs import GcsError, group_arguments, parse_integer, parse_number
 from escape_sim.emulators.e727.stage import SERVO_S, Hold, Ramp, Wave
 from escape_sim.emulators.e727.state import PER_VOLT, VOLTS, ControllerState
 
