@@ -28,6 +28,7 @@ from escape_sim.optics.pupil import contaminated_pupil, pupil_geometry
 from escape_sim.optics.sensor import ModulatedOptics, SensorOptics, make_sensor_optics
 
 if TYPE_CHECKING:
+    from escape_hw.config.devices import ScienceConfig
     from escape_hw.config.system import SystemConfig
 
 #: Spawn key that separates the streams of a run from those of a bench with the same seed.
@@ -213,26 +214,25 @@ class SimBench:
         at = self.pupil.coordinates_m
         return np.asarray(x * at[None, :] + y * at[:, None], np.float32)
 
+    @property
+    def science_section(self) -> ScienceConfig:
+        """Configuration of the science camera; raises ConfigError if there is none."""
+        section = self.config.devices.science
+        if section is None:
+            raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
+        return section
+
     def focal_plane(self, shape: tuple[int, int]) -> FocalPlane:
         """Optics of the science camera for a region."""
-        science = self.config.devices.science
-        if science is None:
-            raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
-        return FocalPlane(
-            self.pupil.amplitude,
-            self.pupil.n_sub * self.pupil.n_pix,
-            self.config.system.wavelength_m,
-            science.psf_px,
-            shape,
-        )
+        diameter_px = self.pupil.n_sub * self.pupil.n_pix
+        wavelength_m, psf_px = self.config.system.wavelength_m, self.science_section.psf_px
+        return FocalPlane(self.pupil.amplitude, diameter_px, wavelength_m, psf_px, shape)
 
     def science_detector(self, shape: tuple[int, int]) -> Detector:
         """Detector of the science camera for a region."""
-        science, twin = self.config.devices.science, self.config.twin.science
-        if science is None:
-            raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
+        twin = self.config.twin.science
         detector = Detector(
-            shape, science.bit_depth, twin.full_well_e, twin.read_noise_e, twin.dark_e,
+            shape, self.science_section.bit_depth, twin.full_well_e, twin.read_noise_e, twin.dark_e,
             twin.background, twin.fixed_pattern, self._science_rng, twin.excess_noise,
         )  # fmt: skip
         self._seed_detector_noise(detector, 1)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,14 @@ from escape_sim.optics.detector import Detector
 from escape_sim.optics.focal_plane import FocalPlane
 
 if TYPE_CHECKING:
+    from escape_hw.config.devices import CameraConfig
     from escape_hw.config.system import SystemConfig
 
 _BENCH_KEY = "simulated bench"
+#: Resolution of the cameras' exposure times in seconds.
+_EXPOSURE_STEP_S = 1e-6
+Info = TypeVar("Info")
+Device = TypeVar("Device")
 
 
 def shared_bench(config: SystemConfig, shared: dict[str, object]) -> SimBench:
@@ -41,87 +47,16 @@ def existing_bench(shared: dict[str, object]) -> SimBench | None:
     return bench if isinstance(bench, SimBench) else None
 
 
-def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> SimMirror:
-    """Entry point ``sim-alpao``."""
-    return SimMirror(name, shared_bench(config, shared))
+class _Simulated(Generic[Info]):
+    """Identity, clock and connection of a simulated device, a mix-in placed before its interface."""
 
-
-def make_wfs_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> SimWavefrontSensorCamera:
-    """Entry point ``sim-ximea``."""
-    return SimWavefrontSensorCamera(name, shared_bench(config, shared))
-
-
-def make_science_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> SimScienceCamera:
-    """Entry point ``sim-science``."""
-    return SimScienceCamera(name, shared_bench(config, shared))
-
-
-def make_screen(name: str, config: SystemConfig, shared: dict[str, object]) -> SimPhaseScreen:
-    """Entry point ``sim-screen``."""
-    return SimPhaseScreen(name, shared_bench(config, shared))
-
-
-def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> SimModulator:
-    """Entry point ``sim-e727``."""
-    return SimModulator(name, shared_bench(config, shared))
-
-
-def make_secondary(name: str, config: SystemConfig, shared: dict[str, object]) -> SimAdaptiveSecondary:
-    """Entry point ``sim-asm``."""
-    return SimAdaptiveSecondary(name, shared_bench(config, shared))
-
-
-class SimMirror(DeformableMirror):
-    """Simulated ALPAO DM97: latency, settling, creep, gain scatter, saturation."""
-
-    def __init__(self, name: str, bench: SimBench) -> None:
-        super().__init__(name, bench.config.devices.dm.limits.to_limits())
-        self._bench = bench
-        self._info = bench.config.devices.dm.info("simulated ALPAO DM97-15", simulated=True)
+    _bench: SimBench
+    _info: Info
 
     @property
-    def info(self) -> DMInfo:
-        """Identity and geometry."""
-        return self._info
-
-    @property
-    def twin(self) -> SimBench:
-        """The simulated bench with its true state; for tests and benchmarks only."""
-        return self._bench
-
-    def now_ns(self) -> int:
-        """Simulated time in nanoseconds."""
-        return self._bench.now_ns
-
-    def _open(self) -> None:
-        self._bench.set_positions(np.zeros(self._info.n_act))
-
-    def _close(self) -> None:
-        """Nothing to release."""
-
-    def _send(self, command: NDArray[np.float64]) -> None:
-        self._bench.drive(command)
-
-
-class _SimCamera(Camera):
-    """Settings, limits and frame times common to both simulated cameras."""
-
-    def __init__(
-        self, name: str, bench: SimBench, info: CameraInfo, settings: CameraSettings, step_s: float
-    ) -> None:
-        super().__init__(name)
-        self._bench, self._info, self._settings, self._step_s = bench, info, settings, step_s
-        self._start_s, self._next_index = 0.0, 0
-
-    @property
-    def info(self) -> CameraInfo:
+    def info(self) -> Info:
         """Identity and fixed properties."""
         return self._info
-
-    @property
-    def settings(self) -> CameraSettings:
-        """Settings in force."""
-        return self._settings
 
     def now_ns(self) -> int:
         """Simulated time in nanoseconds."""
@@ -131,7 +66,42 @@ class _SimCamera(Camera):
         """Nothing to connect."""
 
     def _close(self) -> None:
-        """Nothing to release."""
+        """Nothing to release; the device keeps its state."""
+
+
+class SimMirror(_Simulated[DMInfo], DeformableMirror):
+    """Simulated ALPAO DM97: latency, settling, creep, gain scatter, saturation."""
+
+    def __init__(self, name: str, bench: SimBench) -> None:
+        super().__init__(name, bench.config.devices.dm.limits.to_limits())
+        self._bench = bench
+        self._info = bench.config.devices.dm.info("simulated ALPAO DM97-15", simulated=True)
+
+    @property
+    def twin(self) -> SimBench:
+        """The simulated bench with its true state; for tests and benchmarks only."""
+        return self._bench
+
+    def _open(self) -> None:
+        self._bench.set_positions(np.zeros(self._info.n_act))
+
+    def _send(self, command: NDArray[np.float64]) -> None:
+        self._bench.drive(command)
+
+
+class _SimCamera(_Simulated[CameraInfo], Camera):
+    """Settings, limits and frame times common to both simulated cameras."""
+
+    def __init__(self, name: str, bench: SimBench, section: CameraConfig, model: str) -> None:
+        super().__init__(name)
+        self._bench, self._settings = bench, section.settings()
+        self._info = CameraInfo(model, section.serial, section.sensor_px[::-1], section.bit_depth, True)
+        self._start_s, self._next_index = 0.0, 0
+
+    @property
+    def settings(self) -> CameraSettings:
+        """Settings in force."""
+        return self._settings
 
     def _start(self) -> None:
         self._start_s, self._next_index = self._bench.now_s, 0
@@ -153,8 +123,8 @@ class _SimCamera(Camera):
             )
         if not 0 <= want.gain_db <= 12:
             raise SettingRejected(self.name, f"gain_db is {want.gain_db:g}; it must lie in 0..12")
-        longest = 1 / want.frame_rate_hz
-        exposure = min(max(round(want.exposure_s / self._step_s) * self._step_s, self._step_s), longest)
+        step = _EXPOSURE_STEP_S
+        exposure = min(max(round(want.exposure_s / step) * step, step), 1 / want.frame_rate_hz)
         return CameraSettings(want.region, exposure, want.frame_rate_hz, want.gain_db)
 
     def _configure(self, settings: CameraSettings) -> None:
@@ -186,15 +156,9 @@ class SimWavefrontSensorCamera(_SimCamera):
     """
 
     def __init__(self, name: str, bench: SimBench) -> None:
-        c = bench.config.devices.wfs
-        super().__init__(
-            name,
-            bench,
-            CameraInfo("simulated XIMEA MQ013MG-ON", c.serial, c.sensor_px[::-1], c.bit_depth, True),
-            c.settings(),
-            1e-6,
-        )
-        self._nominal = Region(*c.region)
+        section = bench.config.devices.wfs
+        super().__init__(name, bench, section, "simulated XIMEA MQ013MG-ON")
+        self._nominal = Region(*section.region)
         self._period, self._first = 0.0, 0
 
     @property
@@ -261,16 +225,7 @@ class SimScienceCamera(_SimCamera):
     """Simulated science camera, which integrates the focal plane while the loop runs."""
 
     def __init__(self, name: str, bench: SimBench) -> None:
-        c = bench.config.devices.science
-        if c is None:
-            raise ConfigError(f"system {bench.config.system.name!r} has no [devices.science] section")
-        super().__init__(
-            name,
-            bench,
-            CameraInfo("simulated FLIR Grasshopper3", c.serial, c.sensor_px[::-1], c.bit_depth, True),
-            c.settings(),
-            1e-6,
-        )
+        super().__init__(name, bench, bench.science_section, "simulated FLIR Grasshopper3")
         self._plane: FocalPlane | None = None
         self._detector: Detector | None = None
 
@@ -279,9 +234,8 @@ class SimScienceCamera(_SimCamera):
         shape = (self._settings.region.height, self._settings.region.width)
         if self._plane is None or self._detector is None or self._detector.shape != shape:
             self._plane, self._detector = self._bench.focal_plane(shape), self._bench.science_detector(shape)
-        self._bench.start_integration(
-            self._plane, self._settings.exposure_s, 1 / self._settings.frame_rate_hz
-        )
+        s = self._settings
+        self._bench.start_integration(self._plane, s.exposure_s, 1 / s.frame_rate_hz)
 
     def _stop(self) -> None:
         self._bench.stop_integration()
@@ -295,27 +249,21 @@ class SimScienceCamera(_SimCamera):
         image = bench.mean_image(k, end)
         if self._detector is None:
             raise RuntimeError("the science camera is not running")
-        scale = s.exposure_s / (
-            bench.config.devices.science.exposure_s if bench.config.devices.science else 1
-        )
+        scale = s.exposure_s / bench.science_section.exposure_s
         electrons = 0.0 if bench.beam_blocked else bench.config.twin.science.photons_per_frame * scale
         data, saturated = self._detector.expose(image, electrons)
         data.flags.writeable = False
         return Frame(data, k, round(end * 1e9), bench.now_ns, saturated)
 
 
-class SimPhaseScreen(PhaseScreen):
+class SimPhaseScreen(_Simulated[ScreenInfo], PhaseScreen):
     """Simulated changer with rotating phase screens."""
 
     def __init__(self, name: str, bench: SimBench) -> None:
         super().__init__(name)
-        self._bench = bench
-
-    @property
-    def info(self) -> ScreenInfo:
-        """Identity."""
-        screen = self._bench.config.devices.screen
-        return ScreenInfo("simulated phase screens", screen.serial if screen else "", simulated=True)
+        screen = bench.config.devices.screen
+        self._bench, self._n_screens = bench, len(screen.screens_r0_m) if screen else 0
+        self._info = ScreenInfo("simulated phase screens", screen.serial if screen else "", simulated=True)
 
     @property
     def state(self) -> ScreenState:
@@ -326,14 +274,7 @@ class SimPhaseScreen(PhaseScreen):
     @property
     def n_screens(self) -> int:
         """Number of screens in the changer."""
-        screen = self._bench.config.devices.screen
-        return len(screen.screens_r0_m) if screen else 0
-
-    def _open(self) -> None:
-        """Nothing to connect."""
-
-    def _close(self) -> None:
-        """Nothing to release; the plate keeps rotating."""
+        return self._n_screens
 
     def _set(self, want: ScreenState) -> None:
         b = self._bench
@@ -347,7 +288,7 @@ SERVO_S = 50e-6
 _CYCLE_STEPS = (20, 262_144)
 
 
-class SimModulator(TipTiltModulator):
+class SimModulator(_Simulated[ModulatorInfo], TipTiltModulator):
     """Simulated PI S-330 with E-727: the frequency is rounded to the servo clock, starting takes time.
 
     It reports the commanded modulation. Ellipticity, phase lag and centre drift (``twin.pyramid``) affect
@@ -366,24 +307,9 @@ class SimModulator(TipTiltModulator):
         )
 
     @property
-    def info(self) -> ModulatorInfo:
-        """Identity and range."""
-        return self._info
-
-    @property
     def modulation(self) -> Modulation | None:
         """Modulation in force."""
         return self._bench.beam_path.modulation
-
-    def now_ns(self) -> int:
-        """Simulated time in nanoseconds."""
-        return self._bench.now_ns
-
-    def _open(self) -> None:
-        """Nothing to connect; the stage is parked."""
-
-    def _close(self) -> None:
-        """Nothing to release."""
 
     def _check(self, want: Modulation) -> Modulation:
         steps = round(1 / (want.frequency_hz * SERVO_S))
@@ -405,7 +331,7 @@ class SimModulator(TipTiltModulator):
         self._bench.beam_path.modulation = None
 
 
-class SimAdaptiveSecondary(AdaptiveSecondary):
+class SimAdaptiveSecondary(_Simulated[DMInfo], AdaptiveSecondary):
     """Simulated 336-actuator secondary of the MMT: mirror dynamics, latency, and a floating shell.
 
     ``lift`` in the options of its device section (default true): opening it leads to ``RUNNING``.
@@ -419,24 +345,9 @@ class SimAdaptiveSecondary(AdaptiveSecondary):
         noise = np.random.SeedSequence(bench.config.system.seed, spawn_key=(0xA5,))
         self._shell = Shell(bench, dm.n_act, dm.stroke_m, np.random.default_rng(noise))
 
-    @property
-    def info(self) -> DMInfo:
-        """Identity and geometry."""
-        return self._info
-
-    def now_ns(self) -> int:
-        """Simulated time in nanoseconds."""
-        return self._bench.now_ns
-
     def trip(self, reason: str) -> None:
         """Simulate a latched fault: coils off, the shell on its reference body."""
         self._shell.trip(reason)
-
-    def _open(self) -> None:
-        """Nothing to connect."""
-
-    def _close(self) -> None:
-        """Nothing to release; the shell keeps its state."""
 
     def _send_to_shell(self, command: NDArray[np.float64]) -> None:
         self._bench.drive(command)
@@ -464,3 +375,18 @@ class SimAdaptiveSecondary(AdaptiveSecondary):
             self._bench.now_ns, shell.state, shell.gap_m(), current, AMBIENT_C + RISE_C_PER_A * current, 0,
             shell.fault,
         )  # fmt: skip
+
+
+def _factory(
+    device: Callable[[str, SimBench], Device],
+) -> Callable[[str, SystemConfig, dict[str, object]], Device]:
+    """Entry point that creates a device on the shared bench of a system."""
+    return lambda name, config, shared: device(name, shared_bench(config, shared))
+
+
+make_mirror = _factory(SimMirror)
+make_wfs_camera = _factory(SimWavefrontSensorCamera)
+make_science_camera = _factory(SimScienceCamera)
+make_screen = _factory(SimPhaseScreen)
+make_modulator = _factory(SimModulator)
+make_secondary = _factory(SimAdaptiveSecondary)

@@ -133,6 +133,11 @@ class InfluenceFunctions:
         return np.asarray(np.einsum("yat,xat->ayx", along_y, along_x))
 
 
+def nominal_influence_functions(config: SystemConfig) -> InfluenceFunctions:
+    """Influence functions of the design's mirror."""
+    return InfluenceFunctions(actuator_positions(config), pitch_on_pupil(config), config.devices.dm.coupling)
+
+
 def _cross_term_weights(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weights ``(n,)`` of the powers of ``u v`` in ``exp(-q_xy u v)``.
 

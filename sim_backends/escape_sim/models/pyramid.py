@@ -14,7 +14,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.config.sensor import PyramidSection
 from escape_sim.atmosphere.von_karman import structure_function
-from escape_sim.mirror.influence_functions import InfluenceFunctions, actuator_positions, pitch_on_pupil
+from escape_sim.mirror.influence_functions import InfluenceFunctions, nominal_influence_functions
 from escape_sim.mirror.mode_surfaces import (
     N_DERIVATIVES,
     GaussianFactors,
@@ -33,7 +33,7 @@ from escape_sim.models.pyramid_turbulence import (
 )
 from escape_sim.optics.fourier_filter import next_fast_length
 from escape_sim.optics.modulation import ModulationPath
-from escape_sim.optics.pupil import pupil_from_images, pupil_geometry
+from escape_sim.optics.pupil import nominal_flux, pupil_from_images
 from escape_sim.optics.pyramid import GridRegion, Prism, PyramidOptics
 
 if TYPE_CHECKING:
@@ -65,11 +65,8 @@ _IMAGE_POSITION_ERROR_PX, _DIAGONALS = 0.1, np.array([1.0, -1.0, -1.0, 1.0])
 
 def nominal_pupils(config: SystemConfig) -> PyramidPupils:
     """The design's pupil images; valid where the design flux is sufficient."""
-    sensor, pupil = config.sensor_as(PyramidSection), pupil_geometry(config)
-    n, p = pupil.n_sub, pupil.n_pix
-    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
-    flux /= np.percentile(flux[flux > 0], 95)
-    valid = flux >= sensor.min_flux
+    sensor, flux = config.sensor_as(PyramidSection), nominal_flux(config)
+    n, valid = sensor.n_sub, flux >= sensor.min_flux
     centres = np.array(sensor.pupils_px)
     return PyramidPupils(
         centres, float(n), pupil_boxes(centres, n), valid,
@@ -119,9 +116,7 @@ class PyramidModel:
     ) -> None:
         pupil = pupil_from_images(config, pupils)
         self._config, self._pupils, self._pupil = config, pupils, pupil
-        self._positions = actuator_positions(config)
-        self._pitch = pitch_on_pupil(config)
-        self._coupling = config.devices.dm.coupling
+        self._nominal = nominal_influence_functions(config)
         self._modes = basis
         self._modulation = modulation or ModulationPath.circle(pupils.modulation)
         # The optical path changes by twice the surface.
@@ -130,7 +125,7 @@ class PyramidModel:
         if turbulence is None:
             turbulence = estimate_strength(self.optics(), pupils, _OUTER_SCALE, self._pokes)
         self.turbulence = turbulence if turbulence >= _NEGLIGIBLE_STRENGTH else 0.0
-        sigma = self._pitch / np.sqrt(2 * np.log(1 / self._coupling))
+        sigma = self._nominal.pitch_m / np.sqrt(2 * np.log(1 / self._nominal.coupling))
         self._nodes, self._interpolation = surface_nodes(pupil.coordinates_m, sigma)
         self._response = self._compute_phase_derivatives()
         self._response *= np.float32(scale)
@@ -142,7 +137,7 @@ class PyramidModel:
     @property
     def n_act(self) -> int:
         """Number of actuators."""
-        return len(self._positions)
+        return self._nominal.n_act
 
     @property
     def sub_aperture_m(self) -> float:
@@ -338,4 +333,4 @@ class PyramidModel:
         )
 
     def _influence(self, width: float) -> InfluenceFunctions:
-        return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)
+        return replace(self._nominal, width=width)

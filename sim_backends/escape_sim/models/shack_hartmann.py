@@ -19,9 +19,9 @@ from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
-from escape_sim.mirror.influence_functions import InfluenceFunctions, actuator_positions, pitch_on_pupil
+from escape_sim.mirror.influence_functions import InfluenceFunctions, nominal_influence_functions
 from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, gaussian_factors, mode_surfaces
-from escape_sim.optics.pupil import PupilGeometry, pupil_geometry
+from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_geometry
 from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
 
 if TYPE_CHECKING:
@@ -390,10 +390,7 @@ def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticMo
 
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:
     """The design's grid, centred on the camera region; valid where the design flux is sufficient."""
-    pupil = pupil_geometry(config)
-    n, p = pupil.n_sub, pupil.n_pix
-    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
-    flux /= np.percentile(flux[flux > 0], 95)
+    flux, n = nominal_flux(config), config.sensor.n_sub
     valid = flux >= config.sensor.min_flux
     pitch = config.sensor_as(ShackHartmannSection).pitch_px
     width, height = config.devices.wfs.region[2:]
@@ -430,9 +427,7 @@ class ShackHartmannModel:
                 f"the grid has {grid.valid.shape} lenslets, "
                 f"the design {self._pupil.n_sub} x {self._pupil.n_sub}"
             )
-        self._positions = actuator_positions(config)
-        self._pitch = pitch_on_pupil(config)
-        self._coupling = config.devices.dm.coupling
+        self._nominal = nominal_influence_functions(config)
         self._opd_per_command_m = 2 * config.devices.dm.stroke_m
         self._config, self._grid = config, grid
         self._variants: list[ShackHartmannModel] | None = None
@@ -442,7 +437,7 @@ class ShackHartmannModel:
     @property
     def n_act(self) -> int:
         """Number of actuators."""
-        return len(self._positions)
+        return self._nominal.n_act
 
     @property
     def sub_aperture_m(self) -> float:
@@ -532,4 +527,4 @@ class ShackHartmannModel:
         return gaussian_factors(self._influence(width), registration, self.sub_aperture_m, at, at, dtype)
 
     def _influence(self, width: float) -> InfluenceFunctions:
-        return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)
+        return replace(self._nominal, width=width)

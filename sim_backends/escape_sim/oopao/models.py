@@ -15,7 +15,7 @@ from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
-from escape_sim.mirror.influence_functions import actuator_positions, pitch_on_pupil
+from escape_sim.mirror.influence_functions import nominal_influence_functions
 from escape_sim.models.shack_hartmann import nominal_grid
 from escape_sim.oopao.library import (
     SourceAndTelescope,
@@ -42,23 +42,22 @@ class OOPAOMirror:
 
     def __init__(self, config: SystemConfig, pupil: PupilGeometry, light: SourceAndTelescope) -> None:
         n = pupil.n_sub * pupil.n_pix
-        self._pupil, self._telescope, self._dm = pupil, light.telescope, config.devices.dm
+        self._pupil, self._telescope, self._stroke_m = pupil, light.telescope, config.devices.dm.stroke_m
         # OOPAO's mirror has its n samples from edge to edge, its wavefront at pixel centres: lengths for
         # the mirror must be larger by this factor.
         self._edge_factor = n / (n - 1)
-        self._positions = actuator_positions(config)
-        self._pitch = pitch_on_pupil(config)
+        self._influence = nominal_influence_functions(config)
         self._mirrors: dict[float, Any] = {}
 
     @property
     def n_act(self) -> int:
         """Number of actuators."""
-        return len(self._positions)
+        return self._influence.n_act
 
     @property
     def unit_command_factor(self) -> float:
         """Full strokes in the difference of a push and a pull of :data:`POKE_SURFACE_M`."""
-        return self._dm.stroke_m / (2 * POKE_SURFACE_M)
+        return self._stroke_m / (2 * POKE_SURFACE_M)
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions, see :class:`SyntheticModel`."""
@@ -81,9 +80,9 @@ class OOPAOMirror:
                 self._mirrors[width] = oopao_classes().DeformableMirror(
                     telescope=self._telescope,
                     nSubap=self._pupil.n_sub,
-                    mechCoupling=self._dm.coupling,
-                    coordinates=self._positions * self._edge_factor,
-                    pitch=self._pitch * self._edge_factor * width,
+                    mechCoupling=self._influence.coupling,
+                    coordinates=self._influence.positions_m * self._edge_factor,
+                    pitch=self._influence.pitch_m * self._edge_factor * width,
                     print_dm_properties=False,
                 )
         return self._mirrors[width]

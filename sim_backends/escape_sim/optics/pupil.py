@@ -136,6 +136,14 @@ def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeome
     return PupilGeometry(n_sub, n_pix, d, x, amplitude.astype(np.float32))
 
 
+def nominal_flux(config: SystemConfig) -> NDArray[np.float64]:
+    """Flux ``(n_sub, n_sub)`` of the design's sub-apertures, 1 for a bright one."""
+    pupil = pupil_geometry(config)
+    n, p = pupil.n_sub, pupil.n_pix
+    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
+    return np.asarray(flux / np.percentile(flux[flux > 0], 95))
+
+
 def pupil_from_images(config: SystemConfig, pupils: PyramidPupils) -> PupilGeometry:
     """Pupil with the illumination of measured pyramid images.
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from escape_hw.api.emulator import Emulator, EmulatorRequest
+from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 from escape_sim.devices.twins import shared_bench
 from escape_sim.emulators.asm.connection import AsmFault, parse_fault_script
@@ -18,7 +19,7 @@ from escape_sim.emulators.faults import current_word
 from escape_sim.mirror.shell import MovingActuators, RealTimeActuators, Shell
 
 if TYPE_CHECKING:
-    from escape_hw.config.system import SystemConfig
+    pass
 
 #: Default port, as of the driver.
 PORT = 7336
@@ -64,7 +65,7 @@ class AsmEmulator(Emulator):
 
     def __init__(self, request: EmulatorRequest) -> None:
         options = _current_options(request)
-        config = request.config or _load_system(options.get("system", "maps-nir"))
+        config = request.config or load_system(options.get("system", "maps-nir"))
         on_twin = request.shared is not None
         hold, rest = (TWIN_HOLD_S, TWIN_REST_S) if on_twin else (HOLD_S, REST_S)
         dm = config.devices.dm
@@ -150,12 +151,6 @@ class AsmEmulator(Emulator):
             "requests": len(server.calls),
             "damaged_frames": server.damaged,
         }
-
-
-def _load_system(name: str) -> SystemConfig:
-    from escape_hw.config.loader import load_system
-
-    return load_system(name)
 
 
 def _positive_option(options: dict[str, str], key: str, default: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import os
 import select
@@ -9,8 +10,7 @@ import socket
 import threading
 import time
 import tty
-from collections.abc import Mapping
-from typing import Protocol
+from collections.abc import Callable, Mapping
 
 from escape_hw.errors import ConfigError
 from escape_sim.emulators.e727.controller import E727Controller
@@ -118,42 +118,57 @@ class ClientSession:
         self.final_condition = self._controller.end_session()
 
 
-class E727Server(Protocol):
+class E727Server(abc.ABC):
     """A server in its own thread, with the session of its client."""
 
-    client_session: ClientSession
+    def __init__(self, controller: E727Controller, faults: FaultInjector) -> None:
+        self._controller = controller
+        self.client_session = ClientSession(controller, faults)
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
 
+    @abc.abstractmethod
     def start(self) -> str:
         """Start; returns the address."""
 
     def stop(self) -> None:
-        """Stop."""
+        """End the connection and stop; may be repeated."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._close()
+
+    def _start_thread(self, serve: Callable[[], None]) -> None:
+        self._stop.clear()
+        self._thread = threading.Thread(target=serve, name=type(self).__name__, daemon=True)
+        self._thread.start()
+
+    @abc.abstractmethod
+    def _close(self) -> None:
+        """Close what :meth:`start` opened."""
 
 
-class TcpServer:
+class TcpServer(E727Server):
     """TCP server for one client; further clients are refused. Port 0 takes any free port."""
 
     def __init__(self, controller: E727Controller, faults: FaultInjector, host: str, port: int) -> None:
-        self._controller, self._address = controller, (host, port)
-        self.client_session = ClientSession(controller, faults)
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
+        super().__init__(controller, faults)
+        self._address = (host, port)
         self._listener: socket.socket | None = None
 
     def start(self) -> str:
         """Listen; returns ``tcp HOST:PORT``, raises ConfigError if the address cannot be used."""
         host, port = self._address
         try:
-            self._listener = socket.create_server((host, port))
+            self._listener = listener = socket.create_server((host, port))
         except OSError as error:
             raise ConfigError(
                 f"cannot listen on {host}:{port} ({error.strerror or error}); choose another --port, "
                 "0 for any"
             ) from error
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._serve, name="e727-tcp", daemon=True)
-        self._thread.start()
-        return "tcp {}:{}".format(*self._listener.getsockname()[:2])
+        self._start_thread(lambda: self._serve(listener))
+        return f"tcp {listener.getsockname()[0]}:{self.port}"
 
     @property
     def port(self) -> int:
@@ -162,20 +177,12 @@ class TcpServer:
             raise RuntimeError("the server has not been started")
         return int(self._listener.getsockname()[1])
 
-    def stop(self) -> None:
-        """Close the connection and stop listening."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+    def _close(self) -> None:
         if self._listener is not None:
             self._listener.close()
             self._listener = None
 
-    def _serve(self) -> None:
-        listener = self._listener
-        if listener is None:
-            raise RuntimeError("the server has not been started")
+    def _serve(self, listener: socket.socket) -> None:
         client: socket.socket | None = None
         while not self._stop.is_set():
             ready, _, _ = select.select([listener, *([client] if client else [])], [], [], _POLL_S)
@@ -215,14 +222,10 @@ class TcpServer:
         self.client_session.finish()
 
 
-class PtyServer:
+class PtyServer(E727Server):
     """Server on a pseudo-terminal, as on a serial line or USB-serial adapter."""
 
-    def __init__(self, controller: E727Controller, faults: FaultInjector) -> None:
-        self.client_session = ClientSession(controller, faults)
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._descriptors: tuple[int, int] | None = None
+    _descriptors: tuple[int, int] | None = None
 
     def start(self) -> str:
         """Open the terminal; returns ``pty /dev/pts/N``."""
@@ -230,18 +233,12 @@ class PtyServer:
         tty.setraw(theirs)
         # The other end is kept open here, too: reading fails when nobody has opened it.
         self._descriptors = (ours, theirs)
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._serve, args=(ours,), name="e727-pty", daemon=True)
-        self._thread.start()
+        self._start_thread(lambda: self._serve(ours))
         return f"pty {os.ttyname(theirs)}"
 
     def stop(self) -> None:
         """Close the terminal."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-        self._close()
+        super().stop()
         self.client_session.finish()
 
     def _close(self) -> None:

@@ -1,5 +1,7 @@
 """A pyusb backend with the emulated controller on its bus, for a driver in the same process."""
 
+# ruff: noqa: D102 - the methods are those of pyusb's IBackend
+
 from __future__ import annotations
 
 import errno
@@ -30,11 +32,9 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         self.claimed = False
 
     def enumerate_devices(self) -> Any:
-        """The device, unless it is unplugged."""
         return iter([self] if self._pipe.is_plugged else [])
 
     def get_device_descriptor(self, dev: Any) -> Any:
-        """Device descriptor."""
         return SimpleNamespace(
             bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0xFF, bDeviceSubClass=0,
             bDeviceProtocol=0, bMaxPacketSize0=_PACKET, idVendor=VENDOR, idProduct=PRODUCT, bcdDevice=0x0100,
@@ -43,7 +43,6 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: Any, config: int) -> Any:
-        """Descriptor of the only configuration."""
         if config:
             raise IndexError(config)
         return SimpleNamespace(
@@ -52,7 +51,6 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_interface_descriptor(self, dev: Any, intf: int, alt: int, config: int) -> Any:
-        """Descriptor of the only interface."""
         if intf or alt:
             raise IndexError(intf)
         return SimpleNamespace(
@@ -62,51 +60,41 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_endpoint_descriptor(self, dev: Any, ep: int, intf: int, alt: int, config: int) -> Any:
-        """Descriptors of the bulk endpoints: out, in."""
         return SimpleNamespace(
             bLength=7, bDescriptorType=5, bEndpointAddress=(_OUT, _IN)[ep], bmAttributes=_BULK,
             wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
         )  # fmt: skip
 
     def open_device(self, dev: Any) -> Any:
-        """Handle of the device."""
         return self
 
     def close_device(self, dev_handle: Any) -> None:
-        """The client has disconnected."""
         self._pipe.client_session.finish()
 
     def get_configuration(self, dev_handle: Any) -> int:
-        """Number of the only configuration."""
         return 1
 
     def set_configuration(self, dev_handle: Any, config_value: int) -> None:
-        """Select the only configuration."""
+        pass
 
     def claim_interface(self, dev_handle: Any, intf: int) -> None:
-        """Claim the interface; fails while a kernel driver or another owner holds it."""
         if self.kernel_driver or self.claimed:
             raise usb.core.USBError("Resource busy", -6, errno.EBUSY)
         self.claimed = True
 
     def release_interface(self, dev_handle: Any, intf: int) -> None:
-        """Release the interface."""
         self.claimed = False
 
     def is_kernel_driver_active(self, dev_handle: Any, intf: int) -> bool:
-        """Whether a kernel driver holds the interface."""
         return self.kernel_driver
 
     def detach_kernel_driver(self, dev_handle: Any, intf: int) -> None:
-        """Detach the kernel driver."""
         self.kernel_driver = False
 
     def attach_kernel_driver(self, dev_handle: Any, intf: int) -> None:
-        """Attach the kernel driver again."""
         self.kernel_driver = True
 
     def bulk_write(self, dev_handle: Any, ep: int, intf: int, data: Any, timeout: int) -> int:
-        """Transfer to the controller."""
         try:
             self._pipe.write(bytes(data))
         except ConnectionError:
@@ -114,7 +102,6 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         return len(data)
 
     def bulk_read(self, dev_handle: Any, ep: int, intf: int, buff: Any, timeout: int) -> int:
-        """Transfer from the controller."""
         try:
             data = self._pipe.read(len(buff), timeout / 1000)
         except ConnectionError:
@@ -134,7 +121,6 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         data: Any,
         timeout: int,
     ) -> int:
-        """String descriptors; other requests fail."""
         kind, number = divmod(wValue, 256)
         if bRequest != _GET_DESCRIPTOR or kind != _STRING:
             raise usb.core.USBError("Pipe error", -9, errno.EPIPE)
