@@ -44,7 +44,7 @@ _OUTER_SCALE = 4.0
 #: Pupil diameters over r0 below which turbulence does not change the response.
 _NEGLIGIBLE_STRENGTH = 0.5
 #: Systematic error of the scalings under turbulence and pokes, in % of the diameter: the limit that a mean
-#: over some twenty realisations gives (docs/decisions/0018-pyramids-in-truth.md, "Scalings that leaned").
+#: over some twenty realisations gives (docs/decisions/0018-pyramid-registration-uncertainties.md).
 _SCALING_SYSTEMATIC = 0.05
 #: Relative gain error of slopes at the rim (measured: 0.2 to 0.3): pixels saturate where pokes
 #: concentrate the light, and the pokes' effect at the rim is only approximately known.
