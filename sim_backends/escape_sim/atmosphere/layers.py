@@ -203,18 +203,11 @@ class Atmosphere:
         ):
             angle = math.radians(direction)
             layer_seed = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number))
-            self.layers.append(
-                TurbulentLayer(
-                    source,
-                    # The layers' variances are in proportion to the fractions.
-                    math.sqrt(fraction) * R0_WAVELENGTH_M / (2 * math.pi),
-                    (speed * math.cos(angle), speed * math.sin(angle)),
-                    settings.boiling_s,
-                    lit,
-                    layer_seed,
-                    executor,
-                )
-            )
+            wind = speed * math.cos(angle), speed * math.sin(angle)
+            # The layers' variances are in proportion to the fractions.
+            scale = math.sqrt(fraction) * R0_WAVELENGTH_M / (2 * math.pi)
+            layer = TurbulentLayer(source, scale, wind, settings.boiling_s, lit, layer_seed, executor)
+            self.layers.append(layer)
 
     def add(self, time_s: float, opd_m: NDArray[np.float32], strength: float = 1.0) -> None:
         """Add ``strength`` times the optical path at ``time_s`` to ``opd_m (n, n)``, in metres."""

@@ -207,13 +207,8 @@ class TurbulenceSource:
         half = np.array([[1, 0], [-1, 1], [0, 1], [1, 1]], dtype=float)
         widths = step / 3.0 ** np.arange(1, levels + 1)
         self.wave_frequencies = (half[None] * widths[:, None, None]).reshape(-1, 2)
-        self._wave_rms = np.sqrt(
-            np.concatenate(
-                [_cell_power(half[:, 0] * w, half[:, 1] * w, w, r0_m, outer_scale_m) for w in widths]
-            )
-            if levels
-            else np.empty(0)
-        )
+        power = [_cell_power(half[:, 0] * w, half[:, 1] * w, w, r0_m, outer_scale_m) for w in widths]
+        self._wave_rms = np.sqrt(np.concatenate([np.empty(0), *power]))
 
     def draw(self, rng: np.random.Generator) -> TurbulenceRealisation:
         """Draw a realisation: first the screen, then the long waves."""

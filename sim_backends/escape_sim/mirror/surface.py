@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, MeasuredInfluenceFunctions
 
 if TYPE_CHECKING:
     from escape_hw.config.twin import TwinDrift
@@ -24,28 +25,10 @@ NEGLIGIBLE_HEIGHT = 1e-6
 _GEMM_SPEEDUP = 6.0
 
 
-class InfluenceModel(Protocol):
-    """Influence functions of a mirror under any registration."""
-
-    @property
-    def n_act(self) -> int:
-        """Number of actuators."""
-
-    def surfaces(
-        self,
-        registration: Registration,
-        sub_aperture_m: float,
-        x_m: NDArray[np.float64],
-        y_m: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
-
-
-class SurfaceFunction(Protocol):
-    """Function from commands to surfaces on a fixed grid."""
-
-    def __call__(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``."""
+#: Influence functions of a mirror under any registration.
+InfluenceModel = InfluenceFunctions | MeasuredInfluenceFunctions
+#: Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``, on a fixed grid.
+SurfaceFunction = Callable[[NDArray[np.float64]], NDArray[np.float32]]
 
 
 def make_mirror_surface(
@@ -196,19 +179,9 @@ _MAX_PARAMETER_CHANGE = np.array([0.01, 0.01, 3e-4, 0.003, 0.003])
 
 
 class Flexure:
-    """True registration of the mirror as a function of time.
+    """True registration of the mirror as a function of time, from ``start`` at time zero.
 
-    Parameters
-    ----------
-    start
-        Registration at time zero.
-    drift
-        Rates, sinusoid and period.
-
-    Attributes
-    ----------
-    update_interval_s
-        Seconds after which a parameter may have changed enough for a new surface.
+    ``update_interval_s`` is the time after which a parameter may have changed enough for a new surface.
     """
 
     def __init__(self, start: Registration, drift: TwinDrift) -> None:

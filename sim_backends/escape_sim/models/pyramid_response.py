@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -27,26 +26,11 @@ def _shifted_spread(spread, row, column, light, out):  # type: ignore[no-untyped
             target[j] = line[column - j].conjugate() * amplitude[j]
 
 
-class PixelCorrelations(Protocol):
-    """Means of ``conj(E(u)) f(p) / A(p)`` for the field ``E`` at a pixel and the pupil field ``f``."""
-
-    def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
-        """Yield ``n`` rows of ``n`` or more samples for each (row, column) ``u`` in ``pixels``."""
-
-
 class ModulatedCorrelations:
     """Correlations of a modulation without turbulence: matrix products over its points.
 
-    Parameters
-    ----------
-    light
-        Pupil amplitude ``(n, n)``.
-    prism
-        Faces, for a pupil in the grid's corner.
-    n_grid
-        Side of the periodic grid in samples.
-    modulation
-        Path of the image over the pyramid.
+    Correlations are means of ``conj(E(u)) f(p) / A(p)`` for the field ``E`` at a pixel and the pupil
+    field ``f``. Parameters as for :func:`slope_response`; ``light`` is the pupil amplitude ``(n, n)``.
     """
 
     def __init__(
@@ -69,7 +53,7 @@ class ModulatedCorrelations:
         self._n = n
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
-        """Correlations of :class:`PixelCorrelations`."""
+        """Yield ``n`` rows of ``n`` or more samples for each (row, column) ``u`` in ``pixels``."""
         fields = self._fields[pixels[:, 0], pixels[:, 1]]
         yield from (fields @ self._tilts).reshape(-1, self._n, self._n)
 
@@ -77,18 +61,9 @@ class ModulatedCorrelations:
 class TurbulentCorrelations:
     """Correlations of a modulation under turbulence: one convolution with the coherence per pixel.
 
-    Not thread-safe.
-
-    Parameters
-    ----------
-    light
-        Pupil amplitude ``(n, n)``.
-    spread
-        Field at ``u`` of a point at ``p``, for ``u - p`` from ``1 - n`` on along y and x.
-    mean
-        From :func:`coherence`.
-    variation
-        Added to ``mean`` where the phase varies more.
+    ``light`` is the pupil amplitude ``(n, n)``, ``spread`` the point response from :func:`_spread`,
+    ``mean`` the :func:`coherence`, to which ``variation`` is added where the phase varies more. Not
+    thread-safe.
     """
 
     def __init__(
@@ -103,7 +78,7 @@ class TurbulentCorrelations:
         self._variation_filter = None if variation is None else _convolution(variation.difference, len(light))
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
-        """Correlations of :class:`PixelCorrelations`."""
+        """Yield ``n`` rows of ``n`` or more samples for each (row, column) ``u`` in ``pixels``."""
         n, filter_, variation_filter = len(self._light), self._filter, self._variation_filter
         for row, column in pixels:
             _shifted_spread(self._spread, n - 1 + row, n - 1 + column, self._light, filter_.field)
@@ -121,16 +96,14 @@ class TurbulentCorrelations:
             yield filter_.result
 
 
+PixelCorrelations = ModulatedCorrelations | TurbulentCorrelations
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CoherenceVariation:
-    """Coherence that is interpolated linearly between two, depending on the position.
+    """Coherence interpolated between two: half the weight of the second, and its difference to the first.
 
-    Parameters
-    ----------
-    half_share
-        Half the weight ``(n, n)`` of the second.
-    difference
-        The second less the first ``(2 n - 1, 2 n - 1)``, see :func:`coherence`.
+    ``half_share`` is ``(n, n)`` and ``difference`` ``(2 n - 1, 2 n - 1)``, see :func:`coherence`.
     """
 
     half_share: NDArray[np.float32]

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
-from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, require_kind
+from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 from escape_sim.mirror.influence_functions import nominal_influence_functions
-from escape_sim.models.shack_hartmann import nominal_grid
+from escape_sim.models.factory import model_geometry
 from escape_sim.oopao.library import (
     SourceAndTelescope,
     make_lenslets,
@@ -186,14 +186,10 @@ def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticMo
     CalibrationError
         The grid does not fit the design.
     """
-    if config.sensor.kind == "pyramid":
-        from escape_sim.models.pyramid import nominal_pupils
-
-        pupils = nominal_pupils(config) if grid is None else require_kind(grid, PyramidPupils)
-        return OOPAOPyramidModel(config, pupils)
-    return OOPAOShackHartmannModel(
-        config, nominal_grid(config) if grid is None else require_kind(grid, SubApertureGrid)
-    )
+    geometry = model_geometry(config, grid)
+    if isinstance(geometry, PyramidPupils):
+        return OOPAOPyramidModel(config, geometry)
+    return OOPAOShackHartmannModel(config, geometry)
 
 
 class OOPAOShackHartmannModel(OOPAOPushPullModel):

@@ -174,22 +174,18 @@ class OOPAOShackHartmann:
         line = np.arange(n_sub) * pitch_px
         self._first: list[NDArray[np.intp]] = []
         self._to_pixels: list[NDArray[np.float64]] = []
-        for start, length in zip(origin_px, shape[::-1], strict=True):
+        for start, length, numbers in zip(origin_px, shape[::-1], self._lit.T[::-1], strict=True):
             centres = np.asarray(start + line, dtype=np.float64)
             first = first_pixels(centres, field)
             pixels = first[:, None] + np.arange(field) - centres[:, None]
             self._first.append(first)
             self._to_pixels.append(camera_pixel_matrix(pixels, n_pix, spot_px))
-            self._require_inside(first, length)
-
-    def _require_inside(self, first: NDArray[np.intp], length: int) -> None:
-        axis = self._lit[:, 1] if len(self._first) == 1 else self._lit[:, 0]
-        used = first[axis]
-        if used.min() < 0 or used.max() + self._field > length:
-            raise ValueError(
-                f"lit lenslets fall outside the region of {self.shape[1]} x {self.shape[0]} pixels; "
-                "enlarge the camera region or move the grid's origin"
-            )
+            used = first[numbers]
+            if used.min() < 0 or used.max() + field > length:
+                raise ValueError(
+                    f"lit lenslets fall outside the region of {shape[1]} x {shape[0]} pixels; "
+                    "enlarge the camera region or move the grid's origin"
+                )
 
     def frame(
         self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None

@@ -106,17 +106,8 @@ _TiltConverter = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 class BeamPath:
     """Path of the simulated beam on the pyramid, commanded by the modulator or by an emulated stage.
 
-    Parameters
-    ----------
-    config
-        Tilt per lambda/D and the true imperfections (``twin.pyramid``).
-    phase
-        Phase of the centre's drift along x and y in radians ``(2,)``.
-
-    Attributes
-    ----------
-    modulation
-        Commanded modulation; None when parked.
+    The true imperfections are those of ``twin.pyramid``; ``phase (2,)`` is the phase of the centre's drift
+    along x and y in radians. ``modulation`` is the commanded modulation, None when parked.
     """
 
     def __init__(self, config: SystemConfig, phase: NDArray[np.float64]) -> None:

@@ -112,18 +112,8 @@ def _add_power(field, power):  # type: ignore[no-untyped-def]  # pragma: no cove
 class FourierKernel:
     """Power of a field behind the prism, summed over modulation points, by Fourier transforms.
 
-    Not thread-safe: use one kernel per thread.
-
-    Parameters
-    ----------
-    prism
-        The faces.
-    n
-        Pupil samples across the field.
-    n_grid
-        Side of the periodic grid, even.
-    rows
-        Number of output rows wanted, from row 0 on.
+    ``n`` is the number of pupil samples across the field, ``n_grid`` the even side of the periodic grid,
+    ``rows`` the number of output rows wanted from row 0 on. Not thread-safe: use one kernel per thread.
     """
 
     def __init__(self, prism: Prism, n: int, n_grid: int, rows: int) -> None:
@@ -221,12 +211,8 @@ class SeparableKernel:
     ``A field B^T``. Both matrices are symmetric under reversal, so even and odd parts of the field
     are propagated separately with half the work. Not thread-safe: use one kernel per thread.
 
-    Parameters
-    ----------
-    shift_x, shift_y
-        Half the distance of the images along x and y in samples.
-    n, n_grid
-        Pupil samples across the field, and side of the grid around whose centre the images are; even.
+    ``shift_x`` and ``shift_y`` are half the distances of the images in samples; ``n`` and ``n_grid``, the
+    pupil samples and the grid around whose centre the images are, are even.
     """
 
     def __init__(self, shift_x: float, shift_y: float, n: int, n_grid: int) -> None:
@@ -414,16 +400,9 @@ class PyramidOptics:
 
 
 class GridRegion:
-    """Position of a square grid of samples on the camera region.
+    """Position on a camera region ``shape`` of a square grid around pupil images ``centres_px (4, 2)``.
 
-    Parameters
-    ----------
-    centres_px
-        Centres ``(4, 2)`` of the pupil images on the region.
-    shape
-        Region (rows, columns).
-    grid, samples
-        Side of the square in camera pixels, and samples across a camera pixel.
+    The square has ``grid`` camera pixels with ``samples`` samples across each.
     """
 
     def __init__(

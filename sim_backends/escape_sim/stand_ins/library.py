@@ -75,32 +75,26 @@ def _compile(compiler: str, name: str, sources: dict[str, bytes], target: Path) 
     """Compile in a temporary folder and move the result, so that no incomplete library is ever loaded."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        _compile_in_place(compiler, name, sources, target)
+        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+            for file, text in sources.items():
+                (Path(folder) / file).write_bytes(text)
+            command = [compiler, *_FLAGS, f"{name}.c", "-o", target.name, *_LIBS]
+            done = subprocess.run(
+                command, cwd=folder, capture_output=True, text=True, check=False, timeout=_COMPILE_S
+            )
+            if done.returncode != 0:
+                raise StandInUnavailable(
+                    f"{compiler} did not compile the stand-in of {name}; is its C library installed "
+                    f"(Debian: libc6-dev)?\n{done.stderr.strip()}"
+                )
+            os.replace(Path(folder) / target.name, target)
+    except subprocess.TimeoutExpired as error:
+        raise StandInUnavailable(f"{compiler} did not compile the stand-in of {name}: {error}") from error
     except OSError as error:
         raise StandInUnavailable(
             f"the stand-in of {name} was not compiled: {error}; is {target.parent} writable? "
             "XDG_CACHE_HOME chooses another place"
         ) from error
-
-
-def _compile_in_place(compiler: str, name: str, sources: dict[str, bytes], target: Path) -> None:
-    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-        for file, text in sources.items():
-            (Path(folder) / file).write_bytes(text)
-        out = Path(folder) / target.name
-        command = [compiler, *_FLAGS, f"{name}.c", "-o", str(out), *_LIBS]
-        try:
-            done = subprocess.run(
-                command, cwd=folder, capture_output=True, text=True, check=False, timeout=_COMPILE_S
-            )
-        except subprocess.TimeoutExpired as error:
-            raise StandInUnavailable(f"{compiler} did not compile the stand-in of {name}: {error}") from error
-        if done.returncode != 0:
-            raise StandInUnavailable(
-                f"{compiler} did not compile the stand-in of {name}; is its C library installed "
-                f"(Debian: libc6-dev)?\n{done.stderr.strip()}"
-            )
-        os.replace(out, target)
 
 
 class StandIn:

@@ -119,7 +119,6 @@ class AsmConnection(asyncio.Protocol):
         self.closed_by_server = False
         self.last_frame_s = time.monotonic()
 
-    # ------------------------------------------------------------------ transport
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """A client has connected."""
         self._transport = cast(asyncio.Transport, transport)
@@ -165,7 +164,6 @@ class AsmConnection(asyncio.Protocol):
         if self._transport is not None and data:
             self._transport.write(data)
 
-    # ------------------------------------------------------------------ requests
     def data_received(self, data: bytes) -> None:
         """Process every complete request; of several commands at once only the newest is applied."""
         if self._is_stalled:
@@ -199,7 +197,6 @@ class AsmConnection(asyncio.Protocol):
         self.last_frame_s = time.monotonic()
         self._send_reply(kind, payload, fault)
 
-    # ------------------------------------------------------------------ faults of the link
     def _apply_connection_fault(self, kind: str) -> None:
         self.closed_by_server = kind != "stall"
         if kind == "stall":

@@ -80,7 +80,6 @@ class AsmController:
         self._transition: tuple[ShellState, float] | None = None
         self._failed_checks = 0
 
-    # ------------------------------------------------------------------ state
     @property
     def out_of_service(self) -> set[int]:
         """Contaminated or disabled actuators."""
@@ -138,7 +137,6 @@ class AsmController:
             self._failed_checks = 0
             self.shell.recover()
 
-    # ------------------------------------------------------------------ commands
     def command(self, metres: NDArray[np.float32], absolute: bool) -> tuple[int, int]:
         """Apply or skip a finite shape ``(n_act,)``; returns result code and number of changed values."""
         wanted = metres.astype(np.float64)
@@ -166,7 +164,6 @@ class AsmController:
             self._finish_transition(ShellState.SET)
         return protocol.SKIPPED
 
-    # ------------------------------------------------------------------ periodic checks
     def tick(self, now: float, since_last_frame_s: float) -> str:
         """Check watchdog and alarms; returns the fault if one was found.
 
@@ -196,7 +193,6 @@ class AsmController:
         self.trip(alarm)
         return alarm
 
-    # ------------------------------------------------------------------ readings
     def positions_m(self) -> NDArray[np.float64]:
         """Measured positions ``(n_act,)`` in metres from flat; NaN where unreadable."""
         return self.shell.measure_positions() * self.shell.stroke_m - self.flat_m

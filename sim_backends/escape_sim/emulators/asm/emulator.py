@@ -66,12 +66,10 @@ class AsmEmulator(Emulator):
     def __init__(self, request: EmulatorRequest) -> None:
         options = _current_options(request)
         config = request.config or load_system(options.get("system", "maps-nir"))
-        on_twin = request.shared is not None
-        hold, rest = (TWIN_HOLD_S, TWIN_REST_S) if on_twin else (HOLD_S, REST_S)
         dm = config.devices.dm
-        actuators: MovingActuators
         bench = shared_bench(config, request.shared) if request.shared is not None else None
-        actuators = bench or RealTimeActuators(dm.n_act, config.twin.mirror.settling_s)
+        hold, rest = (HOLD_S, REST_S) if bench is None else (TWIN_HOLD_S, TWIN_REST_S)
+        actuators: MovingActuators = bench or RealTimeActuators(dm.n_act, config.twin.mirror.settling_s)
         noise = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(0xA5,)))
         limits = dm.limits
         slew = limits.max_slew if limits.max_slew is not None else 2.0
@@ -85,10 +83,8 @@ class AsmEmulator(Emulator):
             speed=_positive_option(options, "transition_speed", 1.0),
             pass_time=None if bench is None else lambda s: bench.advance_to(bench.now_s + s),
         )  # fmt: skip
-        low, high = (int(_positive_option({"versions": v}, "versions", 1)) for v in _version_option(options))
-        self.server = AsmServer(
-            self.controller, dm.serial, parse_fault_script(options.get("fault", "")), (low, high)
-        )
+        faults, versions = parse_fault_script(options.get("fault", "")), _version_option(options)
+        self.server = AsmServer(self.controller, dm.serial, faults, versions)
         self._host, self._port = request.host, PORT if request.port is None else request.port
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -164,11 +160,12 @@ def _positive_option(options: dict[str, str], key: str, default: float) -> float
     return value
 
 
-def _version_option(options: dict[str, str]) -> tuple[str, str]:
-    low, comma, high = options.get("versions", "1,1").partition(",")
-    if not comma:
-        raise ConfigError(f"--option versions={low}: write LOWEST,HIGHEST")
-    return low, high
+def _version_option(options: dict[str, str]) -> tuple[int, int]:
+    text = options.get("versions", "1,1")
+    low, _, high = text.partition(",")
+    if not (low.isdigit() and high.isdigit()):
+        raise ConfigError(f"--option versions={text}: write LOWEST,HIGHEST")
+    return int(low), int(high)
 
 
 def _actuator_option(text: str, n_act: int) -> set[int]:

@@ -84,7 +84,6 @@ def encode_frame(kind: int, sequence: int, now_ns: int, payload: bytes) -> bytes
     return head + zlib.crc32(head).to_bytes(4, "little") + payload + zlib.crc32(payload).to_bytes(4, "little")
 
 
-# --------------------------------------------------------------------- requests
 def read_hello(payload: bytes) -> tuple[int, int, int, int, str]:
     """Lowest and highest version, role, token and name of the client."""
     low, high, role, _, token = struct.unpack("<BBBBQ", payload[:12])
@@ -117,7 +116,6 @@ def read_text(payload: bytes) -> str:
     return payload[2:].decode()
 
 
-# --------------------------------------------------------------------- replies
 def encode_text(string: str) -> bytes:
     """Text with its length in front."""
     data = string.encode()[:65535]

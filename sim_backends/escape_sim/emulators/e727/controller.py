@@ -89,7 +89,6 @@ class E727Controller:
             "TNR?": lambda _: f"{len(recorder.sources)}\n", "DRL?": recorder.lengths, "DRR?": recorder.read,
         }  # fmt: skip
 
-    # ------------------------------------------------------------------ transport
     def receive(self, data: bytes) -> list[str | None]:
         """Split received bytes; returns the commands that they complete, for :meth:`execute`."""
         with self.lock:
@@ -160,8 +159,6 @@ class E727Controller:
             return bytes([0xB0 if busy else 0xB1, 0x0A])
         return f"{reply[line]}\n".encode()
 
-    # ------------------------------------------------------------------ administration
-
     def _help(self, args: Sequence[str]) -> str:
         return format_lines(
             ["The following commands are valid:", *sorted([*self._handlers, "ERR?", "#5", "#7", "#9", "#24"])]
@@ -229,7 +226,6 @@ class E727Controller:
             self._unread_command = ""
             self._build_handlers()
 
-    # ------------------------------------------------------------------ optics
     def steady_cycle(self) -> tuple[float, NDArray[np.float64]] | None:
         """Modulation cycle of the settled stage: seconds, and true positions ``(_SAMPLES, 2)`` in urad.
 

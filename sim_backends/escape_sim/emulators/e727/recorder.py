@@ -36,14 +36,9 @@ class DataRecorder:
         self._next_step = 0
 
     @property
-    def capacity(self) -> int:
-        """Points of each table."""
-        return POINTS // TABLES
-
-    @property
     def running(self) -> bool:
         """Whether it records: started, and tables not full."""
-        return self._start_step >= 0 and self._length() < self.capacity
+        return self._start_step >= 0 and self._length() < POINTS // TABLES
 
     def start(self) -> None:
         """Clear the tables and record from now on."""
@@ -62,7 +57,7 @@ class DataRecorder:
     def _record(self, first: int, tracks: dict[str, NDArray[np.float64]]) -> None:
         count = len(next(iter(tracks.values())))
         steps = np.arange(max(self._next_step, first), first + count)
-        steps = steps[(steps - self._start_step) % self.rate == 0][: self.capacity - self._length()]
+        steps = steps[(steps - self._start_step) % self.rate == 0][: POINTS // TABLES - self._length()]
         for table, chunks in self._recorded.items():
             axis, option = self.sources[table]
             track = (
@@ -75,7 +70,6 @@ class DataRecorder:
         if not self.running:
             self._stage.remove_listener(self._record)
 
-    # ------------------------------------------------------------------ commands
     def configure(self, args: Sequence[str]) -> None:
         """``DRC table trajectory option``."""
         for text, axis, option in group_arguments(args, 3):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +14,6 @@ from scipy.signal import cont2discrete, lfilter, lfilter_zi
 SERVO_S = 50e-6
 #: Servo steps after which a transient has decayed (0.4 s).
 TRANSIENT_STEPS = 8192
-
-
-class Trajectory(Protocol):
-    """Targets of an axis as a function of the servo step."""
-
-    def at(self, steps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Targets at servo steps."""
 
 
 @dataclass(frozen=True)
@@ -52,20 +44,9 @@ class Ramp:
 
 @dataclass(frozen=True, eq=False)
 class Wave:
-    """Playback of a wave table.
+    """Playback of a wave table from servo step ``start`` on, with ``rate`` servo steps per point.
 
-    Parameters
-    ----------
-    table
-        Targets.
-    start
-        Servo step of the first point.
-    rate
-        Servo steps per point.
-    cycles
-        Number of repetitions; 0 is endless.
-    interpolate
-        Whether to interpolate linearly between points.
+    ``cycles`` 0 is endless; ``interpolate`` connects the points linearly.
     """
 
     table: NDArray[np.float64]
@@ -90,6 +71,10 @@ class Wave:
             return targets
         following = self.table[(point + 1) % n]
         return np.asarray(targets + (following - targets) * (part / self.rate))
+
+
+#: Targets of an axis as a function of the servo step.
+Trajectory = Hold | Ramp | Wave
 
 
 @cache
