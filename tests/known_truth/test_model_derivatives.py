@@ -126,7 +126,7 @@ def test_surfaces_of_modes_and_their_derivatives_equal_those_of_the_actuators():
 def test_unequal_actuators_have_no_closed_form():
     positions = np.zeros((3, 2))
     for odd in ({"wing": 0.1}, {"gain": np.ones(3)}, {"width": np.ones(3)}):
-        with pytest.raises(ValueError, match="equal Gaussian"):
+        with pytest.raises(ValueError, match="equal width and gain"):
             gaussian_factors(
                 InfluenceFunctions(positions, 1.0, 0.4, **odd), Registration(), 1.0, np.ones(2), np.ones(2)
             )

@@ -25,7 +25,7 @@ PATIENCE_S = 30.0
 
 @contextmanager
 def emulator(**options: object) -> Iterator[AsmEmulator]:
-    """An emulator on a free port; its steps are quick and its watchdog is patient unless told otherwise."""
+    """An emulator on a free port; by default with fast transitions and a long watchdog time-out."""
     chosen = {"transition_speed": 1000, "hold_s": 20, "rest_s": 60, **options}
     made = make_emulator(EmulatorRequest(port=0, options={k: str(v) for k, v in chosen.items()}))
     assert isinstance(made, AsmEmulator)

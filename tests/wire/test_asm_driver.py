@@ -98,7 +98,7 @@ def test_every_call_of_a_session_arrives_in_order() -> None:
     assert not sent[2].any()
 
 
-def test_disabled_actuators_are_told_and_never_driven() -> None:
+def test_disabled_actuators_are_reported_and_never_driven() -> None:
     off = [7, 248, 249, 250, 251, 307, 308, 309, 310, 311, 312]
     with emulator() as made, driver(port_of(made), f"devices.dm.limits.disabled={off}") as mirror:
         assert made.server.calls[0] == ("SET_DISABLED", (tuple(off), "devices.dm.limits.disabled"))
@@ -180,14 +180,14 @@ def test_many_may_look_while_one_controls() -> None:
         assert made.violations == ()
 
 
-def test_nobody_looks_at_another_mirror_than_configured() -> None:
+def test_another_serial_number_is_refused() -> None:
     with emulator() as made:
         with pytest.raises(DeviceError, match=r"is 'SIM336', not 'MMT336'; correct devices.dm.serial"):
             driver(port_of(made), "devices.dm.serial=MMT336").observe_health()
         assert made.violations == ()
 
 
-def test_a_second_owner_is_refused_and_told_who_has_it() -> None:
+def test_a_second_owner_is_refused_with_the_name_of_the_first() -> None:
     with emulator() as made, driver(port_of(made)) as owner:
         with pytest.raises(DeviceError, match=r"not owner.*pid \d+ controls it"):
             driver(port_of(made)).open()
@@ -225,7 +225,7 @@ def test_another_mirror_than_configured_is_refused(
         assert not [name for name, _ in made.server.calls if name in ("SET_STATE", "COMMAND")]
 
 
-def test_fresh_dust_is_told_with_the_line_to_configure() -> None:
+def test_new_contamination_is_reported_with_the_line_to_configure() -> None:
     with emulator(contaminated="17") as made, pytest.raises(SettingRejected, match=r"disabled = \[17, 248"):
         driver(port_of(made)).open()
 
@@ -310,7 +310,7 @@ def test_an_observer_that_sleeps_gets_the_newest() -> None:
             wait_for(lambda: time.monotonic_ns() - first.time_ns > 0.5e9, "time passes")
             behind = time.monotonic_ns() - observer.sample(30.0).time_ns
             assert behind < 0.4e9
-            wait_for(lambda: _told_health(observer), "health every second")
+            wait_for(lambda: _has_health(observer), "health every second")
             made.stop()
             with pytest.raises(DeviceError, match="link to"):
                 _watch_on(observer)
@@ -323,12 +323,12 @@ def _watch_on(observer: AsmObserver) -> None:
         observer.sample(30.0)
 
 
-def _told_health(observer: AsmObserver) -> bool:
+def _has_health(observer: AsmObserver) -> bool:
     observer.sample(30.0)
     return observer.health is not None
 
 
-def test_silence_is_told_to_an_observer() -> None:
+def test_silence_is_reported_to_an_observer() -> None:
     with emulator() as made, AsmObserver("watch", "127.0.0.1", port_of(made)) as observer:
         made.controller.parameters["telemetry_hz"] = 1e-9
         with contextlib.suppress(FrameTimeout):

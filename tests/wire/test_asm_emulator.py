@@ -22,7 +22,7 @@ from escape_sim.emulators.asm.connection import AsmConnection
 from escape_sim.emulators.asm.emulator import AsmEmulator
 
 
-def told(payload: bytes) -> tuple[int, str]:
+def refusal(payload: bytes) -> tuple[int, str]:
     """Code and text of a NAK."""
     return struct.unpack_from("<H", payload, 4)[0], w.read_text(payload[8:])
 
@@ -58,7 +58,7 @@ def running(client: RawClient) -> int:
 def test_a_bad_beginning_is_refused(request_: bytes, code: int, words: str) -> None:
     with emulator() as made, RawClient(port_of(made)) as client:
         client.send(request_)
-        found, text = told(client.reply(w.NAK))
+        found, text = refusal(client.reply(w.NAK))
         assert found == code
         assert words in text
         assert any(words in violation for violation in made.violations)
@@ -84,7 +84,7 @@ def test_a_request_out_of_order_or_form_is_refused(kind: int, payload: bytes, co
         client.send(hello(1))
         client.reply(w.WELCOME)
         client.send(frame(kind, 2, payload))
-        found, text = told(client.reply(w.NAK))
+        found, text = refusal(client.reply(w.NAK))
         assert found == code
         assert words in text
         assert any(words in violation for violation in made.violations)
@@ -103,13 +103,13 @@ def test_commands_that_are_not_fresh_finite_and_alone_are_refused() -> None:
             (command(last + 4, 7, float("inf")), "not finite"),
         ):
             client.send(data)
-            assert words in told(client.reply(w.NAK))[1]
+            assert words in refusal(client.reply(w.NAK))[1]
         assert made.controller.applied == 1
         assert made.controller.present_m[0] == pytest.approx(1e-7)
         # Several at once: only the newest is applied.
         client.send(command(last + 5, 8, 1e-7) + command(last + 6, 9, 2e-7) + command(last + 7, 10, 3e-7))
-        assert "newer" in told(client.reply(w.NAK))[1]
-        assert "newer" in told(client.reply(w.NAK))[1]
+        assert "newer" in refusal(client.reply(w.NAK))[1]
+        assert "newer" in refusal(client.reply(w.NAK))[1]
         client.reply(w.ACK)
         assert made.controller.applied == 2
         assert made.controller.present_m[0] == pytest.approx(3e-7)
@@ -126,12 +126,12 @@ def test_a_clock_that_runs_backwards_is_noticed() -> None:
         assert made.violations == ("test's clock runs backwards",)
 
 
-def test_who_only_watches_moves_nothing() -> None:
+def test_an_observer_cannot_command() -> None:
     with emulator() as made, RawClient(port_of(made)) as client:
         client.send(hello(1, role=1))
         client.reply(w.WELCOME)
         client.send(frame(w.SET_STATE, 2, bytes([1])))
-        assert "from an observer" in told(client.reply(w.NAK))[1]
+        assert "from an observer" in refusal(client.reply(w.NAK))[1]
         assert made.controller.shell.state is ShellState.OFF
         assert client.reply(w.TELEM)
 
@@ -207,7 +207,7 @@ def in_pieces(connection: AsmConnection, wire: Wire, data: bytes, places: list[i
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(1, 4), st.lists(st.integers(0, 6000), max_size=8))
-def test_commands_in_any_pieces_are_applied_whole_and_once(count: int, places: list[int]) -> None:
+def test_commands_in_any_fragments_are_applied_once(count: int, places: list[int]) -> None:
     made, connection, wire = offline()
     data = b"".join(command(1 + k, k, k * 1e-7) for k in range(1, count + 1))
     in_pieces(connection, wire, data, places)
@@ -222,7 +222,7 @@ def test_commands_in_any_pieces_are_applied_whole_and_once(count: int, places: l
 
 @settings(deadline=None, max_examples=100)
 @given(st.integers(0, 2000), st.integers(0, 255), st.booleans(), st.lists(st.integers(0, 2000), max_size=4))
-def test_no_command_that_was_not_whole_is_applied(
+def test_incomplete_commands_are_not_applied(
     where: int, byte: int, cut_short: bool, places: list[int]
 ) -> None:
     made, connection, wire = offline()

@@ -1,4 +1,4 @@
-"""The link to an adaptive secondary fails in every way: each ends in the promised state, and says so."""
+"""Every failure of the link to an adaptive secondary ends in the promised state and is reported."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from escape_sim.emulators.asm.emulator import AsmEmulator
 
 #: Requests of the session below; more are tried than it has.
 N_CALLS = 34
-#: Off and at rest; set, the shell floats flat under its own control and follows nobody.
+#: Off and at rest; set, the shell floats flat under its own control and follows no commands.
 SAFE = (ShellState.OFF, ShellState.RESTED, ShellState.SET)
 
 
@@ -48,7 +48,7 @@ def ends_safe(fault: str) -> tuple[str, str, AsmEmulator]:
         return said, str(made.controller.shell.state), made
 
 
-def test_a_reset_at_every_call_ends_at_rest_and_is_told() -> None:
+def test_a_reset_at_every_call_ends_at_rest_and_is_reported() -> None:
     with ThreadPoolExecutor(12) as pool:
         results = list(pool.map(ends_safe, [f"reset@{n}" for n in range(N_CALLS)]))
     met = [n for n, (_, _, made) in enumerate(results) if made.server.requests > n]
@@ -63,7 +63,7 @@ def test_a_reset_at_every_call_ends_at_rest_and_is_told() -> None:
 
 
 @pytest.mark.parametrize("fault", ["close", "truncate", "crc", "stale", "stall", "garbage", "delay:3"])
-def test_every_fault_of_the_wire_is_told_and_ends_at_rest(fault: str) -> None:
+def test_every_fault_of_the_link_is_reported_and_ends_at_rest(fault: str) -> None:
     said, _, _ = ends_safe(f"{fault}@12")
     assert "link to 127.0.0.1" in said
     assert "open it again" in said
@@ -136,7 +136,7 @@ def test_numbers_begin_anew_after_four_thousand_million() -> None:
         assert made.violations == ()
 
 
-def test_a_mirror_that_comes_back_dirty_is_not_taken_over() -> None:
+def test_a_mirror_that_returns_contaminated_is_not_controlled() -> None:
     with emulator() as made:
         mirror = driver(port_of(made), heartbeat_s=0.02, retry_s=0.05).open()
         made.inject("contaminate:12")
@@ -150,12 +150,12 @@ def test_a_mirror_that_comes_back_dirty_is_not_taken_over() -> None:
             mirror.close()
 
 
-def test_who_comes_back_takes_over_from_his_own_half_open_connection() -> None:
+def test_a_client_that_reconnects_replaces_its_own_half_open_connection() -> None:
     with emulator() as made:
         mirror = driver(port_of(made), reply_s=0.3, heartbeat_s=0.02, retry_s=0.05).open()
         first = made.server.owner
         assert first is not None
-        first._is_stalled = True  # the way back is cut, and nobody tells either side
+        first._is_stalled = True  # replies are lost without an error on either side
         wait_for(lambda: made.server.owner not in (None, first), "the same client owns it anew")
         wait_for(lambda: mirror._link.is_up, "the link is up")
         mirror.close()
@@ -176,7 +176,7 @@ def test_a_rest_while_the_link_was_gone_is_not_undone() -> None:
         mirror.close()
 
 
-# --------------------------------------------------------------------- nobody there
+# --------------------------------------------------------------------- no peer
 @contextlib.contextmanager
 def blackhole() -> Iterator[int]:
     """A port that takes connections and never says a word."""
@@ -184,7 +184,7 @@ def blackhole() -> Iterator[int]:
         yield server.getsockname()[1]
 
 
-def test_a_port_that_never_answers_is_told() -> None:
+def test_a_port_that_never_answers_is_reported() -> None:
     with blackhole() as port:
         mirror = driver(port, reply_s=0.2)
         with pytest.raises(DeviceLost, match=r"no answer within 0\.2 s"):
@@ -194,14 +194,14 @@ def test_a_port_that_never_answers_is_told() -> None:
             mirror.observe_health()
 
 
-def test_a_port_where_nobody_listens_is_told() -> None:
+def test_a_closed_port_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(DeviceLost, match=r"nobody answers at 127.0.0.1:\d+ .* check host, port"):
         driver(port).open()
 
 
-def test_a_peer_that_speaks_something_else_is_told() -> None:
+def test_a_peer_with_another_protocol_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as pool:
 
         def greet() -> None:
@@ -215,7 +215,7 @@ def test_a_peer_that_speaks_something_else_is_told() -> None:
         answered.result()
 
 
-def test_an_unplugged_mirror_is_told_and_is_there_again_when_it_is_back() -> None:
+def test_an_unplugged_mirror_is_reported_and_recovers() -> None:
     with emulator() as made:
         port = port_of(made)
         mirror = driver(port).open()
@@ -300,7 +300,7 @@ def test_a_fault_of_another_hour_is_heard_while_nothing_is_sent() -> None:
         mirror.recover()
 
 
-def test_an_owner_that_hangs_does_not_own_for_ever() -> None:
+def test_an_owner_that_hangs_loses_ownership() -> None:
     with emulator(hold_s=0.1, rest_s=0.3) as made, RawClient(port_of(made)) as stopped:
         stopped.send(hello(1))
         stopped.reply(asm_wire.WELCOME)
@@ -308,7 +308,7 @@ def test_an_owner_that_hangs_does_not_own_for_ever() -> None:
         assert stopped.hung_up()
 
 
-def test_a_rest_by_the_watchdog_is_told_with_its_reason() -> None:
+def test_a_rest_by_the_watchdog_is_reported_with_its_reason() -> None:
     with emulator() as made, driver(port_of(made)) as mirror:
         made.inject("watchdog")
         with pytest.raises(DeviceError, match=r"is rested and follows no commands \(the watchdog rested it"):

@@ -186,7 +186,7 @@ def test_looking_at_a_closed_stage_moves_nothing(emulator):
     assert found.frequency_hz == pytest.approx(303.03, rel=1e-4)
 
 
-def test_somebody_elses_stop_is_noticed(emulator):
+def test_a_stop_by_another_client_is_noticed(emulator):
     with driver(emulator) as stage:
         stage.modulate(CIRCLE)
         emulator.controller.execute("\x18")
@@ -218,7 +218,7 @@ def test_limits_are_the_controllers_own(emulator):
             stage.check(Modulation(1e-4, 1500.0))
 
 
-def test_auto_zero_that_fails_is_told(emulator):
+def test_auto_zero_that_fails_is_reported(emulator):
     emulator.controller.state.axes["2"].zero_failed = True
     with pytest.raises(
         DeviceError, match=r"refused 'ATZ 2': error 98, auto-zero failed; is the platform free"
@@ -253,7 +253,7 @@ def test_ctrl_c_during_auto_zero_stops_the_sweep(emulator):
     assert not stage.is_open
 
 
-def test_a_second_client_is_refused_and_told_why(emulator):
+def test_a_second_client_is_refused_with_a_reason(emulator):
     with driver(emulator), pytest.raises(DeviceLost, match=r"one at a time"):
         driver(emulator).open()
     assert emulator.violations == (

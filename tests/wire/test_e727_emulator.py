@@ -159,13 +159,13 @@ def test_a_stage_follows_as_its_second_order_says(servo):
     servo.wait(0.1)
     track = servo.table("DRR? 1 400 1 2 3")
     angle = np.exp(-2j * np.pi * np.arange(400) / 40)
-    x, y, told = (2 / 400 * (column - 1000) @ angle for column in track.T)
-    assert abs(told) == pytest.approx(100.0, rel=1e-6)
+    x, y, target = (2 / 400 * (column - 1000) @ angle for column in track.T)
+    assert abs(target) == pytest.approx(100.0, rel=1e-6)
     # 500 Hz; the closed loop is held for a servo period, which makes it half a period later.
     for found, lag, (f0, damping) in ((x, 0, (900.0, 0.75)), (y, 90, (750.0, 0.8))):
         s = 1j * 500 / f0
         ideal = 1 / (s**2 + 2 * damping * s + 1) * np.exp(-1j * np.pi * 500 * SERVO_S)
-        there = found / told * np.exp(1j * np.radians(lag))
+        there = found / target * np.exp(1j * np.radians(lag))
         assert there == pytest.approx(ideal, rel=5e-3)
 
 
@@ -281,7 +281,7 @@ def test_wrong_options_are_refused(options, says):
         make_emulator(EmulatorRequest(port=0, options=options))
 
 
-def test_a_port_in_use_is_told():
+def test_a_port_in_use_is_reported():
     with make_emulator(EmulatorRequest(port=0)) as first:
         second = make_emulator(EmulatorRequest(port=first.server.port))
         with pytest.raises(ConfigError, match="choose another --port"):
