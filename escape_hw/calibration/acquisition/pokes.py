@@ -7,8 +7,8 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.config.choices import PokePattern
 from escape_hw.config.renamed import present_value
-from escape_hw.config.system import PokePattern
 
 #: How strongly shaped pokes alternate in sign. More gains little (:func:`~.pokes.information_gain`) and asks
 #: the mirror for ever larger steps.

@@ -26,19 +26,19 @@ from escape_hw.calibration.sprint.normal_equations import Priors
 from escape_hw.calibration.sprint.slope_weights import HUBER_ITERATIONS, apply_model_weights, huber_weights
 from escape_hw.calibration.sprint.solvers import MAX_STEP, SolverContext, SprintSolution, solve
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
-from escape_hw.config.renamed import present_value
-from escape_hw.config.system import (
+from escape_hw.config.choices import (
     ACTUATOR_MODELS,
     LOSSES,
     MODES_CHOICES,
     SOLVERS,
     ActuatorModel,
-    CalibrationSection,
     ExtraParameter,
     Loss,
     ModesChoice,
     Solver,
 )
+from escape_hw.config.renamed import present_value
+from escape_hw.config.system import CalibrationSection
 from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 
 

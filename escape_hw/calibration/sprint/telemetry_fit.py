@@ -34,7 +34,7 @@ from escape_hw.calibration.docrime.whitening import (
 )
 from escape_hw.calibration.sprint.fit import fit_registration
 from escape_hw.calibration.sprint.normal_equations import Priors
-from escape_hw.config.system import ActuatorModel, ExtraParameter, Loss, Solver
+from escape_hw.config.choices import ActuatorModel, ExtraParameter, Loss, Solver
 from escape_hw.errors import TooFewFrames
 
 #: Rounds of registration, response, whitener and scatter; a fifth changes nothing that matters.
