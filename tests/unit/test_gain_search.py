@@ -28,7 +28,7 @@ def test_a_best_gain_at_the_edge_of_the_scan_is_none(monkeypatch, top, limit):
         yield
 
     monkeypatch.setattr(gain_search, "close_loop", loop)
-    found, runs = run(gain_search.best_gain(None, fake_results.matrix(), None))
+    found, runs = run(gain_search.find_best_gain(None, fake_results.matrix(), None))
     assert len(runs) <= len(gain_search.GAIN_FRACTIONS) + 4
     assert min(tried) <= found <= max(tried)
     if top < limit:
@@ -43,4 +43,4 @@ def test_a_loop_that_closes_at_no_gain_says_so(monkeypatch):
 
     monkeypatch.setattr(gain_search, "close_loop", loop)
     with pytest.raises(CalibrationError, match=r"none of the gains .*0\.05"):
-        run(gain_search.best_gain(None, fake_results.matrix(), None))
+        run(gain_search.find_best_gain(None, fake_results.matrix(), None))
