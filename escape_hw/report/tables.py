@@ -148,7 +148,7 @@ def strehl_table(loops: Mapping[str, LoopResult]) -> Table:
 
 
 def _format_gain(loop: LoopResult) -> str:
-    error = f" ± {loop.gain_sigma:.3f}" if math.isfinite(loop.gain_sigma) else ""
+    error = f" ± {loop.gain_sigma:.3f}" if loop.gain_sigma is not None else ""
     return f"{loop.gain:.3f}{error}"
 
 

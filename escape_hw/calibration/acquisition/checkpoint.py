@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import math
 import time
@@ -13,11 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
-from escape_hw.config.system import SystemConfig
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.io.fits.run_state import RunState, load_state, save_state
 
@@ -141,18 +138,10 @@ def _require_same_run(path: Path, saved: Mapping[str, Any], now: Mapping[str, An
         raise IncompatibleProduct(f"{path}: its modal basis is not this system's; start a new run")
 
 
-def _changed_keys(saved: str, now: str) -> set[str]:
+def _changed_keys(one: str, other: str) -> set[str]:
     """Keys whose values differ between two configurations as TOML text."""
-    a, b = _parse_configuration(saved), _parse_configuration(now)
+    a, b = dict(_flatten_keys(tomllib.loads(one))), dict(_flatten_keys(tomllib.loads(other)))
     return {key for key in a.keys() | b.keys() if a.get(key) != b.get(key)}
-
-
-def _parse_configuration(text: str) -> dict[str, Any]:
-    """Values of a configuration by key, in the present names of the keys where it is valid."""
-    document = tomllib.loads(text)
-    with contextlib.suppress(ValidationError):
-        document = tomllib.loads(SystemConfig.model_validate(document).to_toml())
-    return dict(_flatten_keys(document))
 
 
 def _flatten_keys(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:

@@ -20,7 +20,7 @@ which depends on the pokes alone, after ``D (sum x z^T - c sum z z^T)`` was subt
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,18 +50,18 @@ class InstrumentalEquations:
         ``sum z z^T`` ``(n_modes, n_modes)``.
     """
 
-    cross: NDArray[np.floating]
-    command_poke_products: NDArray[np.floating]
-    poke_products: NDArray[np.floating]
+    cross: NDArray[Any]
+    command_poke_products: NDArray[Any]
+    poke_products: NDArray[Any]
 
     @staticmethod
     def from_rows(
-        slopes: NDArray[np.floating], commands: NDArray[np.floating], pokes: NDArray[np.floating]
+        slopes: NDArray[Any], commands: NDArray[Any], pokes: NDArray[Any]
     ) -> InstrumentalEquations:
         """Sums of rows ``(n, n_slopes)``, ``(n, n_modes)`` and ``(n, n_modes)``."""
         return InstrumentalEquations(slopes.T @ pokes, commands.T @ pokes, pokes.T @ pokes)
 
-    def solve(self, damping: float = 0.0) -> NDArray[np.floating]:
+    def solve(self, damping: float = 0.0) -> NDArray[Any]:
         """Matrix ``(n_slopes, n_modes)``; ``damping`` is relative to the mean diagonal of ``sum x z^T``."""
         products = self.command_poke_products
         if damping:
@@ -77,7 +77,7 @@ class InstrumentalEquations:
         products, factor = self.command_poke_products, cho_factor(self.poke_products, check_finite=False)
         return np.asarray(products @ cho_solve(factor, products.T, check_finite=False))
 
-    def poke_response(self, matrix: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.floating]:
+    def poke_response(self, matrix: NDArray[Any], factor: float = 1.0) -> NDArray[Any]:
         """``sum y z^T`` less what a matrix attributes to the controller ``(n_slopes, n_modes)``.
 
         ``factor`` is the part of a poke that remains in the command after the loop's response to it.
@@ -285,7 +285,8 @@ class ForgettingSums(InstrumentalEquations):
     def zeros(cls, n_slopes: int, n_modes: int) -> ForgettingSums:
         """Empty sums."""
         square = (n_slopes, n_slopes) if n_slopes <= MAX_CORRELATED_SLOPES else (n_slopes,)
-        return cls(np.zeros((n_slopes, n_modes)), *np.zeros((3, n_modes, n_modes)), np.zeros(square))
+        products, poke_products, gram = np.zeros((3, n_modes, n_modes))
+        return cls(np.zeros((n_slopes, n_modes)), products, poke_products, gram, np.zeros(square))
 
     def forget(self, factor: float) -> None:
         """Multiply the weights of all frames so far by ``factor``."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -139,7 +138,7 @@ class LoopTask(TaskWithMatrix):
             self._recorder = LoopTelemetryRecorder(self._record, grid.n_slopes, bench.dm.info.n_act)
             bench.callbacks = self._recorder.callbacks
         model = gain = None
-        gain_sigma = math.nan
+        gain_sigma = None
         if self._strehl and bench.science is not None:
             model = yield from model_psf(bench)
         if self._search_gain:
