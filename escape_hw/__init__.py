@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from escape_hw.calibration.docrime.closed_loop import docrime_closed_loop
     from escape_hw.calibration.docrime.open_loop import docrime
     from escape_hw.calibration.escape.method import escape
-    from escape_hw.calibration.loop.gain_search import best_gain
+    from escape_hw.calibration.loop.gain_search import find_best_gain
     from escape_hw.calibration.loop.performance import close_loop
     from escape_hw.calibration.push_pull.procedure import push_pull
     from escape_hw.calibration.sprint.fit import sprint
@@ -89,7 +89,6 @@ _PUBLIC_MODULES = {
     "System": "escape_hw.runtime.session.system",
     "Target": "escape_hw.calibration.acquisition.stopping",
     "TipTiltModulator": "escape_hw.api.modulator",
-    "best_gain": "escape_hw.calibration.loop.gain_search",
     "bundled_systems": "escape_hw.config.bundled",
     "close_loop": "escape_hw.calibration.loop.performance",
     "connect": "escape_hw.remote.client",
@@ -97,6 +96,7 @@ _PUBLIC_MODULES = {
     "docrime_closed_loop": "escape_hw.calibration.docrime.closed_loop",
     "errors": "escape_hw.errors",
     "escape": "escape_hw.calibration.escape.method",
+    "find_best_gain": "escape_hw.calibration.loop.gain_search",
     "find_sensor": "escape_hw.calibration.acquisition.sensor_setup",
     "load_matrix": "escape_hw.io.fits.matrix",
     "load_system": "escape_hw.config.loader",
@@ -148,7 +148,6 @@ __all__ = [
     "Target",
     "TipTiltModulator",
     "__version__",
-    "best_gain",
     "bundled_systems",
     "close_loop",
     "connect",
@@ -156,6 +155,7 @@ __all__ = [
     "docrime_closed_loop",
     "errors",
     "escape",
+    "find_best_gain",
     "find_sensor",
     "load_matrix",
     "load_system",
@@ -172,7 +172,7 @@ __all__ = [
 
 
 #: Names of version 0.1.0 -> present names; they will go with version 0.3.0.
-_RENAMED = {"Measured": "Estimate", "closed_loop": "close_loop"}
+_RENAMED = {"Measured": "Estimate", "best_gain": "find_best_gain", "closed_loop": "close_loop"}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,1 +1,4 @@
-"""DO-CRIME: estimation of interaction matrix, temporal response and whitening filter from random pokes, and the open- and closed-loop measurements. The numerics are pure; ``acquisition``, ``open_loop`` and ``closed_loop`` move hardware."""
+"""DO-CRIME: interaction matrix and temporal response from random pokes, in open and closed loop.
+
+The modules ``acquisition``, ``open_loop`` and ``closed_loop`` move hardware; the others are pure numerics.
+"""
