@@ -87,9 +87,9 @@ def test_a_single_product_is_a_run_of_its_own(folder):
 def test_nothing_can_be_started(folder):
     source = ReplaySource(folder)
     assert source.procedures() == ()
-    with pytest.raises(ConfigError, match="recording"):
+    with pytest.raises(ConfigError, match="recorded run"):
         source.plan("escape", {})
-    assert "recording" in READ_ONLY_REASON
+    assert "recorded run" in READ_ONLY_REASON
 
 
 def test_what_is_no_run_is_refused(folder, tmp_path):
