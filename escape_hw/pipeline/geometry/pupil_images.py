@@ -34,7 +34,7 @@ _COMPRESSION, _COMPRESSION_VIGNETTED = 1.0, 0.25
 #: Ratio of the first harmonic of a vignetted rim, which is taken for a shift, to the second to fourth ones.
 _FIRST_HARMONIC = 1.4
 #: Errors in pixels of the shadow beyond its scatter over time, because the light is uneven on its scale, and
-#: of rim and shadow together (docs/decisions/0018-pyramids-in-truth.md).
+#: of rim and shadow together (docs/decisions/0018-pyramid-registration-uncertainties.md).
 _SHADOW_SIGMA_PX, _COMMON_SIGMA_PX = 0.02, 0.018
 #: Fewest lit pixels of an image.
 _MIN_VALID = 12
