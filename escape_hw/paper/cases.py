@@ -166,7 +166,7 @@ def load_finished(folder: Path, kind: str, asked: Mapping[str, Any]) -> dict[str
     document = read_result(folder)
     if document.get("command") != f"reproduce {kind}":
         raise ConfigError(f"{folder} holds the run of 'escape {document.get('command')}'; take another --out")
-    kept = document.get("asked", asked)
+    kept = document.get("request", asked)
     if kept != asked:
         raise ConfigError(
             f"{folder} was run with {_format_request(kept)}; asked for is {_format_request(asked)}: give the same --share, --set "

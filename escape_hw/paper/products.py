@@ -80,8 +80,8 @@ def save_comparison(
         if result.partial
         else [criteria.sprint_converged("ESCAPE", estimate), *criteria.loop_criteria(result.loops)]
     )
-    if not result.partial and estimate is not None and record.planted is not None:
-        checks.insert(1, criteria.injected_value_recovered("ESCAPE", estimate, record.planted))
+    if not result.partial and estimate is not None and record.injected is not None:
+        checks.insert(1, criteria.injected_value_recovered("ESCAPE", estimate, record.injected))
     if not result.partial and result.gains is not None:
         checks.append(criteria.gains_converged(result.gains))
     labels: dict[str, Any] = {product_key(label): {"label": label} for label in result.calibrations}
@@ -140,9 +140,9 @@ def save_table1(
         checks.append(criteria.sprint_converged(column, calibration.registration))
         if calibration.registration is not None:
             estimates[column] = calibration.registration
-            if record.planted is not None:
+            if record.injected is not None:
                 checks.append(
-                    criteria.injected_value_recovered(column, calibration.registration, record.planted)
+                    criteria.injected_value_recovered(column, calibration.registration, record.injected)
                 )
     if len(estimates) == 2:
         checks += criteria.short_and_long_agree(*estimates.values())

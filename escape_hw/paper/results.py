@@ -263,7 +263,7 @@ def _figures(kind: str, run: RunContent) -> Iterator[tuple[str, str, Figure]]:
     for label, estimate in run.estimates().items():
         if estimate.iterations:
             caption = f"{name}: convergence of SPRINT {label}".strip()
-            yield f"{kind}-convergence", caption, figures_registration.convergence(estimate, run.planted)
+            yield f"{kind}-convergence", caption, figures_registration.convergence(estimate, run.injected)
             break
     matrices = run.matrices()
     if matrices and kind != "table1" and not kind.startswith("sweep"):

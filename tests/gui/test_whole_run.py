@@ -14,13 +14,13 @@ from escape_hw.io.fits.matrix import load_matrix
 from escape_hw.remote.state import Finish, FinishedRun
 
 
-def planted(ended: FinishedRun) -> Registration:
-    return Registration(**ended.document["planted"])
+def injected(ended: FinishedRun) -> Registration:
+    return Registration(**ended.document["injected"])
 
 
 def recovered(ended: FinishedRun) -> None:
-    """The registration is the planted one, within five of its standard errors."""
-    truth = planted(ended).to_dict()
+    """The registration is the injected one, within five of its standard errors."""
+    truth = injected(ended).to_dict()
     for name in PARAMETERS:
         found = ended.document["registration"][name]
         assert abs(found["value"] - truth[name]) < 5 * found["sigma"], name

@@ -163,5 +163,5 @@ def _show(
 
     context.show(status_line(record.simulated, result.partial), *format_calibration(result))
     if result.registration is not None:
-        context.show(rich_table(registration_table({"": result.registration}, record.planted)))
+        context.show(rich_table(registration_table({"": result.registration}, record.injected)))
     context.show(*format_criteria(document["criteria"]), *format_products(document["products"]))

@@ -253,7 +253,7 @@ def _run_case(
         with context.bench(selection) as bench:
             from escape_hw.runtime.session.record import BenchRecord
 
-            record = replace(BenchRecord.from_bench(bench), asked=asked)
+            record = replace(BenchRecord.from_bench(bench), request=asked)
             result, stop = context.run_keeping_partial(case.procedure(bench, **counts))
         with context.protect_saving(stop):
             document = case.save(folder, record, result, context.wall_seconds)
@@ -281,8 +281,8 @@ def _show_registration(context: CommandContext, columns: dict[str, Any], documen
     from escape_hw.report.tables import registration_table
 
     found = {label: item.registration for label, item in columns.items() if item.registration is not None}
-    planted = Registration(**document["planted"]) if document["planted"] else None
-    context.show(rich_table(registration_table(found, planted)))
+    injected = Registration(**document["injected"]) if document["injected"] else None
+    context.show(rich_table(registration_table(found, injected)))
 
 
 def _show_criteria(context: CommandContext, document: dict[str, Any]) -> None:

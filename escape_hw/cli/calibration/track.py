@@ -68,10 +68,10 @@ def _show(
     context.show(status_line(record.simulated, result.partial))
     found = {name: Estimate(**value) for name, value in document["registration"].items()}
     if found:
-        planted = Registration(**document["planted_end"]) if document["planted_end"] else None
-        context.show(rich_table(parameters_table({"": found}, planted)))
-    if document["planted_note"]:
-        context.show(document["planted_note"])
+        injected = Registration(**document["injected_end"]) if document["injected_end"] else None
+        context.show(rich_table(parameters_table({"": found}, injected)))
+    if document["injected_note"]:
+        context.show(document["injected_note"])
     if result.optical_gain.size:
         value, sigma = result.optical_gain.mean(), result.optical_gain_sigma.mean()
         context.show(f"optical gain beside the first matrix: {value:.3f} ± {sigma:.3f}")

@@ -53,7 +53,7 @@ def _show_run(context: CommandContext, folder: Path) -> None:
     document = run.document
     context.show(f"{document['command']} on {document['system']}", status_line(run.simulated, run.partial()))
     if run.estimates():
-        context.show(rich_table(registration_table(run.estimates(), run.planted)))
+        context.show(rich_table(registration_table(run.estimates(), run.injected)))
     for gains in run.gains.values():
         context.show(rich_table(rounds_table(gains)))
     if run.loops:
