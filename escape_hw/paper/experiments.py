@@ -30,27 +30,6 @@ PAPER_REGISTRATION = (
 
 
 @dataclass(slots=True)
-class CalibrationComparison:
-    """Several calibrations of one system, each with its loop.
-
-    ``loops`` are the runs at each matrix's own best gain, ``scans`` the runs that found it, both by
-    label; ``rescaled_calibration`` is ESCAPE's matrix as the bootstrap of the optical gains leaves it; ``sky_time``
-    holds error curves over a few random plants; ``notes`` say what went wrong on the way; ``partial`` is
-    true when the operator stopped it early.
-    """
-
-    calibrations: dict[str, CalibrationResult] = field(default_factory=dict)
-    loops: dict[str, LoopResult] = field(default_factory=dict)
-    scans: dict[str, list[LoopResult]] = field(default_factory=dict)
-    sky_time: dict[str, Any] | None = None
-    gains: GainsResult | None = None
-    rescaled_calibration: CalibrationResult | None = None
-    notes: list[str] = field(default_factory=list)
-    partial: bool = False
-    __repr__ = short_repr
-
-
-@dataclass(slots=True)
 class Table1Result:
     """ESCAPE with few and with many frames (paper, Table 1), by the heading of the column."""
 
@@ -108,83 +87,12 @@ def reproduce_shwfs(
     return result
 
 
-def measure_matrices(bench: Bench, frames: int, result: CalibrationComparison) -> Procedure[None]:
-    """Add the calibrations "push-pull", "DO-CRIME" and "ESCAPE", the latter two from the same frames.
-
-    Parameters
-    ----------
-    bench
-        An open bench.
-    frames
-        Frames of the DO-CRIME measurement.
-    result
-        Takes the calibrations; ``partial`` is set when one of them was stopped.
-    """
-    baseline = yield from calibrate_with_method(bench, "push-pull")
-    result.calibrations["push-pull"] = baseline
-    result.partial = baseline.partial
-    if result.partial:
-        return
-    found = yield from calibrate_with_method(bench, "escape", frames=frames)
-    result.partial = found.partial
-    if found.partial:
-        # Stopped before SPRINT: what there is is a DO-CRIME matrix.
-        result.calibrations["DO-CRIME"] = found
-        return
-    measured = measured_calibration(found)
-    if measured is not None:
-        result.calibrations["DO-CRIME"] = measured
-    result.calibrations["ESCAPE"] = found
-
-
 def _close_loops(bench: Bench, loop_frames: int, result: CalibrationComparison) -> Procedure[None]:
     model = yield from model_psf(bench)
     for label, calibration in result.calibrations.items():
         yield from close_loop_at_best_gain(bench, label, calibration, loop_frames, model, result)
         if result.partial:
             return
-
-
-def close_loop_at_best_gain(
-    bench: Bench,
-    label: str,
-    calibration: CalibrationResult,
-    loop_frames: int,
-    model: NDArray[np.float32],
-    result: CalibrationComparison,
-) -> Procedure[None]:
-    """Find a matrix's own best gain, close the loop with it, and add both to the result.
-
-    Parameters
-    ----------
-    bench
-        An open bench with a science camera.
-    label
-        What the matrix is called in the result.
-    calibration
-        The matrix, and the geometry that it belongs to.
-    loop_frames
-        Frames of the loop at the best gain.
-    model
-        PSF to measure Strehl ratios against.
-    result
-        Takes the runs; ``partial`` is set when one of them was stopped.
-
-    Raises
-    ------
-    CalibrationError
-        No gain gives a stable loop.
-    """
-    from escape_hw.calibration.loop.gain_search import best_gain
-    from escape_hw.calibration.loop.performance import close_loop
-
-    matrix, grid = calibration.matrix, calibration.grid
-    gain, scan = yield from best_gain(bench, matrix, grid, model_psf=model)
-    result.scans[label] = list(scan)
-    result.partial = any(run.partial for run in scan)
-    if not result.partial:
-        loop = yield from close_loop(bench, matrix, grid, gain=gain, frames=loop_frames, model_psf=model)
-        result.loops[label], result.partial = loop, loop.partial
 
 
 def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -> Procedure[Table1Result]:
@@ -208,22 +116,8 @@ def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -
     return result
 
 
-def measured_calibration(result: CalibrationResult) -> CalibrationResult | None:
-    """The DO-CRIME matrix behind an ESCAPE matrix as a calibration of its own."""
-    if result.measured is None:
-        return None
-    return replace(result, matrix=result.measured, measured=None, registration=None, notes=())
-
-
-#: What is added to a matrix's label when it is scaled by its optical gains.
-WITH_GAINS = " + OG"
 #: Pokes in closed loop (paper: 0.1 to 0.2 % of the stroke).
 CLOSED_POKE = 0.002
-
-#: Relative standard error of the gains that a round of the paper's 20,000 frames reaches with pokes that
-#: cost one percent of the Strehl ratio.
-GAIN_ACCURACY = 0.015
-
 
 def reproduce_pywfs(
     bench: Bench, *, frames: int = SHORT_FRAMES, closed_frames: int = 10_000, loop_frames: int = 5000
@@ -270,67 +164,6 @@ def reproduce_pywfs(
     return result
 
 
-def measure_matrices_on_one_geometry(
-    bench: Bench, frames: int, result: CalibrationComparison
-) -> Procedure[None]:
-    """Add the calibrations "push-pull", "DO-CRIME" and "ESCAPE" with the geometry of the last for all.
-
-    See :func:`~escape_hw.paper.experiments.measure_matrices`.
-    """
-    found = yield from calibrate_with_method(bench, "escape", frames=frames)
-    measured, result.partial = measured_calibration(found), found.partial
-    if found.partial:
-        # Stopped before SPRINT: what there is is a DO-CRIME matrix.
-        result.calibrations["DO-CRIME"] = found
-        return
-    baseline = yield from calibrate_with_method(bench, "push-pull", grid=found.grid)
-    result.calibrations["push-pull"], result.partial = baseline, baseline.partial
-    if measured is not None:
-        result.calibrations["DO-CRIME"] = measured
-    result.calibrations["ESCAPE"] = found
-
-
-def measure_optical_gains(
-    bench: Bench, frames: int, result: CalibrationComparison, *, accuracy: float = GAIN_ACCURACY
-) -> Procedure[tuple[CalibrationResult, NDArray[np.float32]]]:
-    """Add the optical gains of all matrices, found in closed loop on ESCAPE's.
-
-    Parameters
-    ----------
-    bench
-        An open bench with a science camera.
-    frames
-        Frames per round at most.
-    result
-        With the matrices; takes the gains, and ``partial`` when they were stopped.
-    accuracy
-        Relative standard error of the gains to go on for.
-
-    Returns
-    -------
-    rescaled : CalibrationResult
-        ESCAPE's, scaled.
-    model : ndarray of float32, ``(rows, columns)``
-        The model PSF.
-    """
-    from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
-    from escape_hw.calibration.sprint.synthetic_matrix import static_light_matrix
-
-    model = yield from model_psf(bench)
-    found = result.calibrations["ESCAPE"]
-    beside = {label: one.matrix for label, one in result.calibrations.items() if label != "ESCAPE"}
-    run = yield from bootstrap_gains(
-        bench, found, beside=beside, frames=frames, accuracy=accuracy, shape=static_light_matrix(bench, found),
-        model_psf=model,
-    )  # fmt: skip
-    result.gains, result.rescaled_calibration, result.partial = (
-        run.result,
-        run.rescaled_calibration,
-        run.result.partial,
-    )
-    return run.rescaled_calibration, model
-
-
 def _gains_and_loops(
     bench: Bench, closed_frames: int, loop_frames: int, result: CalibrationComparison
 ) -> Procedure[None]:
@@ -350,25 +183,6 @@ def _gains_and_loops(
         yield from close_loop_at_best_gain(bench, label, calibration, loop_frames, model, result)
         if result.partial:
             return
-
-
-def with_and_without_optical_gains(
-    known: dict[str, CalibrationResult], result: CalibrationComparison
-) -> Iterator[tuple[str, CalibrationResult]]:
-    """Each matrix as it is, and scaled by its optical gains."""
-    from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
-    from escape_hw.calibration.optical_gain.smoothing import usable
-
-    if result.gains is None or result.gains.gains is None:
-        return
-    every = {"ESCAPE": result.gains.gains, **result.gains.beside}
-    for label, one in known.items():
-        yield label, one
-        if label == "ESCAPE" and result.rescaled_calibration is not None:
-            yield label + WITH_GAINS, result.rescaled_calibration
-            continue
-        scaled = scale_matrix(one.matrix, usable(every[label]), every[label].best_sigma)
-        yield label + WITH_GAINS, replace(one, matrix=scaled, measured=None)
 
 
 #: Two minutes at 500 Hz: "a few minutes of sky-time" in the paper.

@@ -101,7 +101,7 @@ def sweep_section(document: Mapping[str, Any]) -> str:
     parts = []
     if document["best"]:
         caption = (
-            f"Every matrix at its own best parameters: mean over {loops['final'] // len(sweep['arms'])} "
+            f"Every matrix at its own best parameters: mean over {loops['final'] // len(sweep['curves'])} "
             f"stretches of air, the same for all, of {sweep['frames']} frames; standard errors over them."
         )
         parts.append(html.table(best_table(document), caption))

@@ -24,7 +24,7 @@ SHORT = (
     "--trials", "12", "--candidates", "1", "--replicates", "1", "--final-replicates", "6", "--frames", "270", "--quiet",
     "--json",
 )  # fmt: skip
-#: 12 drawn, one heat and six finals of two matrices.
+#: 12 drawn, one replicate and six final ones of two matrices.
 LOOPS = 12 + 2 + 12
 
 

@@ -1,4 +1,4 @@
-"""What may be swept where; a sweep on an open bench, as on hardware; conclusions from made-up loops."""
+"""Search space by system; a sweep on an open bench, as on hardware; results of synthetic loops."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from escape_hw.runtime.sweep.run import Sweep, run_sweep
 from escape_hw.runtime.sweep.search_space import default_space, parse_parameter
 
 
-def test_hardware_wants_a_persons_limits_on_everything():
+def test_hardware_needs_limits_for_every_parameter():
     config = load_system("razor-shwfs", mode="hardware")
     with pytest.raises(ConfigError, match="leak, dropped_modes"):
         parse_search_space(config, ["gain=0.1:0.5"])
@@ -80,7 +80,7 @@ def test_passwords_are_not_written(tmp_path):
     space = default_space(30, [parse_parameter("gain=0.1:1")])
     swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
     url = "postgresql+psycopg://me:secret@host/sweeps"
-    assert "secret" not in SweepDescription(swept, url, "s", "random", 0.01).keep(tmp_path).read_text()
+    assert "secret" not in SweepDescription(swept, url, "s", "random", 0.01).save(tmp_path).read_text()
     with pytest.raises(ConfigError, match="--storage"):
         read_description(tmp_path)
     assert read_description(tmp_path, url).storage == url
@@ -103,10 +103,10 @@ def test_a_sweep_on_an_open_bench(tmp_path):
             bench.config.to_toml(), arms, space, Design(4, 1, 1, 6), 200, 1,
             psf=str(tmp_path / "psf.npy"), simulated=False,
         )  # fmt: skip
-        kept = SweepDescription(swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05).validate()
-        kept.save(tmp_path)
-        assert read_description(tmp_path) == kept
-        found = run(run_sweep(swept, kept.store(), bench), observers=(sent.append,))
+        description = SweepDescription(swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05).validate()
+        description.save(tmp_path)
+        assert read_description(tmp_path) == description
+        found = run(run_sweep(swept, description.open_study(), bench), observers=(sent.append,))
         assert np.all(bench.dm.shape == 0)
     result = analyse_sweep(swept, found, 0.05)
     assert len(found.records) == 4 + 2 + 12

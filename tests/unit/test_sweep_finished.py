@@ -30,7 +30,7 @@ def description(tmp_path: Path) -> SweepDescription:
     one = SweepDescription(swept, f"sqlite:///{run / 'study.db'}", "sweep", "random", 0.01)
     with RunFolder("razor-shwfs", "sweep", run) as folder:
         folder.write_config(config.to_toml())
-        one.keep(folder.path)
+        one.save(folder.path)
     return one
 
 
@@ -61,7 +61,7 @@ def test_resume_of_a_finished_sweep_shows_its_result(
 ):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     there = conclude_in(tmp_path / where, description)
-    description.store().set_result_folder(str(there))
+    description.open_study().set_result_folder(str(there))
     before = sorted(path.name for path in tmp_path.iterdir())
     code, out, err = escape("sweep", "--resume", tmp_path / "run", "--out", tmp_path / "again")
     assert code == 0
@@ -75,5 +75,5 @@ def test_resume_of_a_finished_sweep_shows_its_result(
 
 
 def test_a_result_that_has_gone_is_made_again(description: SweepDescription, tmp_path: Path) -> None:
-    description.store().set_result_folder(str(tmp_path / "gone"))
+    description.open_study().set_result_folder(str(tmp_path / "gone"))
     assert find_finished_result(tmp_path / "run", description) is None

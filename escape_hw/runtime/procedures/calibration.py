@@ -281,7 +281,7 @@ class CalibrationTask:
     ) -> SavedRun:
         """See :meth:`~escape_hw.runtime.procedures.task.Task.save`."""
         from escape_hw.io.documents import calibration_document
-        from escape_hw.paper.experiments import measured_calibration
+        from escape_hw.runtime.procedures.calibration_comparison import measured_calibration
         from escape_hw.runtime.procedures.products import add_calibration, write_run_result
 
         measured = measured_calibration(result)
