@@ -66,9 +66,9 @@ def test_without_a_science_camera_there_is_nothing_to_judge_by():
 
 def test_ranges_beyond_the_configurations_are_refused():
     for text in ("gain=0.1:9", "leak=0:2", "dropped_modes=0:30", "twin.loss_probability=0:0.9", "twin.x=0:1"):
-        arm = MatrixVariant("A", False, __file__, "")
+        variant = MatrixVariant("A", False, __file__, "")
         space = default_space(30, [parse_parameter(text)])
-        swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
+        swept = Sweep(configuration().to_toml(), (variant,), space, Design(), 100, 1)
         with pytest.raises(ConfigError, match=text.partition("=")[0]):
             SweepDescription(swept, "sqlite://", "s", "random", 0.01).validate()
 
@@ -76,9 +76,9 @@ def test_ranges_beyond_the_configurations_are_refused():
 def test_passwords_are_not_written(tmp_path):
     (tmp_path / "im.fits").write_bytes(b"")
     path = tmp_path / "im.fits"
-    arm = MatrixVariant("A", False, path, file_sha256(path))
+    variant = MatrixVariant("A", False, path, file_sha256(path))
     space = default_space(30, [parse_parameter("gain=0.1:1")])
-    swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
+    swept = Sweep(configuration().to_toml(), (variant,), space, Design(), 100, 1)
     url = "postgresql+psycopg://me:secret@host/sweeps"
     assert "secret" not in SweepDescription(swept, url, "s", "random", 0.01).save(tmp_path).read_text()
     with pytest.raises(ConfigError, match="--storage"):
@@ -97,10 +97,10 @@ def test_a_sweep_on_an_open_bench(tmp_path):
         path = escape_hw.save_matrix(tmp_path / "im.fits", bench.calibrate("push-pull"))
         np.save(tmp_path / "psf.npy", bench.take_model_psf())
         sent = []
-        arms = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("A", "B"))
+        variants = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("A", "B"))
         space = tuple(parse_parameter(t) for t in ("gain=0.3:0.6", "leak=0.01", "dropped_modes=2:6"))
         swept = Sweep(
-            bench.config.to_toml(), arms, space, Design(4, 1, 1, 6), 200, 1,
+            bench.config.to_toml(), variants, space, Design(4, 1, 1, 6), 200, 1,
             psf=str(tmp_path / "psf.npy"), simulated=False,
         )  # fmt: skip
         description = SweepDescription(swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05).validate()

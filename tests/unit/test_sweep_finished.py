@@ -25,8 +25,8 @@ def description(tmp_path: Path) -> SweepDescription:
     """A sweep of two matrices in the folder ``run``."""
     config, run = configuration(), tmp_path / "run"
     path = save_matrix(tmp_path / "im.fits", fake.calibration(), fake.ORIGIN)
-    arms = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("push-pull", "ESCAPE"))
-    swept = replace(SWEPT, config=config.to_toml(), arms=arms)
+    variants = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("push-pull", "ESCAPE"))
+    swept = replace(SWEPT, config=config.to_toml(), variants=variants)
     one = SweepDescription(swept, f"sqlite:///{run / 'study.db'}", "sweep", "random", 0.01)
     with RunFolder("razor-shwfs", "sweep", run) as folder:
         folder.write_config(config.to_toml())

@@ -350,22 +350,9 @@ class System(Bench):
         """
         from escape_hw.runtime.sweep.request import run_matrix_sweep
 
-        request = {
-            "trials": trials,
-            "frames": frames,
-            "sampler": sampler,
-            "margin": margin,
-            "storage": storage,
-        }
+        asked = {"trials": trials, "frames": frames, "sampler": sampler, "margin": margin, "storage": storage}
         return run_matrix_sweep(
-            self,
-            matrices,
-            Path(folder),
-            vary,
-            request,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
+            self, matrices, Path(folder), vary, asked, workers=workers, scheduler=scheduler, progress=progress
         )
 
     def track(
