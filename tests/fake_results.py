@@ -188,7 +188,7 @@ def sky_time() -> dict[str, object]:
         name: [float(s * np.sqrt(300 / f)) for f in frames] for name, s in zip(names, SIGMA, strict=True)
     }
     return {
-        "plants": 20,
+        "realisations": 20,
         "fewest_frames": {"whitened": 500, "plain": None},
         "frames": frames,
         "estimators": {

@@ -264,7 +264,9 @@ def _sky_time_section(run: RunContent) -> str:
         notes = run.document.get("notes") or []
         return html.section("Sky time", html.note_list(notes)) if notes else ""
     drawing = figures_registration.error_curves(curves)
-    realisations = f", rms over {curves['plants']} random plants" if "plants" in curves else ""
+    # Version 0.1.0 called them plants.
+    number = curves.get("realisations", curves.get("plants"))
+    realisations = f", rms over {number} random registrations" if number else ""
     caption = f"Error of the registration against the frames used{realisations}, with the Cramér-Rao bound."
     fewest_frames = curves.get("fewest_frames") or {}
     if fewest_frames:

@@ -70,7 +70,7 @@ def test_reproduce_maps_shows_the_matrix_beside_its_simulation(escape, bench, tm
     assert "DO-CRIME" in out
     assert "ESCAPE minus DO-CRIME" in out
     page = (run / "report.html").read_text()
-    for word in ("simulation", "dirty mirror", "Stacked closed-loop PSFs"):
+    for word in ("simulation", "contaminated mirror", "Stacked closed-loop PSFs"):
         assert word in page
     assert load_loop(run / "loop_docrime.fits").header["PARENT1"] == "docrime.fits"
 

@@ -78,7 +78,7 @@ def maps(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """A matrix measured on the sky beside its simulation, and the loop on ESCAPE's, with a dirty mirror."""
+    """A matrix measured on the sky beside its simulation, and the loop on ESCAPE's, with a contaminated mirror."""
     with command_context("reproduce maps", json=json, quiet=quiet) as context:
         counts = {"frames": frames, "loop_frames": loop_frames}
         result, document = _run_case(

@@ -12,10 +12,20 @@ from typing import Any
 from escape_hw.api.concurrency import disable_helper_threads
 
 
-def open_process_pool(count: int) -> ProcessPoolExecutor:
-    """A pool of spawned processes that ignore Ctrl-C, use no helper threads and exit with this process."""
+def open_process_pool(count: int, *, helper_threads: bool = False) -> ProcessPoolExecutor:
+    """A pool of spawned processes that ignore Ctrl-C and exit with this process.
+
+    Parameters
+    ----------
+    count
+        Number of processes.
+    helper_threads
+        Whether simulations may use threads of their own.
+    """
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(count, mp_context=context, initializer=_initialise_worker)
+    return ProcessPoolExecutor(
+        count, mp_context=context, initializer=_initialise_worker, initargs=(helper_threads,)
+    )
 
 
 def terminate_pool(pool: ProcessPoolExecutor) -> None:
@@ -27,9 +37,10 @@ def terminate_pool(pool: ProcessPoolExecutor) -> None:
         process.terminate()
 
 
-def _initialise_worker() -> None:
+def _initialise_worker(helper_threads: bool) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    disable_helper_threads()
+    if not helper_threads:
+        disable_helper_threads()
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()

@@ -373,8 +373,8 @@ class SweepStudy:
                 if time.monotonic() + delay_s > deadline or self._stopped.wait(delay_s):
                     raise StorageError(
                         f"the study's storage {redact_password(self.url)} does not answer for "
-                        f"{self._timeout_s:.0f} s ({str(cause).strip().splitlines()[0]}); finished trials are "
-                        "kept: resume when it is back"
+                        f"{self._timeout_s:.0f} s ({str(cause).strip().splitlines()[0]}); finished trials "
+                        "are kept: resume when it is back"
                     ) from error
                 delay_s = min(2 * delay_s, 5.0)
 
