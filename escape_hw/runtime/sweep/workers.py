@@ -174,7 +174,8 @@ class DaskWorkers(Workers):
         """Number of worker threads, at least one."""
         try:
             return max(1, int(sum(self._client.nthreads().values())))
-        except (OSError, ValueError, RuntimeError, CancelledError):
+        except (OSError, ValueError, RuntimeError, CancelledError, AttributeError):
+            # Another thread is connecting anew; a client without a connection has no scheduler.
             return 1
 
     def _open_executor(self) -> Executor:
