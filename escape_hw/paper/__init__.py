@@ -1,1 +1,1 @@
-"""Reproduction of the paper's tables and figures: experiments, their products, and the numbers beside ours."""
+"""Reproduction of the paper's tables and figures: experiments, products, and the numbers beside ours."""

@@ -278,8 +278,8 @@ def check_share(cases: Sequence[tuple[PaperCase, SystemConfig]], share: float) -
         wanted, case, name, minimum = max(short, key=lambda one: one[0])
         enough = math.ceil(1000 * wanted) / 1000
         raise ConfigError(
-            f"--share {share:g}: too small; {case.kind} needs at least {minimum} frames ({name}) and would get "
-            f"{case.scaled_frames(share)[name]} of {case.frames[name]}; the least is --share {enough:g}"
+            f"--share {share:g}: too small; {case.kind} needs at least {minimum} frames ({name}) and would "
+            f"get {case.scaled_frames(share)[name]} of {case.frames[name]}; the least is --share {enough:g}"
         )
 
 

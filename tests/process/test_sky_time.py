@@ -48,7 +48,9 @@ def _stand_in(monkeypatch):
 def test_a_killed_process_ends_the_campaign_and_finished_realisations_are_kept(tmp_path):
     curves = run(sky_time("razor-shwfs", realisations=8, frames=FRAMES, overrides=[str(tmp_path), "3"]))
     assert 1 <= curves["realisations"] <= 3
-    assert f"died (killed, or out of memory) after {curves['realisations']} of 8 realisations" in curves["note"]
+    assert (
+        f"died (killed, or out of memory) after {curves['realisations']} of 8 realisations" in curves["note"]
+    )
     assert curves["fewest_frames"]["whitened"] == 300
 
 
@@ -70,7 +72,9 @@ def test_stopped_it_keeps_the_finished_realisations(tmp_path):
         if progress.done >= 2:
             stop.set()
 
-    slow = sky_time("razor-shwfs", realisations=60, frames=FRAMES, overrides=[str(tmp_path), "100"], workers=1)
+    slow = sky_time(
+        "razor-shwfs", realisations=60, frames=FRAMES, overrides=[str(tmp_path), "100"], workers=1
+    )
     with pytest.raises(Aborted) as caught:
         run(slow, observers=(watch,), abort=stop)
     curves = caught.value.partial

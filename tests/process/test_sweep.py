@@ -51,5 +51,7 @@ def test_killed_workers_and_a_killed_sweep_lose_nothing(arguments, tmp_path):
     assert (shown["folder"], shown["best"]) == (str(again), document["best"])
     assert sorted(path.name for path in tmp_path.iterdir()) == folders
     # The parameters do not depend on when and where the loops ran.
-    drawn = {(row["matrix"], row["realisation"]): row["gain"] for row in loops(again) if row["stage"] == "explore"}
+    drawn = {
+        (row["matrix"], row["realisation"]): row["gain"] for row in loops(again) if row["stage"] == "explore"
+    }
     assert all(drawn["push-pull", index] == gain for (_, index), gain in drawn.items())

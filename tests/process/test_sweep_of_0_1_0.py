@@ -53,9 +53,7 @@ def test_a_finished_sweep_is_analysed_again(runs):
     """Without its result, the same conclusions are drawn from its trials."""
     stored, table = json.loads((OLD / "sweep" / "result.json").read_text()), loops(runs / "sweep")
     (runs / "sweep" / "result.json").unlink()
-    again = ended(
-        start("--resume", str(runs / "sweep"), "--out", str(runs / "again"), "--json", "--quiet")
-    )
+    again = ended(start("--resume", str(runs / "sweep"), "--out", str(runs / "again"), "--json", "--quiet"))
     assert again["sweep"]["loops"] == stored["sweep"]["loops"] == {"explore": 6, "shortlist": 24, "final": 40}
     assert (again["best"], again["comparisons"]) == (stored["best"], stored["comparisons"])
     for key, row in loops(runs / "again").items():

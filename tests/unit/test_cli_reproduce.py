@@ -13,7 +13,7 @@ from escape_hw.paper.cases import CASES
 @pytest.mark.usefixtures("reports")
 def test_reproduce_shwfs_shows_registration_strehl_and_report(escape, bench, tmp_path):
     run = tmp_path / "run"
-    code, out, err = escape("reproduce", "shwfs", "--out", run, "--loop-frames", 321, "--plants", 0)
+    code, out, err = escape("reproduce", "shwfs", "--out", run, "--loop-frames", 321, "--realisations", 0)
     assert code == 0, err
     for word in ("injected", "Shift Y", "push-pull", "DO-CRIME", "ESCAPE", "OTF", "±"):
         assert word in out
@@ -35,7 +35,7 @@ def test_reproduce_shwfs_shows_registration_strehl_and_report(escape, bench, tmp
 
 
 def test_reproduce_judges_its_own_result(document, bench, tmp_path):
-    words = ("reproduce", "shwfs", "--out", tmp_path / "run", "--plants", 0)
+    words = ("reproduce", "shwfs", "--out", tmp_path / "run", "--realisations", 0)
     code, found, _ = document(*words, "--set", "twin.registration.shift_x=30")
     assert code == 1
     failed = [check["text"] for check in found["criteria"] if not check["met"]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from made_up_sweep import SWEPT, made_up
+from synthetic_sweep import SWEPT, synthetic_run
 
 from escape_hw.errors import ConfigError
 from escape_hw.io.run_folder import RunFolder
@@ -20,7 +20,7 @@ from escape_hw.runtime.sweep.result import analyse_sweep
 def sweep_run(tmp_path_factory):
     with RunFolder("razor-shwfs", "sweep", tmp_path_factory.mktemp("sweep") / "run") as folder:
         head = {"schema": 1, "command": "sweep", "system": "razor-shwfs", "simulated": True, "seed": 1}
-        folder.write_result({**head, **sweep_document(analyse_sweep(SWEPT, made_up(0.0), 0.01))})
+        folder.write_result({**head, **sweep_document(analyse_sweep(SWEPT, synthetic_run(0.0), 0.01))})
     return folder.path
 
 

@@ -6,8 +6,8 @@ import importlib.util
 
 import numpy as np
 import pytest
-from made_up_sweep import SWEPT, made_up
 from small_system import SMALL, configuration
+from synthetic_sweep import SWEPT, synthetic_run
 
 import escape_hw
 from escape_hw.api.procedure import run
@@ -103,7 +103,9 @@ def test_a_sweep_on_an_open_bench(tmp_path):
             bench.config.to_toml(), variants, space, Design(4, 1, 1, 6), 200, 1,
             psf=str(tmp_path / "psf.npy"), simulated=False,
         )  # fmt: skip
-        description = SweepDescription(swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05).validate()
+        description = SweepDescription(
+            swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05
+        ).validate()
         description.save(tmp_path)
         assert read_description(tmp_path) == description
         found = run(run_sweep(swept, description.open_study(), bench), observers=(sent.append,))
@@ -126,7 +128,7 @@ def test_a_sweep_on_an_open_bench(tmp_path):
     ("difference", "word"), [(0.0, "equivalent"), (0.05, "ESCAPE better"), (-0.05, "worse")]
 )
 def test_conclusions(difference, word):
-    result = analyse_sweep(SWEPT, made_up(difference), 0.01)
+    result = analyse_sweep(SWEPT, synthetic_run(difference), 0.01)
     (one,) = result.comparisons
     assert one.found.mean == pytest.approx(difference, abs=0.005)
     assert (word if word != "worse" else "push-pull better than ESCAPE") in one.text

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import fake_results as fake
 import pytest
-from made_up_sweep import SWEPT, made_up
 from small_system import configuration
+from synthetic_sweep import SWEPT, synthetic_run
 
 from escape_hw.io.documents import dumps, header_fields
 from escape_hw.io.fits.matrix import save_matrix
@@ -36,7 +36,7 @@ def description(tmp_path: Path) -> SweepDescription:
 
 def conclude_in(path: Path, description: SweepDescription, partial: bool = False) -> Path:
     """What a sweep writes at its end."""
-    run = made_up(0.0)
+    run = synthetic_run(0.0)
     run.partial = partial
     document = {
         **header_fields("sweep", "razor-shwfs", True, 1),

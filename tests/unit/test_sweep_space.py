@@ -75,7 +75,11 @@ def test_all_variants_draw_the_same_parameters_on_the_same_turbulence():
 
 def test_no_two_stages_share_their_turbulence():
     design = Design(trials=6)
-    stages = (design.exploration_slots(VARIANTS), design.shortlist_slots(VARIANTS), design.final_slots(VARIANTS))
+    stages = (
+        design.exploration_slots(VARIANTS),
+        design.shortlist_slots(VARIANTS),
+        design.final_slots(VARIANTS),
+    )
     seeds = [{slot.run_seed(7) for slot in stage} for stage in stages]
     assert len(seeds[0] | seeds[1] | seeds[2]) == sum(map(len, seeds))
     assert (

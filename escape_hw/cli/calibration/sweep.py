@@ -15,7 +15,6 @@ from escape_hw.cli.context import CommandContext, command_context
 
 if TYPE_CHECKING:
     from escape_hw.bench import Bench
-    from escape_hw.config.system import SystemConfig
     from escape_hw.errors import Aborted
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
@@ -35,11 +34,7 @@ class _Request:
     counts: tuple[int, int, int, int]
     frames: int
     calibration_frames: int | None
-    sampler: str
-    metric: str
-    margin: float
-    storage: str | None
-    study: str
+    study: dict[str, Any]
     force: bool
 
 
@@ -135,7 +130,9 @@ def sweep(
             tuple(im or ()), gains,
             (*(f"{key}={text}" for key, text in ranges.items() if text is not None), *(vary or ())),
             (trials, candidates, replicates, final_replicates),
-            frames, calibration_frames, sampler, metric, margin / 100, storage, study, force,
+            frames, calibration_frames,
+            dict(sampler=sampler, metric=metric, margin=margin / 100, storage=storage, study=study),
+            force,
         )  # fmt: skip
         source = str(system if resume is None else resume / "config.toml")
         selection = options.SystemSelection.of(source, set, seed, mode)
@@ -155,7 +152,7 @@ def sweep(
                 from escape_hw.runtime.session.record import BenchRecord
 
                 record = BenchRecord.from_bench(bench)
-                description = resumed or _describe(context, request, config, bench, folder, record)
+                description = resumed or _describe(context, request, bench, folder, record)
                 if not bench.simulated:
                     result, stop = _run(context, description, bench)
             if description.sweep.simulated:
@@ -184,51 +181,31 @@ def _show_finished(context: CommandContext, run: Path, description: SweepDescrip
 
 
 def _describe(
-    context: CommandContext,
-    request: _Request,
-    config: SystemConfig,
-    bench: Bench,
-    folder: RunFolder,
-    record: BenchRecord,
+    context: CommandContext, request: _Request, bench: Bench, folder: RunFolder, record: BenchRecord
 ) -> SweepDescription:
-    """Measure or read the matrices of a new sweep, and save its description and model PSF in the folder."""
-    import numpy as np
-
-    from escape_hw.runtime.procedures.calibration import model_psf
-    from escape_hw.runtime.sweep.description import SweepDescription
+    """Measure or read the matrices of a new sweep, and save its description in the folder."""
+    from escape_hw.runtime.sweep.description import describe_sweep
     from escape_hw.runtime.sweep.design import Design
     from escape_hw.runtime.sweep.request import parse_search_space
-    from escape_hw.runtime.sweep.run import Sweep
 
-    space = parse_search_space(config, request.vary)
-    variants = tuple(_prepare_variants(context, request, config, bench, folder, record))
-    psf = None
-    if all("." not in parameter.key for parameter in space):
-        psf = folder.file("model_psf.npy")
-        np.save(psf, context.run(model_psf(bench)))
-    swept = Sweep(
-        config.to_toml(), variants, space, Design(*request.counts), request.frames, config.system.seed,
-        request.metric, None if psf is None else str(psf), bench.simulated,
-    )  # fmt: skip
-    storage = request.storage or f"sqlite:///{folder.file('study.db')}"
-    description = SweepDescription(swept, storage, request.study, request.sampler, request.margin).validate()
+    variants = _prepare_variants(context, request, bench, folder, record)
+    space, design = parse_search_space(bench.config, request.vary), Design(*request.counts)
+    description = context.run(
+        describe_sweep(bench, folder.path, variants, space, design, frames=request.frames, **request.study)
+    )
     description.save(folder.path)
     return description
 
 
 def _prepare_variants(
-    context: CommandContext,
-    request: _Request,
-    config: SystemConfig,
-    bench: Bench,
-    folder: RunFolder,
-    record: BenchRecord,
+    context: CommandContext, request: _Request, bench: Bench, folder: RunFolder, record: BenchRecord
 ) -> list[MatrixVariant]:
     from escape_hw.errors import ConfigError
     from escape_hw.io.fits.gains import load_gains
     from escape_hw.runtime.procedures.task import load_fitting_matrix, require_hardware_matrix
     from escape_hw.runtime.sweep.matrices import measure_variants, read_variants, save_variants
 
+    config = bench.config
     if request.im:
         products = [load_fitting_matrix(path, config, request.force) for path in request.im]
         for product in products:

@@ -34,7 +34,7 @@ def discover(
             context.show(device.toml, "")
         if not found:
             context.notify(
-                "no device was found; check permissions with 'escape doctor', and name network hosts with --host"
+                "no device was found; check permissions with 'escape doctor', name network hosts with --host"
             )
         devices = [asdict(device) for device in found]
         context.result({**header_fields("discover", None, None, None), "devices": devices}, met=bool(found))

@@ -34,7 +34,7 @@ def emulate(
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Emulate a device on its own interface until Ctrl-C; reports protocol errors of clients (exit code 1)."""
+    """Emulate a device on its own interface until Ctrl-C; reports errors of clients (exit code 1)."""
     with command_context("emulate", json=json) as context:
         from escape_hw.api.emulator import EmulatorRequest
         from escape_hw.config.registry import EMULATORS, available, emulator_factory

@@ -1,1 +1,1 @@
-"""This computer and single devices: checks, discovery, udev rules, process pools, tools for one device."""
+"""Host computer and single devices: checks, discovery, udev rules, process pools, tools for one device."""

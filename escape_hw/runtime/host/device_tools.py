@@ -23,7 +23,7 @@ _CHECKED_PHASES = 16
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """Commands sent, commands that the mirror skipped, and the largest value sent, fraction of full stroke."""
+    """Commands sent, commands that the mirror skipped, and the largest value, fraction of full stroke."""
 
     commands: int
     skipped: int

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from escape_hw.api.procedure import Procedure
+from escape_hw.bench import Bench
 from escape_hw.config.loader import load_text
 from escape_hw.errors import ConfigError, ProductError
 from escape_hw.io.documents import dumps
 from escape_hw.io.provenance import file_sha256
 from escape_hw.io.storage import write_atomic
+from escape_hw.runtime.procedures.calibration import model_psf
 from escape_hw.runtime.sweep.design import Design, MatrixVariant, current_keys
 from escape_hw.runtime.sweep.run import METRICS, Sweep
 from escape_hw.runtime.sweep.search_space import DELAY_KEY, Parameter, format_value, parse_parameter
@@ -109,6 +115,52 @@ class SweepDescription:
         path = folder / DESCRIPTION_FILE
         write_atomic(path, (dumps(document) + "\n").encode())
         return path
+
+
+def describe_sweep(
+    bench: Bench,
+    folder: Path,
+    variants: Sequence[MatrixVariant],
+    space: tuple[Parameter, ...],
+    design: Design,
+    *,
+    frames: int,
+    metric: str = "peak",
+    sampler: str,
+    margin: float,
+    storage: str | None,
+    study: str = "sweep",
+) -> Procedure[SweepDescription]:
+    """Describe a new sweep, and save its model PSF in the folder if all loops can share one.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    folder
+        Of the sweep.
+    variants, space, design, frames, metric
+        See :class:`~escape_hw.runtime.sweep.run.Sweep`.
+    sampler, margin, storage, study
+        See :class:`SweepDescription`; an SQLite file in the folder by default.
+
+    Raises
+    ------
+    ConfigError
+        See :meth:`SweepDescription.validate`.
+    """
+    path, psf = folder / "model_psf.npy", None
+    if all("." not in one.key for one in space):
+        psf = str(path)
+        if not path.is_file():
+            np.save(path, (yield from model_psf(bench)))
+    config = bench.config
+    sweep = Sweep(
+        config.to_toml(), tuple(variants), space, design, frames, config.system.seed, metric, psf,
+        bool(bench.simulated),
+    )  # fmt: skip
+    url = storage or f"sqlite:///{folder / 'study.db'}"
+    return SweepDescription(sweep, url, study, sampler, margin).validate()
 
 
 def _check_limits(sweep: Sweep, parameter: Parameter) -> None:

@@ -19,7 +19,6 @@ from escape_hw.runtime.sweep.search_space import (
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
     from escape_hw.runtime.session.system import CalibrationLike, System
-    from escape_hw.runtime.sweep.description import SweepDescription
     from escape_hw.runtime.sweep.result import SweepResult
 
 #: Sections of the configuration that the matrices were measured with.
@@ -116,12 +115,18 @@ def run_matrix_sweep(
     require_optuna()
     space = parse_search_space(bench.config, vary)
     require_loop_frames(bench.config, request["frames"])
-    from escape_hw.runtime.sweep.description import DESCRIPTION_FILE, read_description
+    from escape_hw.runtime.sweep.description import DESCRIPTION_FILE, describe_sweep, read_description
+    from escape_hw.runtime.sweep.design import Design
     from escape_hw.runtime.sweep.result import analyse_sweep
     from escape_hw.runtime.sweep.run import run_sweep
     from escape_hw.runtime.sweep.workers import open_workers
 
-    description = _describe(bench, matrices, folder, space, request, progress)
+    folder = folder.absolute()
+    options = dict(request)
+    variants, design = _save_matrices(matrices, folder), Design(trials=options.pop("trials"))
+    description = bench.run(
+        describe_sweep(bench, folder, variants, space, design, **options), progress=progress
+    )
     if (folder / DESCRIPTION_FILE).is_file():
         known = read_description(folder)
         description = known if known.settings() == description.settings() else description
@@ -137,26 +142,16 @@ def run_matrix_sweep(
     return analyse_sweep(description.sweep, found, description.margin)
 
 
-def _describe(
-    bench: System,
-    matrices: Mapping[str, CalibrationLike],
-    folder: Path,
-    space: tuple[Parameter, ...],
-    request: Mapping[str, Any],
-    progress: bool,
-) -> SweepDescription:
-    """Save the matrices and the model PSF in the folder, and describe the sweep."""
+def _save_matrices(matrices: Mapping[str, CalibrationLike], folder: Path) -> list[MatrixVariant]:
+    """Save matrices in memory as the variants of a sweep."""
     import numpy as np
 
     from escape_hw.io.fits.matrix import load_matrix, save_matrix
     from escape_hw.io.storage import make_folder
     from escape_hw.runtime.procedures.products import product_key
     from escape_hw.runtime.session.system import as_calibration
-    from escape_hw.runtime.sweep.description import SweepDescription
-    from escape_hw.runtime.sweep.design import Design, MatrixVariant
-    from escape_hw.runtime.sweep.run import Sweep
+    from escape_hw.runtime.sweep.design import MatrixVariant
 
-    folder = folder.absolute()
     make_folder(folder)
     variants = []
     for label, given in matrices.items():
@@ -167,14 +162,4 @@ def _describe(
         if existing is None or not np.array_equal(existing.matrix.data, calibration.matrix.data):
             existing = load_matrix(save_matrix(path, calibration))
         variants.append(MatrixVariant(label, False, path, existing.sha256))
-    psf = None
-    if all("." not in one.key for one in space):
-        psf = folder / "model_psf.npy"
-        if not psf.is_file():
-            np.save(psf, bench.take_model_psf(progress=progress))
-    sweep = Sweep(
-        bench.config.to_toml(), tuple(variants), space, Design(trials=request["trials"]), request["frames"],
-        bench.config.system.seed, "peak", None if psf is None else str(psf), bench.simulated,
-    )  # fmt: skip
-    storage = request["storage"] or f"sqlite:///{folder / 'study.db'}"
-    return SweepDescription(sweep, storage, "sweep", request["sampler"], request["margin"]).validate()
+    return variants

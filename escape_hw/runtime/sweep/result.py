@@ -140,7 +140,7 @@ def _summarise_final(final: Sequence[LoopRecord]) -> BestLoops:
 
 
 def _pairs(variants: Sequence[MatrixVariant]) -> Iterable[tuple[str, str]]:
-    """Every variant against the first, every matrix with optical gains against itself without, and neighbours."""
+    """Every variant and the first, every matrix with and without its optical gains, and neighbours."""
     first, *others = variants
     for one in others:
         yield one.label, first.label

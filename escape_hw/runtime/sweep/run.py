@@ -233,8 +233,8 @@ def _candidates(sweep: Sweep, records: Sequence[LoopRecord]) -> dict[tuple[str, 
             notes = {n for one in records if one.slot.variant == variant.label for n in one.outcome["notes"]}
             raise CalibrationError(
                 f"no loop with the matrix {variant.label} gave a Strehl ratio "
-                f"({'; '.join(sorted(notes)) or 'all diverged'}); widen the range of the gain, make the loops "
-                "longer, or leave the matrix out"
+                f"({'; '.join(sorted(notes)) or 'all diverged'}); widen the range of the gain, make the "
+                "loops longer, or leave the matrix out"
             )
         found.update({(variant.label, number): values for number, values in enumerate(chosen)})
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import socket
@@ -13,7 +14,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import Any, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import optuna
 from optuna.distributions import BaseDistribution
@@ -28,6 +29,7 @@ from escape_hw.runtime.sweep.design import EXPLORE, MatrixVariant, Slot, current
 from escape_hw.runtime.sweep.search_space import Parameter, Range
 
 log = logging.getLogger(__name__)
+P = ParamSpec("P")
 T = TypeVar("T")
 
 #: The samplers by name.
@@ -96,18 +98,9 @@ class SlotSampler(BaseSampler):
 
 @dataclass(frozen=True, slots=True)
 class LoopRecord:
-    """A finished loop.
+    """A finished loop: slot, parameters, outcome, and the Strehl ratio that is maximised, 0 if it diverged.
 
-    Parameters
-    ----------
-    slot
-        Its place in the design.
-    values
-        Its parameters.
-    outcome
-        See :func:`~escape_hw.runtime.sweep.trials.loop_outcome`.
-    merit
-        The Strehl ratio that is maximised; 0 for a loop that diverged.
+    See :func:`~escape_hw.runtime.sweep.trials.loop_outcome`.
     """
 
     slot: Slot
@@ -126,6 +119,18 @@ class _Storage(optuna.storages.RDBStorage):
     def record_heartbeat(self, trial_id: int) -> None:
         with contextlib.suppress(StorageInternalError, DBAPIError):
             super().record_heartbeat(trial_id)
+
+
+def _retried(
+    method: Callable[Concatenate[SweepStudy, P], T],
+) -> Callable[Concatenate[SweepStudy, P], T]:
+    """The method, called again while the storage does not answer."""
+
+    @functools.wraps(method)
+    def call(self: SweepStudy, *arguments: P.args, **keywords: P.kwargs) -> T:
+        return self._retry(lambda: method(self, *arguments, **keywords))
+
+    return call
 
 
 class SweepStudy:
@@ -191,6 +196,7 @@ class SweepStudy:
         self._stopped.set()
 
     # ------------------------------------------------------------------ run loops
+    @_retried
     def enqueue_missing(
         self, plan: Sequence[Slot], values: Mapping[tuple[str, int], Mapping[str, Any]]
     ) -> tuple[int, int]:
@@ -208,11 +214,6 @@ class SweepStudy:
         n_unfinished, n_waiting : int
             Slots of the stage without a finished loop, and trials in the queue.
         """
-        return self._retry(lambda: self._enqueue_missing(plan, values))
-
-    def _enqueue_missing(
-        self, plan: Sequence[Slot], values: Mapping[tuple[str, int], Mapping[str, Any]]
-    ) -> tuple[int, int]:
         self._fail_abandoned()
         trials = [t for t in self._study.get_trials(deepcopy=False) if "slot" in t.user_attrs]
         finished = {_slot_of(t) for t in trials if t.state in _FINISHED}
@@ -287,15 +288,17 @@ class SweepStudy:
         trial.suggest_categorical("optical_gains", (False, True))
         return slot, {one.key: _suggest_value(trial, one) for one in self._space}
 
+    @_retried
     def ask(self) -> tuple[optuna.Trial, Slot, dict[str, Any]] | None:
         """Take the next trial of the queue, for a procedure that cannot run within :meth:`run_next`."""
-        trial = self._retry(self._study.ask)
+        trial = self._study.ask()
         try:
-            return (trial, *self._retry(lambda: self._suggest(trial)))
+            return (trial, *self._suggest(trial))
         except _SlotTaken:
             self.tell(trial, None)
             return None
 
+    @_retried
     def tell(self, trial: optuna.Trial, outcome: dict[str, Any] | None, merit: float | None = None) -> None:
         """Store the outcome of a trial from :meth:`ask`; without one, its loop runs again.
 
@@ -305,26 +308,23 @@ class SweepStudy:
             Another runner uses the study.
         """
         state = TrialState.FAIL if outcome is None else TrialState.PRUNED if merit is None else None
-
-        def tell() -> None:
-            try:
-                if outcome is not None:
-                    trial.set_user_attr("outcome", outcome)
-            except UpdateFinishedTrialError:
-                # Stored just before the connection broke, or failed by another runner.
-                if self._study.get_trials(deepcopy=False)[trial.number].state == TrialState.FAIL:
-                    raise CalibrationError(
-                        "another runner took over the study; one bench serves one sweep: end the other"
-                    ) from None
-            self._study.tell(trial, merit, state=state, skip_if_finished=True)
-
-        self._retry(tell)
+        try:
+            if outcome is not None:
+                trial.set_user_attr("outcome", outcome)
+        except UpdateFinishedTrialError:
+            # Stored just before the connection broke, or failed by another runner.
+            if self._study.get_trials(deepcopy=False)[trial.number].state == TrialState.FAIL:
+                raise CalibrationError(
+                    "another runner took over the study; one bench serves one sweep: end the other"
+                ) from None
+        self._study.tell(trial, merit, state=state, skip_if_finished=True)
 
     # ------------------------------------------------------------------ results
+    @_retried
     def records(self) -> list[LoopRecord]:
         """Every finished loop once, in the order of the design."""
         found: dict[Slot, LoopRecord] = {}
-        for trial in self._retry(lambda: self._study.get_trials(deepcopy=False, states=_FINISHED)):
+        for trial in self._study.get_trials(deepcopy=False, states=_FINISHED):
             if "slot" in trial.user_attrs:
                 slot, values = _slot_of(trial), {one.key: trial.params[one.key] for one in self._space}
                 merit = trial.value if trial.state == TrialState.COMPLETE else None
@@ -338,19 +338,22 @@ class SweepStudy:
             if (r.slot.stage, r.slot.variant) == (EXPLORE, variant)
         ]
 
+    @_retried
     def result_folder(self) -> str | None:
         """Folder with the result of the complete sweep; ``None`` before there is one."""
-        return self._retry(lambda: self._study.user_attrs.get("finished_in"))
+        return self._study.user_attrs.get("finished_in")
 
+    @_retried
     def set_result_folder(self, folder: str) -> None:
         """Store the folder with the result of the complete sweep."""
-        self._retry(lambda: self._study.set_user_attr("finished_in", folder))
+        self._study.set_user_attr("finished_in", folder)
 
     # ------------------------------------------------------------------ storage
+    @_retried
     def _check_settings(self, settings: dict[str, Any]) -> None:
-        known = current_keys(self._retry(lambda: self._study.user_attrs.get("settings")))
+        known = current_keys(self._study.user_attrs.get("settings"))
         if known is None:
-            self._retry(lambda: self._study.set_user_attr("settings", settings))
+            self._study.set_user_attr("settings", settings)
             return
         other = [key for key in settings if known.get(key) != settings[key]]
         if other:

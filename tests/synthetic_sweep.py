@@ -19,7 +19,7 @@ SWEPT = Sweep(
 )
 
 
-def made_up(difference: float) -> SweepRun:
+def synthetic_run(difference: float) -> SweepRun:
     """Loops with a maximum in the gain, common turbulence, and a difference between the variants."""
     rng, records = np.random.default_rng(1), []
     for stage, count in ((EXPLORE, 40), (FINAL, 24)):
