@@ -10,7 +10,8 @@ from escape_hw.cli.renamed import current_words
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("sweep x --heats 2 --finals=6 --drop 0:4", "sweep x --replicates 2 --final-replicates=6 --dropped-modes 0:4"),
+        ("sweep x --heats 2 --finals=6", "sweep x --replicates 2 --final-replicates=6"),
+        ("sweep x --drop 0:4", "sweep x --dropped-modes 0:4"),
         ("reproduce sky-time --plants 4", "reproduce sky-time --realisations 4"),
         ("rehearse x -- escape rehearse x --plants", "with-stand-ins x -- escape rehearse x --plants"),
     ],

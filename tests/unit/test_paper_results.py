@@ -61,5 +61,5 @@ def test_what_is_no_sweep_of_the_papers_is_refused(tmp_path):
 def test_a_sweep_that_was_broken_off_is_not_taken_for_a_finished_one(sweep_run, tmp_path):
     document = json.loads((sweep_run / "result.json").read_text())
     (tmp_path / "result.json").write_text(json.dumps({**document, "partial": True}))
-    with pytest.raises(ConfigError, match="broken off; finish it"):
+    with pytest.raises(ConfigError, match="unfinished; finish it"):
         find_sweeps([tmp_path])

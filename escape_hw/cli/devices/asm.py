@@ -104,7 +104,7 @@ def clear(
         changed = after is not previous
         report_device_result(
             context, "asm clear", config, mirror.info.simulated, changed,
-            previous=previous.state, fault=previous.fault, after=after.state,
+            before=previous.state, fault=previous.fault, after=after.state,
         )  # fmt: skip
 
 
@@ -144,7 +144,7 @@ def _go_to_state(
     context.show(f"{previous} → {health.state}", *_format_health(health))
     report_device_result(
         context, command, config, mirror.info.simulated, previous is not health.state,
-        previous=previous, after=health.state, health=asdict(health),
+        before=previous, after=health.state, health=asdict(health),
     )  # fmt: skip
 
 

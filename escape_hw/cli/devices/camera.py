@@ -67,8 +67,8 @@ def snap(
         saturated = max(frame.n_saturated for frame in frame_list)
         context.show(
             f"{info.model} {info.serial}: {len(frame_list)} frames of {cube.shape[2]} x {cube.shape[1]} "
-            f"pixels, {status.lost} lost, counts {counts['min']} to {counts['max']}, mean {counts['mean']:.1f}, "
-            f"{saturated} saturated",
+            f"pixels, {status.lost} lost, counts {counts['min']} to {counts['max']}, "
+            f"mean {counts['mean']:.1f}, {saturated} saturated",
             *([f"written: {out}"] if out is not None else []),
         )
         report_device_result(

@@ -19,6 +19,7 @@ from escape_hw.runtime.sweep.search_space import (
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
     from escape_hw.runtime.session.system import CalibrationLike, System
+    from escape_hw.runtime.sweep.design import MatrixVariant
     from escape_hw.runtime.sweep.result import SweepResult
 
 #: Sections of the configuration that the matrices were measured with.
