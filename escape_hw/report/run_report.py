@@ -223,7 +223,7 @@ def _track_section(run: RunContent) -> str:
     if lines:
         heads = ("seconds", "", "change of the matrix", "slowest mode", "fastest mode")
         what = (
-            "New matrices. Slowest, fastest: loop gain of the modes with the matrix before; 1 is asked for."
+            "New matrices. Slowest, fastest: loop gain of the modes with the previous matrix; 1 is nominal."
         )
         parts.append(html.table(tables.Table(heads, lines), what))
     parts.append(html.note_list([f"after {one['seconds']:.0f} s: {one['text']}" for one in alarms], "bad"))
@@ -277,7 +277,7 @@ def _sky_time_section(run: RunContent) -> str:
 
 
 def _mirror_figure(run: RunContent, command: NDArray[np.float64]) -> Figure | None:
-    """The command on the map of the actuators, when the run knows where they stand."""
+    """Map of the command, when the run has the actuators' positions."""
     layout, positions = run.layout, run.places_m
     if layout is not None and command.size == int(layout.sum()):
         return figures_bench.mirror_on_grid(command, layout)

@@ -92,7 +92,7 @@ def error_curves(curves: Mapping[str, Any]) -> Figure:
             panel.axhline(curves["goal"][name], color=style.MUTED, lw=1.0, ls=":", label="goal")
         style.style_axes(panel).set_title(title, fontsize=9.5)
         panel.set(xlabel="frames", ylabel=f"rms error [{_SHORT_UNITS[unit]}]")
-        # The frames themselves, few enough to be read: powers of ten tell little over one decade.
+        # Plain numbers of frames: powers of ten are not useful over one decade.
         labelled = frames[:: -(-frames.size // 5)]
         panel.xaxis.set_major_locator(FixedLocator(list(labelled)))
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))

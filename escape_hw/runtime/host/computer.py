@@ -92,9 +92,11 @@ class Host:
         def read(name: str) -> str:
             return self.text(str((folder / name).relative_to(self.root))) or ""
 
-        texts = map(read, ("idVendor", "idProduct", "manufacturer", "product", "serial"))
         bus, number = int(read("busnum") or 0), int(read("devnum") or 0)
-        return UsbDevice(*texts, f"/dev/bus/usb/{bus:03d}/{number:03d}")
+        return UsbDevice(
+            read("idVendor"), read("idProduct"), read("manufacturer"), read("product"), read("serial"),
+            f"/dev/bus/usb/{bus:03d}/{number:03d}",
+        )  # fmt: skip
 
     def serial_lines(self) -> list[SerialLine]:
         """Serial lines over USB."""

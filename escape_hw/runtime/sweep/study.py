@@ -127,8 +127,8 @@ def _retried(
     """The method, called again while the storage does not answer."""
 
     @functools.wraps(method)
-    def call(self: SweepStudy, *arguments: P.args, **keywords: P.kwargs) -> T:
-        return self._retry(lambda: method(self, *arguments, **keywords))
+    def call(study: SweepStudy, /, *arguments: P.args, **keywords: P.kwargs) -> T:
+        return study._retry(lambda: method(study, *arguments, **keywords))
 
     return call
 
