@@ -9,7 +9,7 @@ from sqlalchemy import text
 
 from escape_hw.errors import CalibrationError, ConfigError, StorageError
 from escape_hw.runtime.sweep import study as module
-from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot
+from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot, draw_parameters
 from escape_hw.runtime.sweep.search_space import default_space
 from escape_hw.runtime.sweep.study import SweepStudy
 
@@ -37,7 +37,7 @@ def run_all(*studies: SweepStudy, plan=PLAN, merit=lambda slot, values: 0.1 + va
         done.append(slot)
         return OUTCOME, merit(slot, values)
 
-    while any(one.enqueue_missing(plan, {})[1] for one in studies):
+    while any(one.enqueue_missing(plan, {}, 3)[1] for one in studies):
         for one in studies:
             one.run_next(loop)
     return done
@@ -45,7 +45,7 @@ def run_all(*studies: SweepStudy, plan=PLAN, merit=lambda slot, values: 0.1 + va
 
 def abandon(study: SweepStudy, silent_s: int | None) -> Slot:
     """Start a loop as a runner does that is killed; its last heartbeat was given ``silent_s`` ago."""
-    study.enqueue_missing(PLAN, {})
+    study.enqueue_missing(PLAN, {}, 3)
     trial = study._study.ask()
     if silent_s is not None:
         trial.set_user_attr("host", "elsewhere:1")
@@ -75,7 +75,7 @@ def test_what_a_live_runner_runs_is_left_to_it(opened):
     slot = abandon(opened(), 0)
     study = opened()
     assert slot not in run_all(study)
-    assert study.enqueue_missing(PLAN, {}) == (1, 0)
+    assert study.enqueue_missing(PLAN, {}, 3) == (1, 0)
 
 
 def test_two_runners_run_every_trial_once(opened):
@@ -87,13 +87,13 @@ def test_two_runners_run_every_trial_once(opened):
 def test_a_loop_that_two_runners_enqueued_runs_once(opened):
     first, second = opened(), opened()
     seen = second._study.get_trials()
-    first.enqueue_missing(PLAN, {})
+    first.enqueue_missing(PLAN, {}, 10)
     second._study.get_trials = lambda *_, **__: seen
-    second.enqueue_missing(PLAN, {})
+    second.enqueue_missing(PLAN, {}, 10)
     del second._study.get_trials
-    assert first.enqueue_missing(PLAN, {}) == (len(PLAN), 2 * len(PLAN))
+    assert first.enqueue_missing(PLAN, {}, 10) == (len(PLAN), 2 * len(PLAN))
     assert len(run_all(first)) == len(PLAN)
-    assert first.enqueue_missing(PLAN, {}) == (0, 0)
+    assert first.enqueue_missing(PLAN, {}, 3) == (0, 0)
 
 
 def test_a_result_that_comes_after_the_trial_was_given_up_changes_nothing(opened):
@@ -107,7 +107,7 @@ def test_a_result_that_comes_after_the_trial_was_given_up_changes_nothing(opened
             return OUTCOME, 9.0
         return OUTCOME, 0.1
 
-    while study.enqueue_missing(PLAN, {})[1]:
+    while study.enqueue_missing(PLAN, {}, 3)[1]:
         study.run_next(slow)
     assert len(runs) == len(PLAN) + 1
     assert {(record.slot, record.merit) for record in study.records()} == {(slot, 0.1) for slot in PLAN}
@@ -115,16 +115,16 @@ def test_a_result_that_comes_after_the_trial_was_given_up_changes_nothing(opened
 
 def test_a_bench_whose_study_another_one_took_over_stops(opened):
     first, second = opened(heartbeat=False), opened(heartbeat=False)
-    first.enqueue_missing(PLAN, {})
+    first.enqueue_missing(PLAN, {}, 3)
     trial, _, _ = first.ask()
-    second.enqueue_missing(PLAN, {})
+    second.enqueue_missing(PLAN, {}, 3)
     with pytest.raises(CalibrationError, match="one bench serves one sweep"):
         first.tell(trial, OUTCOME, 0.3)
 
 
 def test_a_study_is_resumed_with_what_it_has(opened):
     one = opened(heartbeat=False)
-    one.enqueue_missing(PLAN, {})
+    one.enqueue_missing(PLAN, {}, 3)
     trial, slot, values = one.ask()
     one.tell(trial, OUTCOME, 0.5)
     again = opened()
@@ -134,7 +134,7 @@ def test_a_study_is_resumed_with_what_it_has(opened):
 
 def test_a_loop_that_diverged_is_pruned_and_counts_with_zero(opened):
     one = opened()
-    one.enqueue_missing(PLAN, {})
+    one.enqueue_missing(PLAN, {}, 3)
     one.run_next(lambda slot, values: ({**OUTCOME, "diverged": True}, None))
     (record,) = one.records()
     assert record.merit == 0.0
@@ -143,7 +143,7 @@ def test_a_loop_that_diverged_is_pruned_and_counts_with_zero(opened):
 
 def test_a_loop_that_raises_or_is_stopped_runs_again(opened):
     one = opened()
-    one.enqueue_missing(PLAN, {})
+    one.enqueue_missing(PLAN, {}, 3)
 
     def fail(slot, values):
         raise CalibrationError("no light")
@@ -153,9 +153,20 @@ def test_a_loop_that_raises_or_is_stopped_runs_again(opened):
     assert sorted(run_all(one), key=str) == sorted(PLAN, key=str)
     bench = opened(heartbeat=False)
     plan = [Slot(EXPLORE, VARIANTS[0].label, 99)]
-    bench.enqueue_missing(plan, {})
+    bench.enqueue_missing(plan, {}, 1)
     bench.tell(bench.ask()[0], None)
     assert run_all(bench, plan=plan) == plan
+
+
+def test_trials_that_version_0_1_0_enqueued_without_parameters_run_with_those_of_their_slot(opened):
+    one = opened()
+    for slot in PLAN[:2]:
+        stored = {"stage": slot.stage, "arm": slot.variant, "index": slot.index, "candidate": 0}
+        one._study.enqueue_trial({"matrix": "push-pull"}, user_attrs={"slot": stored})
+    run_all(one)
+    values = {record.slot.index: record.values for record in one.records()}
+    assert values[0] == draw_parameters(SPACE, 1, 0)
+    assert {record.slot for record in one.records()} == set(PLAN)
 
 
 def test_other_settings_are_refused_by_name(opened):
@@ -168,7 +179,7 @@ def test_later_stages_fix_their_parameters(opened):
     one, seen = opened(), []
     fixed = {"gain": 0.3, "leak": 0.01, "dropped_modes": 4}
     plan = [Slot(FINAL, variant.label, 0) for variant in VARIANTS]
-    one.enqueue_missing(plan, {(variant.label, 0): fixed for variant in VARIANTS})
+    one.enqueue_missing(plan, {(variant.label, 0): fixed for variant in VARIANTS}, 1)
     one.run_next(lambda slot, values: (seen.append(values) or OUTCOME, 0.1))
     assert seen == [fixed]
 
@@ -199,7 +210,7 @@ def test_tpe_learns_from_each_variant_alone(opened):
 
 def test_a_storage_that_does_not_answer_for_a_while_is_waited_for(opened, monkeypatch):
     one = opened()
-    one.enqueue_missing(PLAN, {})
+    one.enqueue_missing(PLAN, {}, 3)
     refusals, ask = iter([StorageInternalError("gone"), StorageInternalError("gone")]), one._study.ask
     monkeypatch.setattr(one._stopped, "wait", lambda seconds: False)
 
@@ -216,7 +227,7 @@ def test_a_storage_that_does_not_answer_for_a_while_is_waited_for(opened, monkey
 def test_a_storage_lost_while_a_loop_runs_costs_that_loop_only(opened, monkeypatch):
     """Optuna hides the storage's error behind one of its own when the outcome cannot be stored."""
     one = opened()
-    one.enqueue_missing(PLAN, {})
+    one.enqueue_missing(PLAN, {}, 3)
     monkeypatch.setattr(one._stopped, "wait", lambda seconds: False)
     storage, lost = one._study._storage, []
     write, read = storage.set_trial_state_values, storage.get_trial
@@ -248,7 +259,7 @@ def test_a_storage_that_stays_away_is_named(opened, monkeypatch):
 
     monkeypatch.setattr(one._study, "get_trials", never)
     with pytest.raises(StorageError, match=r"sqlite.*does not answer.*resume"):
-        one.enqueue_missing(PLAN, {})
+        one.enqueue_missing(PLAN, {}, 3)
 
 
 @pytest.mark.parametrize("url", ["nonsense", "nosuchdialect://host/name"])

@@ -165,12 +165,13 @@ def _run_in_parallel(
     try:
         while True:
             if completed or time.monotonic() >= refresh_at:
-                n_unfinished, n_waiting = study.enqueue_missing(plan, values)
+                # One more than there are workers, so that the next loop starts as soon as one ends.
+                n_free = workers.count + 1 - len(futures)
+                n_unfinished, n_waiting = study.enqueue_missing(plan, values, n_free)
                 refresh_at = time.monotonic() + _REFRESH_S
                 if not n_unfinished and not n_waiting:
                     break
-                # One more than there are workers, so that the next loop starts as soon as one ends.
-                for _ in range(min(workers.count + 1 - len(futures), n_waiting)):
+                for _ in range(min(n_free, n_waiting)):
                     futures.add(threads.submit(study.run_next, run_loop))
             completed, futures = wait(futures, timeout=_POLL_S, return_when=FIRST_COMPLETED)
             if not completed and not futures:
@@ -203,7 +204,7 @@ def _run_on_bench(
     trials are asked for and told.
     """
     while True:
-        n_unfinished, n_waiting = study.enqueue_missing(plan, values)
+        n_unfinished, n_waiting = study.enqueue_missing(plan, values, 1)
         if n_unfinished < len(plan):
             yield report(n_before + len(plan) - n_unfinished)
         if not n_unfinished and not n_waiting:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import logging
 import os
 import socket
@@ -17,9 +18,8 @@ from datetime import datetime
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import optuna
-from optuna.distributions import BaseDistribution
 from optuna.exceptions import ExperimentalWarning, StorageInternalError, UpdateFinishedTrialError
-from optuna.samplers import BaseSampler, TPESampler
+from optuna.samplers import TPESampler
 from optuna.trial import FrozenTrial, TrialState, create_trial
 from sqlalchemy import event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
@@ -40,60 +40,10 @@ N_STARTUP_LOOPS = 10
 HEARTBEAT_S, GRACE_PERIOD_S = 5, 30
 #: Seconds to wait for a storage that does not answer.
 STORAGE_TIMEOUT_S = 120.0
-#: Trials enqueued ahead: each one costs time whenever a trial is taken from the queue.
-_QUEUE_LENGTH = 24
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
-#: Parameters and merit of the finished loops of a variant.
-History = Sequence[tuple[dict[str, Any], float]]
 #: Runs the loop of a slot; returns its outcome and its merit, ``None`` when it diverged.
 RunLoop = Callable[[Slot, dict[str, Any]], tuple[dict[str, Any], float | None]]
-
-
-class SlotSampler(BaseSampler):
-    """Chooses the parameters of a trial of the first stage by its slot.
-
-    Without ``history`` they are drawn by the number of the realisation, see
-    :func:`~escape_hw.runtime.sweep.design.draw_parameters`. With it, TPE learns from the loops of the same
-    variant only: each matrix is optimised for itself.
-    """
-
-    def __init__(
-        self, space: Sequence[Parameter], seed: int, history: Callable[[str], History] | None
-    ) -> None:
-        self._space, self._seed, self._history = tuple(space), seed, history
-        self._distributions = {one.key: one.distribution() for one in space}
-
-    def infer_relative_search_space(
-        self, study: optuna.Study, trial: FrozenTrial
-    ) -> dict[str, BaseDistribution]:
-        """All parameters: they are chosen together."""
-        return self._distributions
-
-    def sample_relative(
-        self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
-    ) -> dict[str, Any]:
-        """The parameters of a trial; none where the trial's parameters are fixed."""
-        if "slot" not in trial.user_attrs or trial.user_attrs["slot"]["stage"] != EXPLORE:
-            return {}
-        slot = _slot_of(trial)
-        history = () if self._history is None else self._history(slot.variant)
-        if self._history is None or min(len(history), slot.index) < N_STARTUP_LOOPS:
-            return draw_parameters(self._space, self._seed, slot.index)
-        seed = zlib.crc32(f"{self._seed} {slot.variant} {slot.index}".encode())
-        tpe = TPESampler(seed=seed, multivariate=True, n_startup_trials=0)
-        variant_study = optuna.create_study(direction="maximize", sampler=tpe)
-        variant_study.add_trials(
-            create_trial(params=params, distributions=self._distributions, value=merit)
-            for params, merit in history
-        )
-        return dict(variant_study.ask(self._distributions).params)
-
-    def sample_independent(
-        self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
-    ) -> Any:
-        """Not used: see :meth:`sample_relative`."""
-        raise RuntimeError(f"{param_name}: a trial without a slot has no parameters")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +60,7 @@ class LoopRecord:
 
 
 class _SlotTaken(Exception):
-    """The trial's loop is finished, or run elsewhere."""
+    """The trial's loop is finished, or runs elsewhere, or cannot run."""
 
 
 class _Storage(optuna.storages.RDBStorage):
@@ -127,8 +77,8 @@ def _retried(
     """The method, called again while the storage does not answer."""
 
     @functools.wraps(method)
-    def call(study: SweepStudy, /, *arguments: P.args, **keywords: P.kwargs) -> T:
-        return study._retry(lambda: method(study, *arguments, **keywords))
+    def call(self: SweepStudy, /, *arguments: P.args, **keywords: P.kwargs) -> T:
+        return self._retry(lambda: method(self, *arguments, **keywords))
 
     return call
 
@@ -182,13 +132,13 @@ class SweepStudy:
         self.url, self.name, self._timeout_s = url, name, timeout_s
         self._variants, self._space = {one.label: one for one in variants}, tuple(space)
         self._matrices = tuple(dict.fromkeys(one.matrix for one in variants))
+        self._seed, self._use_tpe = seed, use_tpe
         self._grace_s = GRACE_PERIOD_S if heartbeat else 0
         self._stopped = threading.Event()
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         # Optuna announces the interface of its heartbeats as experimental, from several threads.
         warnings.filterwarnings("ignore", ".*(heartbeat|fail_stale_trials)", ExperimentalWarning)
-        sampler = SlotSampler(space, seed, self._history if use_tpe else None)
-        self._study = self._retry(lambda: _open_study(url, name, sampler, heartbeat))
+        self._study = self._retry(lambda: _open_study(url, name, heartbeat))
         self._check_settings(dict(settings))
 
     def stop(self) -> None:
@@ -198,16 +148,20 @@ class SweepStudy:
     # ------------------------------------------------------------------ run loops
     @_retried
     def enqueue_missing(
-        self, plan: Sequence[Slot], values: Mapping[tuple[str, int], Mapping[str, Any]]
+        self, plan: Sequence[Slot], values: Mapping[tuple[str, int], Mapping[str, Any]], n_free: int
     ) -> tuple[int, int]:
         """Enqueue the next loops of a stage; trials of runners that died count as missing.
+
+        Loops of the first stage get random parameters, or those that TPE chooses from the finished ones.
 
         Parameters
         ----------
         plan
             Every slot of the stage.
         values
-            Parameters by variant and candidate, where the stage fixes them.
+            Parameters by variant and candidate, in the later stages.
+        n_free
+            Length of the queue that the runner can start at once.
 
         Returns
         -------
@@ -219,15 +173,30 @@ class SweepStudy:
         finished = {_slot_of(t) for t in trials if t.state in _FINISHED}
         present = finished | {_slot_of(t) for t in trials if t.state != TrialState.FAIL}
         n_waiting = sum(t.state == TrialState.WAITING for t in trials)
-        missing = [slot for slot in plan if slot not in present]
-        if n_waiting <= _QUEUE_LENGTH // 2:
-            for slot in missing[: _QUEUE_LENGTH - n_waiting]:
-                variant = self._variants[slot.variant]
-                fixed = {"matrix": variant.matrix, "optical_gains": variant.optical_gains}
-                fixed |= values.get((slot.variant, slot.candidate), {})
-                self._study.enqueue_trial(fixed, user_attrs={"slot": asdict(slot)})
-                n_waiting += 1
+        missing = (slot for slot in plan if slot not in present)
+        for slot in itertools.islice(missing, max(0, n_free - n_waiting)):
+            variant = self._variants[slot.variant]
+            parameters = values.get((slot.variant, slot.candidate)) or self._choose_parameters(slot)
+            fixed = {"matrix": variant.matrix, "optical_gains": variant.optical_gains, **parameters}
+            self._study.enqueue_trial(fixed, user_attrs={"slot": asdict(slot)})
+            n_waiting += 1
         return sum(slot not in finished for slot in plan), n_waiting
+
+    def _choose_parameters(self, slot: Slot) -> dict[str, Any]:
+        """Parameters of a loop of the first stage; TPE optimises each variant for itself."""
+        if not self._use_tpe or slot.index < N_STARTUP_LOOPS:
+            return draw_parameters(self._space, self._seed, slot.index)
+        history = [r for r in self.records() if r.slot.stage == EXPLORE and r.slot.variant == slot.variant]
+        if len(history) < N_STARTUP_LOOPS:
+            return draw_parameters(self._space, self._seed, slot.index)
+        distributions = {one.key: one.distribution() for one in self._space}
+        seed = zlib.crc32(f"{self._seed} {slot.variant} {slot.index}".encode())
+        tpe = TPESampler(seed=seed, multivariate=True, n_startup_trials=0)
+        study = optuna.create_study(direction="maximize", sampler=tpe)
+        study.add_trials(
+            create_trial(params=r.values, distributions=distributions, value=r.merit) for r in history
+        )
+        return dict(study.ask(distributions).params)
 
     def _fail_abandoned(self) -> None:
         """Fail running trials whose heartbeats stopped, and those that never had any (0.1.0, hardware)."""
@@ -272,15 +241,17 @@ class SweepStudy:
         self._retry(optimize)
 
     def _suggest(self, trial: optuna.Trial) -> tuple[Slot, dict[str, Any]]:
-        if "slot" not in trial.user_attrs:
-            # Another runner took the last trial of the queue, and Optuna made a new one.
+        trials = self._study.get_trials(deepcopy=False)
+        fixed = trials[trial.number].system_attrs.get("fixed_params", {})
+        if "slot" not in trial.user_attrs or not {one.key for one in self._space} <= set(fixed):
+            # Made by Optuna after another runner took the last one, or enqueued without parameters by 0.1.0.
             raise _SlotTaken
-        slot = Slot(**current_keys(trial.user_attrs["slot"]))
-        for other in self._study.get_trials(deepcopy=False):
+        slot = _slot_of(trials[trial.number])
+        for other in trials:
             earlier = other.state == TrialState.RUNNING and other.number < trial.number
             if (
                 (earlier or other.state in _FINISHED)
-                and other.user_attrs.get("slot")
+                and "slot" in other.user_attrs
                 and _slot_of(other) == slot
             ):
                 raise _SlotTaken
@@ -330,13 +301,6 @@ class SweepStudy:
                 merit = trial.value if trial.state == TrialState.COMPLETE else None
                 found.setdefault(slot, LoopRecord(slot, values, trial.user_attrs["outcome"], merit or 0.0))
         return sorted(found.values(), key=lambda r: (r.slot.stage, r.slot.index, r.slot.candidate))
-
-    def _history(self, variant: str) -> History:
-        return [
-            (r.values, r.merit)
-            for r in self.records()
-            if (r.slot.stage, r.slot.variant) == (EXPLORE, variant)
-        ]
 
     @_retried
     def result_folder(self) -> str | None:
@@ -401,7 +365,7 @@ def redact_password(url: str) -> str:
         return url
 
 
-def _open_study(url: str, name: str, sampler: SlotSampler, heartbeat: bool) -> optuna.Study:
+def _open_study(url: str, name: str, heartbeat: bool) -> optuna.Study:
     # A locked file is waited for; a connection that a restarted server has cut is noticed.
     options: dict[str, Any] = {"pool_pre_ping": True}
     if url.startswith("sqlite"):
@@ -419,9 +383,7 @@ def _open_study(url: str, name: str, sampler: SlotSampler, heartbeat: bool) -> o
     if url.startswith("sqlite"):
         event.listen(storage.engine, "connect", _enable_write_ahead_log)
         storage.engine.dispose()
-    return optuna.create_study(
-        storage=storage, study_name=name, sampler=sampler, direction="maximize", load_if_exists=True
-    )
+    return optuna.create_study(storage=storage, study_name=name, direction="maximize", load_if_exists=True)
 
 
 def _enable_write_ahead_log(connection: Any, _record: object) -> None:
