@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot
-from escape_hw.runtime.sweep.run import Sweep, SweepRun
+from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot, Sweep
+from escape_hw.runtime.sweep.run import SweepRun
 from escape_hw.runtime.sweep.search_space import parse_parameter
 from escape_hw.runtime.sweep.study import LoopRecord
 

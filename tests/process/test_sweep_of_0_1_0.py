@@ -13,7 +13,7 @@ from sweep_cases import ended, finished, start, states
 
 from escape_hw.runtime.sweep.description import read_description
 from escape_hw.runtime.sweep.design import Slot
-from escape_hw.runtime.sweep.trials import run_trial
+from escape_hw.runtime.sweep.trials import TrialSpec, run_trial
 
 OLD = Path(__file__).parents[1] / "data" / "0.1.0"
 #: Folder of the runs, as the stored paths have it.
@@ -82,5 +82,5 @@ def test_an_unfinished_sweep_is_resumed(runs):
 def test_a_loop_has_the_strehl_ratio_that_version_0_1_0_measured(runs):
     sweep, row = read_description(runs / "sweep").sweep, loops(runs / "sweep")["explore", "ESCAPE", "1", "0"]
     values = {one.key: type(one.at(0.0))(row[one.key]) for one in sweep.space}
-    outcome = run_trial(sweep.trial_spec(Slot("explore", "ESCAPE", 1), values))
+    outcome = run_trial(TrialSpec.from_slot(sweep, Slot("explore", "ESCAPE", 1), values))
     assert outcome["strehl"]["peak"]["value"] == pytest.approx(float(row["strehl_peak"]), abs=1e-3)

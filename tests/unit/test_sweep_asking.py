@@ -15,11 +15,11 @@ from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 from escape_hw.io.provenance import file_sha256
 from escape_hw.runtime.sweep.description import SweepDescription, read_description
-from escape_hw.runtime.sweep.design import Design, MatrixVariant
+from escape_hw.runtime.sweep.design import Design, MatrixVariant, Sweep
 from escape_hw.runtime.sweep.products import criteria, sweep_document, trials_csv
 from escape_hw.runtime.sweep.request import parse_search_space, require_loop_frames, require_optuna
 from escape_hw.runtime.sweep.result import analyse_sweep
-from escape_hw.runtime.sweep.run import Sweep, run_sweep
+from escape_hw.runtime.sweep.run import run_sweep
 from escape_hw.runtime.sweep.search_space import default_space, parse_parameter
 
 
@@ -108,7 +108,7 @@ def test_a_sweep_on_an_open_bench(tmp_path):
         ).validate()
         description.save(tmp_path)
         assert read_description(tmp_path) == description
-        found = run(run_sweep(swept, description.open_study(), bench), observers=(sent.append,))
+        found = run(run_sweep(description.open_study(), bench), observers=(sent.append,))
         assert np.all(bench.dm.shape == 0)
     result = analyse_sweep(swept, found, 0.05)
     assert len(found.records) == 4 + 2 + 12

@@ -9,7 +9,7 @@ from sqlalchemy import text
 
 from escape_hw.errors import CalibrationError, ConfigError, StorageError
 from escape_hw.runtime.sweep import study as module
-from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot, draw_parameters
+from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot, Sweep, draw_parameters
 from escape_hw.runtime.sweep.search_space import default_space
 from escape_hw.runtime.sweep.study import SweepStudy
 
@@ -21,10 +21,11 @@ OUTCOME = {"strehl": None, "stable": True, "diverged": False}
 
 @pytest.fixture
 def opened(tmp_path):
-    def make(settings: str = "same", **options) -> SweepStudy:
+    def make(settings: str = "same", heartbeat: bool = True, **options) -> SweepStudy:
         url = f"sqlite:///{tmp_path / 'study.db'}"
         options = {"timeout_s": 5.0, **options}
-        return SweepStudy(url, "s", {"frames": settings}, VARIANTS, SPACE, 1, **options)
+        sweep = Sweep("", VARIANTS, SPACE, Design(), 100, 1, simulated=heartbeat)
+        return SweepStudy(sweep, url, "s", {"frames": settings}, **options)
 
     return make
 
@@ -265,4 +266,4 @@ def test_a_storage_that_stays_away_is_named(opened, monkeypatch):
 @pytest.mark.parametrize("url", ["nonsense", "nosuchdialect://host/name"])
 def test_a_wrong_url_is_a_usage_error(url):
     with pytest.raises(ConfigError, match="--storage"):
-        SweepStudy(url, "s", {}, VARIANTS, SPACE, 1)
+        SweepStudy(Sweep("", VARIANTS, SPACE, Design(), 100, 1), url, "s", {})

@@ -228,7 +228,7 @@ def _run(
     from escape_hw.runtime.sweep.run import run_sweep
 
     try:
-        procedure = run_sweep(description.sweep, description.open_study(), runner)
+        procedure = run_sweep(description.open_study(), runner)
         found, stop = context.run_keeping_partial(procedure)
     finally:
         if not isinstance(runner, Bench):

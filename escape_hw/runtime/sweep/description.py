@@ -18,8 +18,7 @@ from escape_hw.io.documents import dumps
 from escape_hw.io.provenance import file_sha256
 from escape_hw.io.storage import write_atomic
 from escape_hw.runtime.procedures.calibration import model_psf
-from escape_hw.runtime.sweep.design import Design, MatrixVariant, current_keys
-from escape_hw.runtime.sweep.run import METRICS, Sweep
+from escape_hw.runtime.sweep.design import METRICS, Design, MatrixVariant, Sweep, current_keys
 from escape_hw.runtime.sweep.search_space import DELAY_KEY, Parameter, format_value, parse_parameter
 from escape_hw.runtime.sweep.study import SAMPLERS, STORAGE_TIMEOUT_S, SweepStudy, redact_password
 
@@ -91,10 +90,9 @@ class SweepDescription:
         ConfigError, StorageError
             See :class:`~escape_hw.runtime.sweep.study.SweepStudy`.
         """
-        sweep = self.sweep
         return SweepStudy(
-            self.storage, self.study, self.settings(), sweep.variants, sweep.space, sweep.seed,
-            use_tpe=self.sampler == "tpe", timeout_s=timeout_s, heartbeat=sweep.simulated,
+            self.sweep, self.storage, self.study, self.settings(), use_tpe=self.sampler == "tpe",
+            timeout_s=timeout_s,
         )  # fmt: skip
 
     def save(self, folder: Path) -> Path:
@@ -140,7 +138,7 @@ def describe_sweep(
     folder
         Of the sweep.
     variants, space, design, frames, metric
-        See :class:`~escape_hw.runtime.sweep.run.Sweep`.
+        See :class:`~escape_hw.runtime.sweep.design.Sweep`.
     sampler, margin, storage, study
         See :class:`SweepDescription`; an SQLite file in the folder by default.
 

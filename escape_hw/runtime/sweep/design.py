@@ -1,9 +1,9 @@
-"""Design of a sweep: matrix variants, stages, and the slot (stage, variant, realisation) of each loop."""
+"""Design of a sweep: matrix variants, search space, stages, and the slot of each loop."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from escape_hw.runtime.sweep.search_space import Parameter
 #: turbulence; the best of each variant on fresh common realisations.
 EXPLORE, SHORTLIST, FINAL = "explore", "shortlist", "final"
 STAGES = (EXPLORE, SHORTLIST, FINAL)
+#: The Strehl ratios that can be maximised.
+METRICS = ("peak", "otf", "encircled")
 #: Spacing of the stages' seeds.
 _SEED_SPACING = 1_000_000
 #: Names of version 0.1.0 in stored studies and sweep.json, and today's.
@@ -112,6 +114,45 @@ class Design:
     def n_loops(self, n_variants: int) -> int:
         """Loops of all stages."""
         return self.trials + n_variants * (self.candidates * self.replicates + self.final_replicates)
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """What is swept.
+
+    Parameters
+    ----------
+    config
+        The whole configuration, as TOML.
+    variants, space, design
+        What is compared, what is varied, and the number of loops.
+    frames
+        Length of a loop.
+    seed
+        Of the draws and of the turbulence.
+    metric
+        Strehl ratio that is maximised; one of :data:`METRICS`.
+    psf
+        File of the model PSF, or ``None`` when each trial computes its own.
+    simulated
+        Whether each trial opens a simulated bench with its own turbulence.
+    """
+
+    config: str
+    variants: tuple[MatrixVariant, ...]
+    space: tuple[Parameter, ...]
+    design: Design
+    frames: int
+    seed: int
+    metric: str = "peak"
+    psf: str | None = None
+    simulated: bool = True
+
+    def merit(self, outcome: Mapping[str, Any]) -> float | None:
+        """The Strehl ratio that is maximised; ``None`` for a loop that diverged."""
+        if outcome["diverged"] or outcome["strehl"] is None:
+            return None
+        return float(outcome["strehl"][self.metric]["value"])
 
 
 def draw_parameters(space: Sequence[Parameter], seed: int, index: int) -> dict[str, Any]:

@@ -16,9 +16,8 @@ from escape_hw.runtime.procedures.criteria import criterion
 from escape_hw.runtime.procedures.products import write_run_result
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.sweep.description import SweepDescription
-from escape_hw.runtime.sweep.design import EXPLORE, STAGES
+from escape_hw.runtime.sweep.design import EXPLORE, METRICS, STAGES
 from escape_hw.runtime.sweep.result import SweepResult, VariantComparison
-from escape_hw.runtime.sweep.run import METRICS
 from escape_hw.runtime.sweep.study import redact_password
 
 #: File name of the table of loops.

@@ -135,7 +135,7 @@ def run_matrix_sweep(
     simulated = description.sweep.simulated
     pool = open_workers(workers, scheduler) if simulated else None
     try:
-        procedure = run_sweep(description.sweep, description.open_study(), pool or bench)
+        procedure = run_sweep(description.open_study(), pool or bench)
         found = bench.run(procedure, progress=progress)
     finally:
         if pool is not None:

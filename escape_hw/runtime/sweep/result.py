@@ -15,9 +15,8 @@ from optuna.trial import create_trial
 
 from escape_hw.api.results import Estimate, StrehlEstimate
 from escape_hw.pipeline.statistics import MIN_PAIRS, PairedComparison, compare_pairs, describe_comparison
-from escape_hw.runtime.sweep.design import EXPLORE, FINAL, MatrixVariant
-from escape_hw.runtime.sweep.run import METRICS, Sweep, SweepRun
-from escape_hw.runtime.sweep.search_space import Parameter
+from escape_hw.runtime.sweep.design import EXPLORE, FINAL, METRICS, MatrixVariant, Sweep
+from escape_hw.runtime.sweep.run import SweepRun
 from escape_hw.runtime.sweep.study import LoopRecord
 
 #: Importance of a dummy parameter without effect: the share that noise gives to any parameter.
@@ -124,8 +123,7 @@ def analyse_sweep(sweep: Sweep, run: SweepRun, margin: float = DEFAULT_MARGIN) -
         sweep, run, margin, best,
         tuple(_comparisons(sweep, [r for r in run.records if r.slot.stage == FINAL], margin)),
         tuple(_comparisons(sweep, at_random, margin)),
-        importances(run.records, sweep.variants, sweep.space, sweep.seed),
-        importances(run.records, sweep.variants, sweep.space, sweep.seed, closed_only=True),
+        importances(sweep, run.records), importances(sweep, run.records, closed_only=True),
     )  # fmt: skip
 
 
@@ -166,12 +164,7 @@ def _comparisons(sweep: Sweep, records: Iterable[LoopRecord], margin: float) -> 
 
 
 def importances(
-    records: Sequence[LoopRecord],
-    variants: Sequence[MatrixVariant],
-    space: Sequence[Parameter],
-    seed: int,
-    *,
-    closed_only: bool = False,
+    sweep: Sweep, records: Sequence[LoopRecord], *, closed_only: bool = False
 ) -> dict[str, float]:
     """Share of each parameter in the variance of the Strehl ratio (fANOVA, Hutter et al. 2014, by Optuna).
 
@@ -179,10 +172,8 @@ def importances(
 
     Parameters
     ----------
-    records
-        Finished loops; those of the first stage are used.
-    variants, space, seed
-        Of the sweep.
+    sweep, records
+        The sweep and its finished loops; those of the first stage are used.
     closed_only
         Leave out the loops that diverged; otherwise they count with a Strehl ratio of 0.
 
@@ -191,11 +182,12 @@ def importances(
     dict
         By parameter, with :data:`CHANCE`; sums to 1. Empty for fewer than :data:`MIN_LOOPS` loops.
     """
+    variants, seed = sweep.variants, sweep.seed
     variant_of = {one.label: one for one in variants}
     selected = [r for r in records if r.slot.stage == EXPLORE and (r.merit > 0 or not closed_only)]
     if len(selected) < MIN_LOOPS or np.ptp([record.merit for record in selected]) == 0:
         return {}
-    distributions = {one.key: one.distribution() for one in space}
+    distributions = {one.key: one.distribution() for one in sweep.space}
     distributions["matrix"] = CategoricalDistribution(tuple(dict.fromkeys(one.matrix for one in variants)))
     if len({one.optical_gains for one in variants}) > 1:
         distributions["optical_gains"] = CategoricalDistribution((False, True))

@@ -15,14 +15,12 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.representation import short_repr
 from escape_hw.bench import Bench
 from escape_hw.errors import Aborted, CalibrationError
-from escape_hw.runtime.sweep.design import EXPLORE, SHORTLIST, Design, MatrixVariant, Slot
+from escape_hw.runtime.sweep.design import EXPLORE, SHORTLIST, Slot, Sweep
 from escape_hw.runtime.sweep.search_space import Choices, Parameter
 from escape_hw.runtime.sweep.study import LoopRecord, SweepStudy
 from escape_hw.runtime.sweep.trials import TrialSpec, run_closed_loop, run_trial
 from escape_hw.runtime.sweep.workers import Workers
 
-#: The Strehl ratios that can be maximised.
-METRICS = ("peak", "otf", "encircled")
 #: A loop is judged by the mean over its nearest neighbours: at most so many, and so large a share of all.
 _MAX_NEIGHBOURS, _MAX_NEIGHBOUR_FRACTION = 10, 0.05
 #: Seconds between two looks at an abort, and at the study when no loop ends.
@@ -32,53 +30,6 @@ _MAX_THREADS = 1024
 
 #: Parameters by variant and candidate.
 Candidates = Mapping[tuple[str, int], Mapping[str, Any]]
-
-
-@dataclass(frozen=True, slots=True)
-class Sweep:
-    """What is swept.
-
-    Parameters
-    ----------
-    config
-        The whole configuration, as TOML.
-    variants, space, design
-        What is compared, what is varied, and the number of loops.
-    frames
-        Length of a loop.
-    seed
-        Of the draws and of the turbulence.
-    metric
-        Strehl ratio that is maximised; one of :data:`METRICS`.
-    psf
-        File of the model PSF, or ``None`` when each trial computes its own.
-    simulated
-        Whether each trial opens a simulated bench with its own turbulence.
-    """
-
-    config: str
-    variants: tuple[MatrixVariant, ...]
-    space: tuple[Parameter, ...]
-    design: Design
-    frames: int
-    seed: int
-    metric: str = "peak"
-    psf: str | None = None
-    simulated: bool = True
-
-    def trial_spec(self, slot: Slot, values: dict[str, Any]) -> TrialSpec:
-        """What a worker needs for the loop of a slot."""
-        variant = next(one for one in self.variants if one.label == slot.variant)
-        seed = slot.run_seed(self.seed) if self.simulated else None
-        return TrialSpec(
-            self.config, str(variant.path), variant.sha256, self.psf, values, self.frames, seed
-        )  # fmt: skip
-
-    def merit(self, outcome: Mapping[str, Any]) -> float | None:
-        """The Strehl ratio that is maximised; ``None`` for a loop that diverged."""
-        if outcome["diverged"] or outcome["strehl"] is None:
-            return None
-        return float(outcome["strehl"][self.metric]["value"])
 
 
 @dataclass(slots=True)
@@ -91,15 +42,13 @@ class SweepRun:
     __repr__ = short_repr
 
 
-def run_sweep(sweep: Sweep, study: SweepStudy, runner: Workers | Bench) -> Procedure[SweepRun]:
+def run_sweep(study: SweepStudy, runner: Workers | Bench) -> Procedure[SweepRun]:
     """Run the unfinished loops of a sweep.
 
     Parameters
     ----------
-    sweep
-        What to run.
     study
-        Stores the trials; finished ones do not run again.
+        Of the sweep; its finished trials do not run again.
     runner
         Workers that open simulated benches, or an open bench, on which the loops run one after the other.
 
@@ -115,19 +64,19 @@ def run_sweep(sweep: Sweep, study: SweepStudy, runner: Workers | Bench) -> Proce
     StorageError
         The storage does not answer.
     """
-    variants, design, result = sweep.variants, sweep.design, SweepRun()
+    variants, design, result = study.sweep.variants, study.sweep.design, SweepRun()
     report, n_before = Reporter("sweep", design.n_loops(len(variants)), "loop"), 0
 
     def run_stage(plan: list[Slot], values: Candidates) -> Procedure[list[LoopRecord]]:
         nonlocal n_before
         stage = _run_on_bench if isinstance(runner, Bench) else _run_in_parallel
-        yield from stage(sweep, study, runner, plan, values, report, n_before)  # type: ignore[arg-type]
+        yield from stage(study, runner, plan, values, report, n_before)  # type: ignore[arg-type]
         n_before += len(plan)
         return study.records()
 
     try:
         records = yield from run_stage(list(design.exploration_slots(variants)), {})
-        found = _candidates(sweep, records)
+        found = _candidates(study.sweep, records)
         plan = [slot for slot in design.shortlist_slots(variants) if (slot.variant, slot.candidate) in found]
         records = yield from run_stage(plan, found)
         result.best = {one.label: best_candidate(records, one.label) for one in variants}
@@ -140,7 +89,6 @@ def run_sweep(sweep: Sweep, study: SweepStudy, runner: Workers | Bench) -> Proce
 
 
 def _run_in_parallel(
-    sweep: Sweep,
     study: SweepStudy,
     workers: Workers,
     plan: Sequence[Slot],
@@ -155,8 +103,8 @@ def _run_in_parallel(
     """
 
     def run_loop(slot: Slot, parameters: dict[str, Any]) -> tuple[dict[str, Any], float | None]:
-        outcome = workers.run(run_trial, sweep.trial_spec(slot, parameters))
-        return outcome, sweep.merit(outcome)
+        outcome = workers.run(run_trial, TrialSpec.from_slot(study.sweep, slot, parameters))
+        return outcome, study.sweep.merit(outcome)
 
     futures: set[Future[None]] = set()
     completed: set[Future[None]] = set()
@@ -190,7 +138,6 @@ def _run_in_parallel(
 
 
 def _run_on_bench(
-    sweep: Sweep,
     study: SweepStudy,
     bench: Bench,
     plan: Sequence[Slot],
@@ -214,14 +161,14 @@ def _run_on_bench(
             continue
         trial, slot, parameters = asked
         try:
-            outcome = yield from run_closed_loop(bench, sweep.trial_spec(slot, parameters))
+            outcome = yield from run_closed_loop(bench, TrialSpec.from_slot(study.sweep, slot, parameters))
         except BaseException:
             study.tell(trial, None)
             raise
         if outcome.get("partial"):
             study.tell(trial, None)
             raise Aborted(partial=None)
-        study.tell(trial, outcome, sweep.merit(outcome))
+        study.tell(trial, outcome, study.sweep.merit(outcome))
 
 
 # ---------------------------------------------------------------- selection between the stages

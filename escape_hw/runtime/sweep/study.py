@@ -25,7 +25,7 @@ from sqlalchemy import event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
 
 from escape_hw.errors import CalibrationError, ConfigError, EscapeError, StorageError
-from escape_hw.runtime.sweep.design import EXPLORE, MatrixVariant, Slot, current_keys, draw_parameters
+from escape_hw.runtime.sweep.design import EXPLORE, Slot, Sweep, current_keys, draw_parameters
 from escape_hw.runtime.sweep.search_space import Parameter, Range
 
 log = logging.getLogger(__name__)
@@ -93,20 +93,18 @@ class SweepStudy:
 
     Parameters
     ----------
+    sweep
+        Its loops have heartbeats in simulation. On hardware one runner uses :meth:`ask` and :meth:`tell`.
     url
         SQLAlchemy's URL: ``sqlite:////path/study.db``, ``postgresql+psycopg://user@host/name``.
     name
         Name of the study.
     settings
         Settings that must agree to resume a study.
-    variants, space, seed
-        What is compared, what is varied, and the seed of the draws.
     use_tpe
         TPE instead of random parameters.
     timeout_s
         Seconds to wait for a storage that does not answer.
-    heartbeat
-        False for one runner that uses :meth:`ask` and :meth:`tell`, which Optuna gives no heartbeat.
 
     Raises
     ------
@@ -118,27 +116,21 @@ class SweepStudy:
 
     def __init__(
         self,
+        sweep: Sweep,
         url: str,
         name: str,
         settings: Mapping[str, Any],
-        variants: Sequence[MatrixVariant],
-        space: Sequence[Parameter],
-        seed: int,
         *,
         use_tpe: bool = False,
         timeout_s: float = STORAGE_TIMEOUT_S,
-        heartbeat: bool = True,
     ) -> None:
-        self.url, self.name, self._timeout_s = url, name, timeout_s
-        self._variants, self._space = {one.label: one for one in variants}, tuple(space)
-        self._matrices = tuple(dict.fromkeys(one.matrix for one in variants))
-        self._seed, self._use_tpe = seed, use_tpe
-        self._grace_s = GRACE_PERIOD_S if heartbeat else 0
+        self.sweep, self.url, self.name, self._timeout_s = sweep, url, name, timeout_s
+        self._use_tpe, self._grace_s = use_tpe, GRACE_PERIOD_S if sweep.simulated else 0
         self._stopped = threading.Event()
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         # Optuna announces the interface of its heartbeats as experimental, from several threads.
         warnings.filterwarnings("ignore", ".*(heartbeat|fail_stale_trials)", ExperimentalWarning)
-        self._study = self._retry(lambda: _open_study(url, name, heartbeat))
+        self._study = self._retry(lambda: _open_study(url, name, sweep.simulated))
         self._check_settings(dict(settings))
 
     def stop(self) -> None:
@@ -175,7 +167,7 @@ class SweepStudy:
         n_waiting = sum(t.state == TrialState.WAITING for t in trials)
         missing = (slot for slot in plan if slot not in present)
         for slot in itertools.islice(missing, max(0, n_free - n_waiting)):
-            variant = self._variants[slot.variant]
+            variant = next(one for one in self.sweep.variants if one.label == slot.variant)
             parameters = values.get((slot.variant, slot.candidate)) or self._choose_parameters(slot)
             fixed = {"matrix": variant.matrix, "optical_gains": variant.optical_gains, **parameters}
             self._study.enqueue_trial(fixed, user_attrs={"slot": asdict(slot)})
@@ -185,12 +177,12 @@ class SweepStudy:
     def _choose_parameters(self, slot: Slot) -> dict[str, Any]:
         """Parameters of a loop of the first stage; TPE optimises each variant for itself."""
         if not self._use_tpe or slot.index < N_STARTUP_LOOPS:
-            return draw_parameters(self._space, self._seed, slot.index)
+            return draw_parameters(self.sweep.space, self.sweep.seed, slot.index)
         history = [r for r in self.records() if r.slot.stage == EXPLORE and r.slot.variant == slot.variant]
         if len(history) < N_STARTUP_LOOPS:
-            return draw_parameters(self._space, self._seed, slot.index)
-        distributions = {one.key: one.distribution() for one in self._space}
-        seed = zlib.crc32(f"{self._seed} {slot.variant} {slot.index}".encode())
+            return draw_parameters(self.sweep.space, self.sweep.seed, slot.index)
+        distributions = {one.key: one.distribution() for one in self.sweep.space}
+        seed = zlib.crc32(f"{self.sweep.seed} {slot.variant} {slot.index}".encode())
         tpe = TPESampler(seed=seed, multivariate=True, n_startup_trials=0)
         study = optuna.create_study(direction="maximize", sampler=tpe)
         study.add_trials(
@@ -243,7 +235,7 @@ class SweepStudy:
     def _suggest(self, trial: optuna.Trial) -> tuple[Slot, dict[str, Any]]:
         trials = self._study.get_trials(deepcopy=False)
         fixed = trials[trial.number].system_attrs.get("fixed_params", {})
-        if "slot" not in trial.user_attrs or not {one.key for one in self._space} <= set(fixed):
+        if "slot" not in trial.user_attrs or not {one.key for one in self.sweep.space} <= set(fixed):
             # Made by Optuna after another runner took the last one, or enqueued without parameters by 0.1.0.
             raise _SlotTaken
         slot = _slot_of(trials[trial.number])
@@ -255,9 +247,10 @@ class SweepStudy:
                 and _slot_of(other) == slot
             ):
                 raise _SlotTaken
-        trial.suggest_categorical("matrix", self._matrices)
+        matrices = tuple(dict.fromkeys(one.matrix for one in self.sweep.variants))
+        trial.suggest_categorical("matrix", matrices)
         trial.suggest_categorical("optical_gains", (False, True))
-        return slot, {one.key: _suggest_value(trial, one) for one in self._space}
+        return slot, {one.key: _suggest_value(trial, one) for one in self.sweep.space}
 
     @_retried
     def ask(self) -> tuple[optuna.Trial, Slot, dict[str, Any]] | None:
@@ -297,7 +290,7 @@ class SweepStudy:
         found: dict[Slot, LoopRecord] = {}
         for trial in self._study.get_trials(deepcopy=False, states=_FINISHED):
             if "slot" in trial.user_attrs:
-                slot, values = _slot_of(trial), {one.key: trial.params[one.key] for one in self._space}
+                slot, values = _slot_of(trial), {one.key: trial.params[one.key] for one in self.sweep.space}
                 merit = trial.value if trial.state == TrialState.COMPLETE else None
                 found.setdefault(slot, LoopRecord(slot, values, trial.user_attrs["outcome"], merit or 0.0))
         return sorted(found.values(), key=lambda r: (r.slot.stage, r.slot.index, r.slot.candidate))

@@ -23,6 +23,7 @@ from escape_hw.config.system import SystemConfig
 from escape_hw.errors import CalibrationError, IncompatibleProduct
 from escape_hw.io.documents import strehl_document
 from escape_hw.runtime.procedures.calibration import model_psf
+from escape_hw.runtime.sweep.design import Slot, Sweep
 from escape_hw.runtime.sweep.search_space import DELAY_KEY, config_overrides
 
 #: A bench and what its simulated devices share belong to one thread; a Dask worker may have several.
@@ -57,6 +58,14 @@ class TrialSpec:
     values: dict[str, Any]
     frames: int
     run_seed: int | None
+
+    @classmethod
+    def from_slot(cls, sweep: Sweep, slot: Slot, values: dict[str, Any]) -> TrialSpec:
+        """The loop of a slot."""
+        variant = next(one for one in sweep.variants if one.label == slot.variant)
+        seed = slot.run_seed(sweep.seed) if sweep.simulated else None
+        path, sha256 = str(variant.path), variant.sha256
+        return cls(sweep.config, path, sha256, sweep.psf, values, sweep.frames, seed)
 
     def build_config(self) -> SystemConfig:
         """The configuration of this trial.
