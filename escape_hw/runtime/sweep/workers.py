@@ -70,12 +70,11 @@ class Workers(ABC):
             Its workers died several times in a row, or the pool was closed.
         """
         for _ in range(_MAX_DEATHS + 1):
-            with self._lock:
-                if self._closed:
-                    raise CalibrationError("the workers are closed")
-                executor = self._executor
             try:
                 with self._lock:
+                    if self._closed:
+                        raise CalibrationError("the workers are closed")
+                    executor = self._executor
                     future = self.submit(function, *arguments)
                 while not wait((future,), timeout=_POLL_S).done:
                     if executor is not self._executor or self._is_disconnected():
