@@ -29,7 +29,7 @@ def test_the_twin_answers(document, verb):
     assert found["simulated"]
     assert found["info"]["model"] == "simulated PI S-330 with E-727"
     assert found["changed"] == (verb != "status")
-    assert "this moves" not in err
+    assert "this changes hardware" not in err
     if verb == "start":
         assert found["modulation"]["radius_lambda_d"] == pytest.approx(3.0)
         assert found["left"] == "parked", "a twin ends with the command"
@@ -39,7 +39,8 @@ def test_start_status_stop_on_the_wire(document, escape, stage):
     emulator, here = stage
     code, found, err = document("modulator", "start", "razor-pywfs", "--radius", 2, "--frequency", 300, *here)
     assert code == 0, err
-    assert "this moves the modulator: servos on, auto-zero where needed, centre, then the circle" in err
+    assert "this changes hardware, devices.modulator" in err
+    assert ": servos on, auto-zero where needed, centre, then the circle" in err
     assert "requested: 2 lambda/D (94 urad) at 300 Hz" in err
     assert "achievable: 2 lambda/D (94 urad) at 298.507 Hz" in err
     assert found["asked"] == {"radius_lambda_d": 2.0, "frequency_hz": 300.0}
@@ -51,7 +52,7 @@ def test_start_status_stop_on_the_wire(document, escape, stage):
 
     code, found, err = document("modulator", "status", "razor-pywfs", *here)
     assert code == 0
-    assert "this moves" not in err
+    assert "this changes hardware" not in err
     assert found["modulation"]["radius_lambda_d"] == pytest.approx(2.0, rel=0.01)
     assert emulator.controller.state.describe() == "turning"
     code, out, _ = escape("modulator", "status", "razor-pywfs", *here)
@@ -59,7 +60,8 @@ def test_start_status_stop_on_the_wire(document, escape, stage):
 
     code, found, err = document("modulator", "stop", "razor-pywfs", *here)
     assert code == 0
-    assert "this moves the modulator: centre, servos off" in err
+    assert "this changes hardware, devices.modulator" in err
+    assert ": centre, servos off" in err
     assert (found["modulation"], found["left"]) == (None, "parked")
     assert emulator.controller.state.describe() == "at rest"
     assert emulator.complaints == ()

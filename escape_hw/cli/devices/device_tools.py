@@ -16,18 +16,13 @@ if TYPE_CHECKING:
 D = TypeVar("D", bound="Device")
 
 
-def is_on_hardware(config: SystemConfig, key: str) -> bool:
-    """Whether this device of the system is real."""
-    from escape_hw.bench import resolve_mode
-
-    return resolve_mode(getattr(config.devices, key), config) == "hardware"
-
-
 def announce_change(context: CommandContext, config: SystemConfig, key: str, what: str) -> None:
     """Announce how a real device is about to change; nothing for a simulated one."""
-    if is_on_hardware(config, key):
-        serial = getattr(config.devices, key).serial
-        context.notify(f"this changes hardware, devices.{key} {serial}: {what}")
+    from escape_hw.bench import resolve_mode
+
+    section = getattr(config.devices, key)
+    if resolve_mode(section, config) == "hardware":
+        context.notify(f"this changes hardware, devices.{key} {section.serial}: {what}")
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import typer
 
 from escape_hw.cli import options
 from escape_hw.cli.context import CommandContext, command_context
-from escape_hw.cli.devices.device_tools import open_device
+from escape_hw.cli.devices.device_tools import announce_change, open_device
 
 if TYPE_CHECKING:
     from escape_hw.api.modulator import Modulation, ModulatorStatus, TipTiltModulator
@@ -50,11 +50,14 @@ def start(
     """
     with command_context("modulator start", json=json) as context:
         from escape_hw.api.modulator import Modulation
+        from escape_hw.config.sensor import PyramidSection
 
         config, section, device = _device(context, options.SystemSelection.of(system, set, seed, mode))
-        radius_lambda_d = _default_radius(config) if radius is None else radius
+        radius_lambda_d = config.sensor_as(PyramidSection).modulation if radius is None else radius
         requested = Modulation(radius_lambda_d * section.rad_per_lambda_d, frequency or section.frequency_hz)
-        _announce_motion(context, config, "servos on, auto-zero where needed, centre, then the circle")
+        announce_change(
+            context, config, "modulator", "servos on, auto-zero where needed, centre, then the circle"
+        )
         with open_device(context, device):
             achievable = device.check(requested)
             context.notify(f"requested: {_format_modulation(requested, section)}")
@@ -82,7 +85,7 @@ def stop(
     """Stop and park: MOVES the stage to its centre, then switches its servos off."""
     with command_context("modulator stop", json=json) as context:
         config, section, device = _device(context, options.SystemSelection.of(system, set, seed, mode))
-        _announce_motion(context, config, "centre, servos off")
+        announce_change(context, config, "modulator", "centre, servos off")
         with open_device(context, device):
             device.park()
             status = device.status()
@@ -126,22 +129,6 @@ def _device(
     if section is None:
         raise ConfigError(f"system '{config.system.name}' has no modulator, [devices.modulator]")
     return config, section, build_device("modulator", config, TipTiltModulator)  # type: ignore[type-abstract]
-
-
-def _announce_motion(context: CommandContext, config: SystemConfig, what: str) -> None:
-    """Announce how the hardware is about to move."""
-    from escape_hw.bench import resolve_mode
-
-    section = config.devices.modulator
-    if section is not None and resolve_mode(section, config) == "hardware":
-        context.notify(f"this moves the modulator: {what}")
-
-
-def _default_radius(config: SystemConfig) -> float:
-    """Modulation radius of the sensor's section, lambda/D."""
-    from escape_hw.config.sensor import PyramidSection
-
-    return config.sensor_as(PyramidSection).modulation
 
 
 def _format_modulation(modulation: Modulation, section: ModulatorConfig) -> str:
