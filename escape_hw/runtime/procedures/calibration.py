@@ -215,7 +215,7 @@ class ClosedLoopCalibration(CalibrationProcedure):
 
     closed_loop: Path | None = parameter(
         default=None, help="Measure in closed loop, with this control matrix.",
-        label="Control matrix (closed loop)", kind="matrix", deprecated=("closing",),
+        label="Control matrix", kind="matrix", deprecated=("closing",),
     )  # fmt: skip
 
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
