@@ -122,7 +122,9 @@ def test_what_makes_no_mirror_is_named_with_what_is_expected(name: str, message:
 def test_a_broken_model_is_named_with_what_is_expected() -> None:
     with pytest.raises(ConfigError, match=r"takes \(config\).*called as factory\(config, grid\)"):
         registry.model_factory("plug-model")
-    with pytest.raises(ConfigError, match="'plug-none' creates a SystemConfig, not a SyntheticModel; plug_mi"):
+    with pytest.raises(
+        ConfigError, match="'plug-none' creates a SystemConfig, not a SyntheticModel; plug_mi"
+    ):
         registry.model_factory("plug-none")(load_system("razor-shwfs"), None)
 
 
