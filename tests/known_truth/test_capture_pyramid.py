@@ -1,4 +1,7 @@
-"""A pyramid from two actuator pitches and ten degrees away; `benchmarks/studies/capture_range.py` does a hundred."""
+"""A pyramid from two actuator pitches and ten degrees away.
+
+`benchmarks/studies/capture_range.py` does a hundred.
+"""
 
 from __future__ import annotations
 

@@ -170,7 +170,7 @@ def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match="no device driver 'bench-mirror' is installed"):
         registry.device_factory("bench-mirror")
     for number in (1, 2):
-        factory = lambda name, config, shared, number=number: number
+        factory = lambda name, config, shared, number=number: number  # noqa: E731
         registry.register_device("bench-mirror", factory)
         assert registry.device_factory("bench-mirror") is factory
     assert "bench-mirror" in registry.available(registry.DEVICES)
