@@ -142,7 +142,7 @@ def _geometry_of(run: RunContent) -> Geometry:
     if run.layout is not None:
         parts["layout"] = _rows(run.layout)
     if run.places_m is not None:
-        parts["places_m"] = tuple((float(x), float(y)) for x, y in run.places_m)
+        parts["positions_m"] = tuple((float(x), float(y)) for x, y in run.places_m)
     return Geometry.model_validate(parts)
 
 

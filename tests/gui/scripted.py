@@ -201,7 +201,7 @@ class ScriptedSource:
         """Add an entry to every stream that the panels read."""
         rng = np.random.default_rng(seed)
         n_slopes = 2 * sum(row.count("1") for row in self.geometry_data.valid)
-        n_act = sum(row.count("1") for row in self.geometry_data.layout) or len(self.geometry_data.places_m)
+        n_act = sum(row.count("1") for row in self.geometry_data.layout) or len(self.geometry_data.positions_m)
         self.push("frames", spots(self.geometry_data, seed=seed), top=1023.0)
         self.push("slopes", rng.normal(0, 0.4, n_slopes))
         self.push("commands", rng.normal(0, 0.1, n_act))
@@ -211,7 +211,7 @@ class ScriptedSource:
         latencies = rng.gamma(60, 5.2, 4000)
         spacing = rng.normal(2000, 18, 4000)
         self.push("latency_histogram", np.stack([counted(*latencies), counted(*spacing)]))
-        if self.geometry_data.places_m:
+        if self.geometry_data.positions_m:
             self.push("measured_positions", rng.normal(0, 4e-7, n_act))
         line = LogLine(
             number=len(self.lines),
