@@ -24,18 +24,11 @@ from escape_hw.report.tables import TITLES, format_with_error
 
 #: Entry of a list of choices for an argument without a value.
 NO_CHOICE = "–"
-#: Labels of parameters whose names are not suitable as labels.
-_LABELS = {
-    "snr": "SNR goal", "im": "Matrix", "closed_loop": "Control matrix", "frames": "Frames",
-    "poke": "Poke", "accuracy": "Accuracy goal", "strehl": "Measure Strehl", "best": "Optimise gain",
-    "resume": "Resume run", "plain": "Paper's estimator", "whiten": "Whiten turbulence",
-    "budget": "Allowed Strehl loss", "exchange": "Exchange matrix",
-}  # fmt: skip
 
 
 def label(parameter: ProcedureParameter) -> str:
-    """How a parameter is called in the form."""
-    return _LABELS.get(parameter.name, parameter.name.replace("_", " ").capitalize())
+    """Words for a parameter in the form."""
+    return parameter.label or parameter.name.replace("_", " ").capitalize()
 
 
 def parameter_hint(parameter: ProcedureParameter) -> str:

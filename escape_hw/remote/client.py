@@ -41,6 +41,10 @@ from escape_hw.remote.state import (
     State,
 )
 from escape_hw.remote.transport import ClientTransport
+from escape_hw.runtime.procedures.calibration import EscapeProcedure
+from escape_hw.runtime.procedures.declaration import present_names
+from escape_hw.runtime.procedures.python_method import procedure_method
+from escape_hw.runtime.procedures.registry import PROCEDURES
 from escape_hw.streams.ring import ReaderCache
 
 #: Silence of a server after which waiting for a run ends.
@@ -450,24 +454,81 @@ class Connection:
     def start(self, procedure: str, **arguments: float | int | bool | str | None) -> RemoteRun:
         """Start a procedure.
 
+        Parameters
+        ----------
+        procedure
+            Name of the procedure; :meth:`procedures` lists names and parameters.
+        arguments
+            Values of its parameters by name.
+
         Raises
         ------
         LeaseHeld
-            This client may not write.
+            Another client has control.
         ConfigError
             An argument is wrong.
         RequestRefused
-            Something else is going on.
+            The server is busy.
         """
+        declared = next((each for each in PROCEDURES if each.name == procedure), None)
+        if declared is not None:
+            arguments = present_names(declared.parameters(), arguments)
         request = ask.build_request(
             ask.StartProcedure, client=self.client, procedure=procedure, arguments=arguments
         )
         number, _ = self._ask(request, SLOW_TIMEOUT_S)
         return RemoteRun(self, int(number), procedure)
 
-    def calibrate(self, method: str = "escape", *, progress: bool = False, **arguments: Any) -> Any:
-        """Calibrate and wait for the result; arguments as for :meth:`start`."""
-        return self.start(method, **arguments).wait(progress=progress)
+    @procedure_method(EscapeProcedure)
+    def calibrate(
+        self,
+        method: str = "escape",
+        *,
+        frames: int | None = None,
+        poke: float | None = None,
+        snr: float | None = None,
+        accuracy: float | None = None,
+        closed_loop: str | None = None,
+        pokes: str | None = None,
+        whiten: bool | None = None,
+        estimator: str | None = None,
+        solver: str | None = None,
+        modes_choice: str | None = None,
+        loss: str | None = None,
+        extra_parameters: str | None = None,
+        resume: str | None = None,
+        progress: bool = False,
+        **arguments: float | int | bool | str | None,
+    ) -> Any:
+        """Calibrate and wait for the result.
+
+        Parameters
+        ----------
+        method
+            Name of the calibration, or of another procedure; not every method has all parameters.
+        arguments
+            Parameters of a procedure that is not a calibration.
+
+        Returns
+        -------
+        CalibrationResult or dict
+            See :meth:`RemoteRun.wait`.
+
+        Raises
+        ------
+        LeaseHeld, ConfigError, RequestRefused
+            See :meth:`start`.
+        Aborted, CalibrationError, ServerGone
+            See :meth:`RemoteRun.wait`.
+        """
+        declared = {
+            "frames": frames, "poke": poke, "snr": snr, "accuracy": accuracy, "closed_loop": closed_loop,
+            "pokes": pokes, "whiten": whiten, "estimator": estimator, "solver": solver,
+            "modes_choice": modes_choice, "loss": loss, "extra_parameters": extra_parameters,
+            "resume": resume,
+        }  # fmt: skip
+        given = {name: value for name, value in declared.items() if value is not None}
+        return self.start(method, **given, **arguments).wait(progress=progress)
 
     def pause(self) -> None:
         """Pause the running procedure between two steps, mirror flat."""

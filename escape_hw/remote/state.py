@@ -354,7 +354,7 @@ class ProcedurePlan(StateDocument):
 
 
 class ProcedureParameter(StateDocument):
-    """One argument of a procedure, enough to make a form of it."""
+    """One parameter of a procedure, with all that a form needs."""
 
     name: str
     #: ``int``, ``float``, ``bool``, ``choice``, ``text``, ``matrix`` (a name out of ``State.products``).
@@ -362,6 +362,8 @@ class ProcedureParameter(StateDocument):
     default: float | int | bool | str | None = None
     unit: str = ""
     help: str = ""
+    #: Words for a form; derived from the name if empty.
+    label: str = ""
     choices: tuple[str, ...] = ()
     low: float | None = None
     high: float | None = None

@@ -46,7 +46,9 @@ PROCEDURES = (
                 name="frames", kind="int", default=1000, unit="frame", low=1, high=1e6, help="How many."
             ),
             ProcedureParameter(name="snr", kind="float", low=0.01, help="Goal."),
-            ProcedureParameter(name="pokes", kind="choice", default="white", choices=("white", "shaped")),
+            ProcedureParameter(
+                name="pokes", kind="choice", default="white", choices=("white", "anticorrelated")
+            ),
             ProcedureParameter(name="plain", kind="bool", default=False),
             ProcedureParameter(name="closed_loop", kind="matrix"),
         ),
@@ -265,9 +267,9 @@ def test_a_procedure_is_started_from_the_form(calibrate, source, control):
     assert [panel.choice.itemText(k) for k in range(panel.choice.count())] == ["ESCAPE", "Optical gains"]
     assert not panel.start.isEnabled()
     panel.form.set_value("frames", "200")
-    panel.form.set_value("pokes", "shaped")
+    panel.form.set_value("pokes", "anticorrelated")
     until(panel.start.isEnabled, calibrate)
-    arguments = {"frames": 200, "pokes": "shaped"}
+    arguments = {"frames": 200, "pokes": "anticorrelated"}
     assert ("plan", {"procedure": "escape", "arguments": arguments}) in control.asked
     assert "frames" in panel.plan.text()
     assert "% of stroke" in panel.plan.text()

@@ -1,4 +1,4 @@
-"""``escape emulate``: answers on a device's own wire, for its driver to be tried on without the device."""
+"""``escape emulate``: emulate a device on its own interface, to test its driver without the device."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from escape_hw.cli.context import CommandContext, command_context
 if TYPE_CHECKING:
     from escape_hw.api.emulator import Emulator
 
-#: How often new complaints are looked for, in seconds.
+#: Period in seconds at which new protocol violations are reported.
 _POLL_S = 0.2
 
 
 def emulate(
-    name: Annotated[str, typer.Argument(help="Device, such as e727; without one: the list.")] = "",
+    name: Annotated[str, typer.Argument(help="Device, such as e727; without one, lists them.")] = "",
     host: Annotated[str, typer.Option("--host", help="Network interface to listen on.")] = "127.0.0.1",
     port: Annotated[
         int | None,
         typer.Option("--port", min=0, max=65535, help="TCP port (default: the device's; 0: any free)."),
     ] = None,
-    pty: Annotated[bool, typer.Option("--pty", help="On a pseudo-terminal instead of the network.")] = False,
+    pty: Annotated[bool, typer.Option("--pty", help="Use a pseudo-terminal instead of the network.")] = False,
     option: Annotated[
         list[str] | None,
         typer.Option("--option", metavar="KEY=VALUE", help="Setting of this emulator; repeatable."),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0, help="Stop after so long (default: at Ctrl-C).")
+        float | None, typer.Option("--seconds", min=0, help="Stop after this time (default: at Ctrl-C).")
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Stand in for a device on its own wire until Ctrl-C; tells what a client did wrong (exit code 1)."""
+    """Emulate a device on its own interface until Ctrl-C; reports errors of clients (exit code 1)."""
     with command_context("emulate", json=json) as context:
         from escape_hw.api.emulator import EmulatorRequest
         from escape_hw.config.registry import EMULATORS, available, emulator_factory
@@ -48,12 +48,11 @@ def emulate(
         request = EmulatorRequest(host, port, pty, dict(map(_parse_option, option or ())))
         emulator = emulator_factory(name)(request)
         context.result({**document, "emulator": name, **_serve(context, name, emulator, seconds)})
-        if emulator.complaints:
+        if emulator.violations:
             context.code = context.code or 1
 
 
 def _parse_option(text: str) -> tuple[str, str]:
-    """``KEY=VALUE`` as a pair."""
     from escape_hw.errors import ConfigError
 
     key, equals, value = text.partition("=")
@@ -63,26 +62,28 @@ def _parse_option(text: str) -> tuple[str, str]:
 
 
 def _serve(context: CommandContext, name: str, emulator: Emulator, seconds: float | None) -> dict[str, Any]:
-    """Run an emulator until its time is over or somebody stops it; returns what there is to tell."""
+    """Run an emulator until its time is over or Ctrl-C; returns its part of the document."""
     deadline = None if seconds is None else time.monotonic() + seconds
     n_reported = 0
     address = emulator.start()
     try:
         context.notify(f"{name}: {address}")
         while deadline is None or time.monotonic() < deadline:
-            n_reported = _report_new_complaints(context, name, emulator, n_reported)
+            n_reported = _report_new_violations(context, name, emulator, n_reported)
             time.sleep(_POLL_S if deadline is None else min(_POLL_S, max(deadline - time.monotonic(), 0)))
     except KeyboardInterrupt:
         context.notify(f"{name}: stopped")
     finally:
         emulator.stop()
-    _report_new_complaints(context, name, emulator, n_reported)
-    return {"address": address, "complaints": list(emulator.complaints), **emulator.report()}
+    _report_new_violations(context, name, emulator, n_reported)
+    violations = list(emulator.violations)
+    # "complaints" is the name of version 0.1.0.
+    return {"address": address, "violations": violations, "complaints": violations, **emulator.report()}
 
 
-def _report_new_complaints(context: CommandContext, name: str, emulator: Emulator, n_reported: int) -> int:
-    """Tell the complaints after number ``n_reported``; returns how many are told by now."""
-    complaints = emulator.complaints
-    for complaint in complaints[n_reported:]:
-        context.notify(f"{name}: complaint: {complaint}")
-    return len(complaints)
+def _report_new_violations(context: CommandContext, name: str, emulator: Emulator, n_reported: int) -> int:
+    """Report the violations after the first ``n_reported``; returns their present number."""
+    violations = emulator.violations
+    for violation in violations[n_reported:]:
+        context.notify(f"{name}: protocol violation: {violation}")
+    return len(violations)

@@ -16,7 +16,7 @@ from escape_hw.calibration.loop.operation import run_until_opened
 from escape_hw.errors import Aborted, EscapeError
 from escape_hw.io.fits.matrix import MatrixProduct
 from escape_hw.remote.requests import CloseLoop, SetLoop
-from escape_hw.runtime.procedures.task import load_fitting_matrix, require_hardware_matrix
+from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
 from escape_hw.server.engine.bench_owner import BenchOwner
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.engine.publisher import StreamPublisher

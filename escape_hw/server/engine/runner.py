@@ -15,7 +15,7 @@ from escape_hw.errors import Aborted, CommandRejected, DeviceError, EscapeError,
 from escape_hw.io.documents import to_plain_values
 from escape_hw.io.run_folder import RunFolder, dated_folder
 from escape_hw.remote.state import Arguments, Finish, FinishedRun
-from escape_hw.runtime.procedures.task import SavedRun, Task
+from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.server.engine.bench_owner import BenchOwner
 from escape_hw.server.engine.loop import LoopRunner
@@ -53,7 +53,7 @@ class ProcedureRunner:
         self._product_store = product_store
         self._config_text, self._runs, self._send = config_text, runs, send
 
-    def start(self, task: Task[Any], name: str, arguments: Arguments, needs_loop: bool) -> int:
+    def start(self, task: ProcedureSpec[Any], name: str, arguments: Arguments, needs_loop: bool) -> int:
         """Load a task, reserve the engine and queue the procedure; returns the number of its run."""
         config = load_text(self._config_text, overrides=task.overrides)
         task.load(config, self._bench.simulated)
@@ -63,7 +63,7 @@ class ProcedureRunner:
         self._owner.post(lambda: self._run(ticket, task, config))
         return ticket.run.id
 
-    def _run(self, ticket: RunTicket, task: Task[Any], config: SystemConfig) -> None:
+    def _run(self, ticket: RunTicket, task: ProcedureSpec[Any], config: SystemConfig) -> None:
         """Run a task to its end, save its result and report it; in the main thread."""
         run, bench = ticket.run, self._bench
         words = ", ".join(f"{key} {value}" for key, value in run.arguments.items() if value is not None)
@@ -86,7 +86,7 @@ class ProcedureRunner:
         self._send({"ended": finished.model_dump(mode="json")})
         self._owner.send_flat_replies()
 
-    def _run_in_folder(self, ticket: RunTicket, task: Task[Any]) -> FinishedRun:
+    def _run_in_folder(self, ticket: RunTicket, task: ProcedureSpec[Any]) -> FinishedRun:
         """Run in a new folder; every exception becomes the end of the run."""
         run, folder = ticket.run, None
         system = self._bench.config.system.name
@@ -118,7 +118,7 @@ class ProcedureRunner:
         )  # fmt: skip
 
     def _run_and_save(
-        self, ticket: RunTicket, task: Task[Any], folder: RunFolder
+        self, ticket: RunTicket, task: ProcedureSpec[Any], folder: RunFolder
     ) -> tuple[SavedRun, Aborted | None]:
         """Run the procedure and save its result, a partial one as well."""
         if (fault := self._state.snapshot.fault) is not None:

@@ -147,7 +147,7 @@ class EngineSupervisor:
         state = self._published.state
         # Compilation on a busy computer may delay an engine, which is harmless while the mirror is flat.
         moving = state.mirror.peak > 0 or state.loop.closed
-        limit = self._limits.silent_s if moving else IDLE_SILENCE_LIMIT_S
+        limit = self._limits.engine_silence_s if moving else IDLE_SILENCE_LIMIT_S
         silence = now - engine.last_message_s
         if silence > limit:
             self._kill(engine, f"the engine was silent for {silence:.1f} s (limit {limit:g} s)")

@@ -166,7 +166,7 @@ class FrontEnd:
 
     def _check_abandoned_run(self) -> None:
         """Abort a procedure that no client has controlled for a while."""
-        state, limit = self._published.state, self._config.server.abandoned_s
+        state, limit = self._published.state, self._config.server.unattended_s
         abandoned_s, run = self._leases.seconds_without_holder(), state.active_run
         if run is None or abandoned_s <= limit or state.fault is not None or self._leases.lease is not None:
             return
