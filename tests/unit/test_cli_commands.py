@@ -77,7 +77,7 @@ def test_calibrate_document_has_every_promised_field(document, bench, tmp_path):
 
 def test_calibrate_hands_its_options_on(escape, bench, tmp_path):
     code, _, err = escape(
-        "calibrate", "razor-shwfs", "--method", "docrime", "--frames", 500, "--poke", 0.01, "--plain",
+        "calibrate", "razor-shwfs", "--method", "docrime", "--frames", 500, "--poke", 0.01, "--no-whiten",
         "--modes", 50, "--set", "loop.gain=0.3", "--out", tmp_path / "run",
     )  # fmt: skip
     assert code == 0, err
@@ -107,18 +107,20 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
         "method": "docrime-whitened",
         "modes": 94,
         "learning_rate": 1.0,
-        "solver": "effects",
+        "solver": "mixed-effects",
         "modes_choice": "snr",
         "loss": "squares",
-        "actuators": "found",
+        "actuators": "fitted",
         "also": (),
     }
     assert bench.calls == [("sprint", asked)]
     assert (
-        document("sprint", "razor-shwfs", "--im", im, "--solver", "light", "--out", tmp_path / "light")[0]
+        document(
+            "sprint", "razor-shwfs", "--im", im, "--solver", "registration-only", "--out", tmp_path / "light"
+        )[0]
         == 0
     )
-    assert bench.calls[1:] == [("sprint", {**asked, "solver": "light"})]
+    assert bench.calls[1:] == [("sprint", {**asked, "solver": "registration-only"})]
     assert not bench.benches
     product = load_matrix(found["products"]["im"])
     assert product.registration is not None
@@ -142,7 +144,7 @@ def test_loop_document_has_every_promised_field(document, bench, im, tmp_path):
 
 def test_loop_settings_become_configuration(escape, bench, im, tmp_path):
     words = ("loop", "razor-shwfs", "--im", im, "--no-strehl", "--out", tmp_path / "run")
-    assert escape(*words, "--gain", 0.2, "--leak", 0.01, "--drop", 3)[0] == 0
+    assert escape(*words, "--gain", 0.2, "--leak", 0.01, "--dropped-modes", 3)[0] == 0
     loop = bench.benches[0].config.loop
     assert (loop.gain, loop.leak, loop.dropped_modes) == (0.2, 0.01, 3)
     assert escape(*words, "--best-gain")[0] == 0

@@ -20,7 +20,7 @@ def drawn(kind: str, n: int = 20_000) -> np.ndarray:
     return np.array([pokes() for _ in range(n)])
 
 
-@pytest.mark.parametrize("kind", ["white", "shaped"])
+@pytest.mark.parametrize("kind", ["white", "anticorrelated"])
 def test_they_have_the_rms_asked_for_and_the_modes_are_independent(kind):
     pokes = drawn(kind)
     np.testing.assert_allclose(pokes.std(axis=0), AMPLITUDE / np.sqrt(3), rtol=0.03)
@@ -36,7 +36,7 @@ def test_white_pokes_are_what_they_were():
 
 
 def test_shaped_pokes_alternate():
-    pokes = drawn("shaped") / AMPLITUDE
+    pokes = drawn("anticorrelated") / AMPLITUDE
     by_lag = [np.mean(pokes[k:] * pokes[: len(pokes) - k]) / np.mean(pokes**2) for k in (1, 2)]
     assert by_lag == pytest.approx([-ANTICORRELATION, ANTICORRELATION**2], abs=0.03)
 

@@ -37,9 +37,9 @@ def imported_for_type_checkers() -> dict[str, str]:
 
 def test_type_checkers_and_the_interpreter_see_the_same_names() -> None:
     seen = imported_for_type_checkers()
-    whole = {name for name, home in escape_hw._HOME.items() if home == f"escape_hw.{name}"}
+    whole = {name for name, home in escape_hw._PUBLIC_MODULES.items() if home == f"escape_hw.{name}"}
     assert whole == {"errors", "testing"}
-    assert {name: home for name, home in escape_hw._HOME.items() if name not in whole} == {
+    assert {name: home for name, home in escape_hw._PUBLIC_MODULES.items() if name not in whole} == {
         name: home for name, home in seen.items() if name not in whole
     }
     assert set(seen) == set(escape_hw.__all__) - {"__version__"}
@@ -59,7 +59,7 @@ def test_errors_and_configuration_do_not_load_the_numerics() -> None:
 @pytest.mark.parametrize(
     ("method", "procedure"),
     [
-        ("close_loop", "closed_loop"),
+        ("close_loop", "close_loop"),
         ("find_best_gain", "find_best_gain"),
         ("take_model_psf", "measure_model_psf"),
         ("find_sensor", "find_sensor"),

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from escape_hw.api.registration import Registration
 from escape_hw.bench import Bench
 from escape_hw.calibration.modes.derivatives import modal_matrix
-from escape_hw.config.system import PokePattern
+from escape_hw.config.choices import PokePattern
+from escape_hw.config.renamed import present_value
 from escape_hw.errors import ConfigError
 
 #: Correlation, with opposite sign, of an anticorrelated poke with the one before. Beyond this the Fisher
@@ -83,7 +84,8 @@ class AnticorrelatedPokes(RandomPokes):
 
 def select_random_pokes(kind: PokePattern) -> type[PokeSequence]:
     """Class of the random pokes for a value of ``calibration.pokes``."""
-    return AnticorrelatedPokes if kind == "shaped" else RandomPokes
+    kind = present_value("calibration.pokes", kind)
+    return AnticorrelatedPokes if kind == "anticorrelated" else RandomPokes
 
 
 class PushPullPokes:

@@ -26,7 +26,7 @@ from escape_hw.calibration.sprint.fit import estimate_registration, sprint_optio
 from escape_hw.calibration.sprint.solvers import MATRIX_ONLY_SOLVERS
 from escape_hw.calibration.sprint.synthetic_matrix import synthesise_calibration
 from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
-from escape_hw.config.system import ESTIMATORS
+from escape_hw.config.choices import ESTIMATORS
 from escape_hw.errors import Aborted, ConfigError
 
 #: Frames per mode below which the frames themselves are fitted even where there is a matrix: the errors of

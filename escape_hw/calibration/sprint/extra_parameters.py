@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import Estimate
 from escape_hw.api.synthetic_model import HasPupilShift, SyntheticModel
-from escape_hw.config.system import ExtraParameter
+from escape_hw.config.choices import ExtraParameter
 from escape_hw.errors import ConfigError
 
 #: Prior scatter: the shear in % of the diameter, and the images' shift in % of a sub-aperture.
@@ -163,7 +163,7 @@ def build_extra_parameters(
     if "pupil_shift" in also:
         if not isinstance(model, HasPupilShift):
             raise ConfigError(
-                f"calibration.also: the model '{model.name}' of this sensor knows no shift of the pupil; "
+                f"calibration.extra_parameters: the model '{model.name}' of this sensor knows no shift of the pupil; "
                 "it is for a pyramid and calibration.model = 'fast'"
             )
         parameters.append(PupilShift(model, model.with_pupil_shift(_PUPIL_SHIFT_SIGMA, 0.0), "pupil_shift_x"))

@@ -37,7 +37,7 @@ from escape_hw.calibration.docrime.whitening import (
 )
 from escape_hw.calibration.sprint.fit import fit_registration
 from escape_hw.calibration.sprint.normal_equations import Priors
-from escape_hw.config.system import ActuatorModel, ExtraParameter, Loss, Solver
+from escape_hw.config.choices import ActuatorModel, ExtraParameter, Loss, Solver
 from escape_hw.errors import TooFewFrames
 
 #: Rounds of registration, response, whitener and scatter; a fifth changes nothing that matters.
@@ -134,10 +134,10 @@ def fit_telemetry(
     start: Registration | None = None,
     known: TemporalResponse | None = None,
     learning_rate: float = 1.0,
-    solver: Solver = "effects",
+    solver: Solver = "mixed-effects",
     loss: Loss = "squares",
     also: Sequence[ExtraParameter] = (),
-    actuators: ActuatorModel = "found",
+    actuators: ActuatorModel = "fitted",
 ) -> Procedure[TelemetryFit]:
     """Registration, gain and temporal response from a stretch of telemetry.
 
@@ -193,7 +193,7 @@ def fit_telemetry(
             solver=solver, loss=loss, start=start, learning_rate=learning_rate,
             covariance=covariance, priors=priors, coarse_search=start is None, also=also,
             # Single actuators are looked for once, in the end.
-            actuators=actuators if number == rounds - 1 else "alike",
+            actuators=actuators if number == rounds - 1 else "nominal",
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal_matrix() @ template.m2c

@@ -1,1 +1,6 @@
-"""One module per procedure (calibration, registration, gains, loop, tracking, sensor geometry, model PSF) from the request to the saved result, with what they share: task protocol, criteria, saving of products. The algorithms are in calibration/."""
+"""One module per procedure, from the declared parameters to the saved result, and what the modules share.
+
+``declaration`` defines how a procedure is declared, ``registry`` lists all of them, ``python_method`` derives
+methods, ``criteria`` and ``products`` assess and save results. The algorithms are in
+``escape_hw.calibration``.
+"""
