@@ -35,6 +35,6 @@ for name, result in (("DO-CRIME", docrime), ("ESCAPE", escape)):
     print(f"{name:>8} against push-pull: median gain {gain:.3f}, median correlation {agreement:.4f}")
 
 print(f"SPRINT {'converged' if escape.registration.converged else 'did NOT converge'}:")
-for name, found in escape.registration.measured().items():
+for name, found in escape.registration.parameters().items():
     truth = getattr(planted, name)
     print(f"{name:>18}: {found.value:8.3f} ± {found.sigma:.3f} {found.unit} (planted {truth:g})")

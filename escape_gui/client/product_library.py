@@ -132,7 +132,7 @@ def _collect(number: int, ready: dict[tuple[str, str, int], Future[RunContent]])
             if result.gains is None:
                 continue
             gains[label] = GainCurve.of(label, result.gains, [one.gains.best for one in result.rounds])
-            gains |= {other: GainCurve.of(other, one) for other, one in result.beside.items()}
+            gains |= {other: GainCurve.of(other, one) for other, one in result.comparisons.items()}
     ordered = dict(sorted(matrices.items(), key=lambda item: _method_rank(item[1])))
     return LoadedProducts(number, ordered, gains, errors)
 

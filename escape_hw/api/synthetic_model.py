@@ -1,4 +1,4 @@
-"""The synthetic model that SPRINT inverts."""
+"""Protocols of the synthetic model that SPRINT inverts, and of its optional capabilities."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from escape_hw.api.registration import Registration
 
 @runtime_checkable
 class SyntheticModel(Protocol):
-    """A model of mirror and sensor that yields interaction matrices under any registration.
+    """A model of mirror and sensor that computes interaction matrices for any registration.
 
-    It knows the nominal design only. It never sees a twin's hidden truth.
+    It contains the nominal design only, never the true state of a twin.
     """
 
     @property
@@ -64,53 +64,53 @@ class SyntheticModel(Protocol):
         ...
 
     def variants(self) -> Sequence[Self]:
-        """Models that differ from this one by one standard deviation of something uncertain.
+        """Models that differ from this one by one standard deviation of an uncertain property.
 
-        SPRINT fits how much of each difference the data hold, so that the registration does not pay
-        for it and its errors know of it. Empty when the model is sure of itself.
+        SPRINT fits the share of each difference, so that the property does not bias the registration and
+        its errors include it. Empty if no property is uncertain.
         """
         ...
 
 
 @runtime_checkable
 class HasSystematicError(Protocol):
-    """A model whose place on the sensor is itself known with an error only."""
+    """A model with a systematic error of its own registration."""
 
     @property
     def registration_systematic_error(self) -> NDArray[np.float64]:
-        """Standard errors of where the registration counts from ``(5,)``, in its units.
+        """Standard errors of the origin of the registration ``(5,)``, in its units.
 
-        No matrix shows them; SPRINT adds them to its errors.
+        They cannot be estimated from a matrix; SPRINT adds them to its errors.
         """
         ...
 
 
 @runtime_checkable
 class HasGainTrend(Protocol):
-    """A model whose slopes may answer more at the rim of the pupil than it says, or less."""
+    """A model with an uncertain trend of the slope gains over the pupil."""
 
     @property
     def gain_trend(self) -> float:
-        """Prior scatter of a trend: relative change of a slope's gain from the centre to the rim, or 0."""
+        """Prior standard deviation of the relative change of a slope gain from centre to rim, or 0."""
         ...
 
 
 @runtime_checkable
 class HasSlopeWeights(Protocol):
-    """A model that knows which sub-apertures it is no model of."""
+    """A model that provides a weight per slope, small where the model does not apply."""
 
     @property
     def slope_weights(self) -> NDArray[np.float64]:
-        """Weight of every slope's squares ``(n_slopes,)``, in (0, 1]."""
+        """Weight of the squared residual of every slope ``(n_slopes,)``, in (0, 1]."""
         ...
 
 
 @runtime_checkable
 class HasPupilShift(Protocol):
-    """A model that knows what its matrices become when the pupil stands elsewhere on the sensor."""
+    """A model that computes the effect of a shift of the pupil on the sensor."""
 
     def with_pupil_shift(self, shift_x: float, shift_y: float) -> SyntheticModel:
-        """The same sensor with the pupil shifted on it, and the mirror with the pupil.
+        """The model with pupil and mirror shifted on the sensor.
 
         Parameters
         ----------
@@ -122,11 +122,11 @@ class HasPupilShift(Protocol):
 
 @runtime_checkable
 class DifferentiableModel(SyntheticModel, Protocol):
-    """A synthetic model that also gives few modes at a time, and its derivatives in closed form.
+    """A synthetic model that also computes single modes, and analytic derivatives.
 
-    Nothing more is needed of a model than :class:`SyntheticModel`; with this SPRINT is many times
-    faster. The functions of :mod:`escape_hw.calibration.modes.derivatives` take either. Derivatives are by
-    the five parameters of the registration, in their order and units, and by the width.
+    SPRINT needs no more than :class:`SyntheticModel`, but is many times faster with this. The functions of
+    :mod:`escape_hw.calibration.modes.derivatives` accept either. Derivatives are by the five parameters of
+    the registration, in their order and units, and by the width.
     """
 
     def modal_matrix(
@@ -146,7 +146,7 @@ class DifferentiableModel(SyntheticModel, Protocol):
         Returns
         -------
         ndarray, ``(n_slopes, n_modes)``
-            ``zonal_matrix(registration, width) @ m2c``, to single precision at least.
+            ``zonal_matrix(registration, width) @ m2c``, at least to single precision.
         """
         ...
 

@@ -320,7 +320,7 @@ def measure_optical_gains(
     found = result.calibrations["ESCAPE"]
     beside = {label: one.matrix for label, one in result.calibrations.items() if label != "ESCAPE"}
     run = yield from bootstrap_gains(
-        bench, found, beside=beside, frames=frames, accuracy=accuracy, shape=static_light_matrix(bench, found),
+        bench, found, comparisons=beside, frames=frames, accuracy=accuracy, closed_loop_matrix=static_light_matrix(bench, found),
         model_psf=model,
     )  # fmt: skip
     result.gains, result.rescaled_calibration, result.partial = (
@@ -357,17 +357,17 @@ def with_and_without_optical_gains(
 ) -> Iterator[tuple[str, CalibrationResult]]:
     """Each matrix as it is, and scaled by its optical gains."""
     from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
-    from escape_hw.calibration.optical_gain.smoothing import usable
+    from escape_hw.calibration.optical_gain.smoothing import clip_gains
 
     if result.gains is None or result.gains.gains is None:
         return
-    every = {"ESCAPE": result.gains.gains, **result.gains.beside}
+    every = {"ESCAPE": result.gains.gains, **result.gains.comparisons}
     for label, one in known.items():
         yield label, one
         if label == "ESCAPE" and result.rescaled_calibration is not None:
             yield label + WITH_GAINS, result.rescaled_calibration
             continue
-        scaled = scale_matrix(one.matrix, usable(every[label]), every[label].best_sigma)
+        scaled = scale_matrix(one.matrix, clip_gains(every[label]), every[label].best_sigma)
         yield label + WITH_GAINS, replace(one, matrix=scaled, measured=None)
 
 
@@ -407,7 +407,7 @@ def reproduce_maps(
         A loop closes at no gain.
     """
     from escape_hw.calibration.docrime.open_loop import require_enough_frames
-    from escape_hw.calibration.sprint.synthetic_matrix import simulated
+    from escape_hw.calibration.sprint.synthetic_matrix import nominal_calibration
 
     require_enough_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
     result = CalibrationComparison()
@@ -427,7 +427,7 @@ def reproduce_maps(
             )
             if result.partial:
                 return result
-        result.calibrations["simulation"] = simulated(bench, found.grid, found.matrix.m2c)
+        result.calibrations["simulation"] = nominal_calibration(bench, found.grid, found.matrix.m2c)
     except Aborted:
         result.partial = True
     return result

@@ -67,7 +67,7 @@ def test_a_shear_is_recovered_within_its_error(model):
     for seed in SEEDS:
         truth = plant(seed)
         matrix = noisy(model.zonal_matrix(truth.with_shear(SHEAR)), model, seed)
-        found = sprint(matrix, model, also=("anamorphosis",))
+        found = sprint(matrix, model, extra_parameters=("anamorphosis",))
         assert found.converged, found.warnings
         shear = found.extras["anamorphosis"]
         assert shear.sigma < 0.2 * SHEAR
@@ -84,7 +84,7 @@ def test_where_there_is_no_shear_asking_for_one_does_no_harm(model):
     for seed in SEEDS:
         truth = plant(seed)
         matrix = noisy(model.zonal_matrix(truth), model, seed)
-        plain, found = sprint(matrix, model), sprint(matrix, model, also=("anamorphosis",))
+        plain, found = sprint(matrix, model), sprint(matrix, model, extra_parameters=("anamorphosis",))
         shear = found.extras["anamorphosis"]
         pulls.append(shear.value / shear.sigma)
         assert (np.abs(errors(found, truth)) < 4.5 * found.sigma).all()
@@ -102,14 +102,14 @@ def test_a_shear_is_in_the_pseudo_synthetic_matrix(model):
         made, _ = compute_pseudo_synthetic_matrix(model, estimate, np.eye(model.n_act))
         return np.square(made - with_shear).sum() / np.square(with_shear).sum()
 
-    assert missed(sprint(matrix, model, also=("anamorphosis",))) < 0.2 * missed(sprint(matrix, model))
+    assert missed(sprint(matrix, model, extra_parameters=("anamorphosis",))) < 0.2 * missed(sprint(matrix, model))
 
 
 def test_a_shear_stays_with_a_mirror_that_moves_on(model):
     """As for a tracker, which follows the registration alone."""
     truth, basis = plant(1), np.eye(model.n_act)
     found = sprint(
-        noisy(model.zonal_matrix(truth.with_shear(SHEAR)), model, 1), model, also=("anamorphosis",)
+        noisy(model.zonal_matrix(truth.with_shear(SHEAR)), model, 1), model, extra_parameters=("anamorphosis",)
     )
     there = Registration.from_array(found.registration.to_array() + np.array([8.0, -5.0, 0.2, 0.0, 0.0]))
     with_shear = model.zonal_matrix(there.with_shear(found.extras["anamorphosis"].value), found.width.value)
@@ -128,7 +128,7 @@ def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
     for seed in SEEDS:
         truth, moved = plant(seed), np.random.default_rng(seed).uniform(-15, 15, 2)
         matrix = noisy(model.with_pupil_shift(*moved).zonal_matrix(truth), model, seed)
-        found = sprint(matrix, model, also=("pupil_shift",))
+        found = sprint(matrix, model, extra_parameters=("pupil_shift",))
         assert found.converged, found.warnings
         shift = [found.extras[name] for name in ("pupil_shift_x", "pupil_shift_y")]
         own = [(one.value - there) / one.sigma for one, there in zip(shift, moved, strict=True)]
@@ -157,7 +157,7 @@ def test_what_a_model_or_solver_does_not_know_is_refused():
     model = make_model(small_lenslets(), None)
     matrix = noisy(model.zonal_matrix(Registration()), model, 0)
     with pytest.raises(ConfigError, match="knows no shift of the pupil"):
-        sprint(matrix, model, also=("pupil_shift",))
+        sprint(matrix, model, extra_parameters=("pupil_shift",))
     with pytest.raises(ConfigError, match="takes solver = 'effects'"):
-        sprint(matrix, model, also=("anamorphosis",), solver="light")
+        sprint(matrix, model, extra_parameters=("anamorphosis",), solver="light")
     assert not sprint(matrix, model).extras

@@ -79,7 +79,7 @@ def test_the_inverse_from_few_rows_is_that_of_the_truth(n_rows):
     spread = np.sqrt(np.diag(truth))
     sample = rng.multivariate_normal(np.zeros(p), truth, n_rows)
     # In units of the noise, as the mirror is handed on.
-    found = LowRankNoise.of(sample.T @ sample / n_rows, mirror / spread[:, None]).inverse()
+    found = LowRankNoise.from_covariance(sample.T @ sample / n_rows, mirror / spread[:, None]).inverse()
     trial = rng.standard_normal((p, 40))
     correlation = truth / np.outer(spread, spread)
     want = np.einsum("pk,pk->k", trial, np.linalg.solve(correlation, trial))
@@ -93,7 +93,7 @@ def test_the_inverse_from_few_rows_is_that_of_the_truth(n_rows):
 def test_patterns_beyond_what_noise_has_are_not_seen_as_less_than_it():
     rng, p = np.random.default_rng(6), 60
     sample = rng.standard_normal((2000, p))
-    noise = LowRankNoise.of(sample.T @ sample / 2000, rng.standard_normal((p, 5)))
+    noise = LowRankNoise.from_covariance(sample.T @ sample / 2000, rng.standard_normal((p, 5)))
     np.testing.assert_allclose(noise.inverse(), np.eye(p), atol=0.12)
     assert (noise.variances >= noise.level).all()
 

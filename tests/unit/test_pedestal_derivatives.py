@@ -34,7 +34,7 @@ def problem(model: ShackHartmannModel) -> Problem:
     valid = nominal_grid(small_system.configuration()).valid
     sigma, single = np.full(data.shape, 0.1, np.float32), np.eye(model.n_act)
     matrix = InteractionMatrix(data, sigma, single, valid, "small", "push-pull", True)
-    return Problem(WeightedMatrix.of(matrix, np.arange(model.n_act)), model, Priors())
+    return Problem(WeightedMatrix.from_columns(matrix, np.arange(model.n_act)), model, Priors())
 
 
 def beside(state: State, name: str, sign: int) -> tuple[State, float]:

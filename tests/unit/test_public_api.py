@@ -37,12 +37,30 @@ def imported_for_type_checkers() -> dict[str, str]:
 
 def test_type_checkers_and_the_interpreter_see_the_same_names() -> None:
     seen = imported_for_type_checkers()
-    whole = {name for name, home in escape_hw._HOME.items() if home == f"escape_hw.{name}"}
+    whole = {name for name, home in escape_hw._PUBLIC_MODULES.items() if home == f"escape_hw.{name}"}
     assert whole == {"errors", "testing"}
-    assert {name: home for name, home in escape_hw._HOME.items() if name not in whole} == {
+    assert {name: home for name, home in escape_hw._PUBLIC_MODULES.items() if name not in whole} == {
         name: home for name, home in seen.items() if name not in whole
     }
     assert set(seen) == set(escape_hw.__all__) - {"__version__"}
+
+
+PUBLIC_FUNCTIONS = sorted(name for name in escape_hw.__all__ if inspect.isfunction(getattr(escape_hw, name)))
+
+
+@pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
+def test_public_functions_have_an_explicit_typed_signature(name: str) -> None:
+    signature = inspect.signature(getattr(escape_hw, name))
+    for parameter in signature.parameters.values():
+        assert parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD), parameter
+        assert parameter.annotation is not parameter.empty, parameter
+    assert signature.return_annotation is not signature.empty
+
+
+def test_sprint_documents_what_it_returns() -> None:
+    assert inspect.signature(escape_hw.sprint).return_annotation == "RegistrationEstimate"
+    documented = inspect.getdoc(escape_hw.sprint).partition("Returns\n-------\n")[2]
+    assert documented.startswith("RegistrationEstimate\n")
 
 
 def test_errors_and_configuration_do_not_load_the_numerics() -> None:
@@ -59,7 +77,7 @@ def test_errors_and_configuration_do_not_load_the_numerics() -> None:
 @pytest.mark.parametrize(
     ("method", "procedure"),
     [
-        ("close_loop", "closed_loop"),
+        ("close_loop", "close_loop"),
         ("find_best_gain", "best_gain"),
         ("take_model_psf", "measure_model_psf"),
         ("find_sensor", "find_sensor"),

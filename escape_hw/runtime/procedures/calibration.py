@@ -267,14 +267,28 @@ class CalibrationTask:
         if self._control_matrix is not None:
             require_hardware_matrix(self._control_matrix, bench, self._force)
         source = None if self._resume is None else self._resume / STATE_FILE
-        self._checkpoint = Checkpoint(folder.file(STATE_FILE), source, request=asdict(self.request))
         one = self.request
+        # A short run cannot be resumed; escape() refuses to resume one.
+        if source is not None or not self._is_short_run(bench):
+            self._checkpoint = Checkpoint(folder.file(STATE_FILE), source, request=asdict(one))
         return calibrate_with_method(
             bench, one.method, frames=one.frames, poke=one.poke, whiten=not one.plain,
             estimator=one.estimator, closed_loop=None if self._control_matrix is None else self._control_matrix.result,
             checkpoint=self._checkpoint,
             until=None if one.snr is None and one.accuracy is None else Target(one.snr, one.accuracy),
         )  # fmt: skip
+
+    def _is_short_run(self, bench: Bench) -> bool:
+        """Whether the request is for an ESCAPE run of too few frames for a measured matrix."""
+        if self.request.method != "escape":
+            return False
+        from escape_hw.calibration.escape.method import is_short_run
+
+        c, closed_loop = bench.config, self._control_matrix
+        n_modes = c.basis.n_modes if closed_loop is None else closed_loop.matrix.n_modes
+        return is_short_run(
+            c.calibration, n_modes, frames=self.request.frames, estimator=self.request.estimator
+        )
 
     def save(
         self, folder: RunFolder, record: BenchRecord, result: CalibrationResult, wall_seconds: float

@@ -81,8 +81,8 @@ class GainsTask(TaskWithMatrix):
                 bench,
                 self.product.result,
                 **self._options,
-                beside=self._comparison_matrices(),
-                shape=static_light_matrix(bench, self.product.result),
+                comparisons=self._comparison_matrices(),
+                closed_loop_matrix=static_light_matrix(bench, self.product.result),
                 model_psf=model,
             )
         )

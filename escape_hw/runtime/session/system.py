@@ -293,7 +293,7 @@ class System(Bench):
         calibration = as_calibration(calibration)
         procedure = bootstrap_gains(
             self, calibration, poke=poke, accuracy=accuracy, frames=frames,
-            shape=static_light_matrix(self, calibration), model_psf=model_psf,
+            closed_loop_matrix=static_light_matrix(self, calibration), model_psf=model_psf,
         )  # fmt: skip
         return self.run(procedure, progress=progress)
 

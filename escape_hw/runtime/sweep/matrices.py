@@ -115,7 +115,7 @@ def read_variants(
     scaled = _scale_by_gains({label: product.result for label, product in named.items()}, gains)
     if not scaled:
         raise ConfigError(
-            f"the optical gains are those of {gains.method} and {', '.join(gains.beside) or 'nothing else'}; "
+            f"the optical gains are those of {gains.method} and {', '.join(gains.comparisons) or 'nothing else'}; "
             f"the matrices are {', '.join(named)}"
         )
     from escape_hw.io.fits.matrix import save_matrix
@@ -132,14 +132,14 @@ def _scale_by_gains(
     from dataclasses import replace
 
     from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
-    from escape_hw.calibration.optical_gain.smoothing import usable
+    from escape_hw.calibration.optical_gain.smoothing import clip_gains
 
-    vectors = {METHOD_LABELS.get(gains.method, gains.method): gains.gains, **gains.beside}
+    vectors = {METHOD_LABELS.get(gains.method, gains.method): gains.gains, **gains.comparisons}
     found = {}
     for label, one in known.items():
         vector = vectors.get(label) or vectors.get(product_key(label))
         if vector is not None:
-            matrix = scale_matrix(one.matrix, usable(vector), vector.best_sigma)
+            matrix = scale_matrix(one.matrix, clip_gains(vector), vector.best_sigma)
             found[label] = replace(one, matrix=matrix, measured=None)
     return found
 
