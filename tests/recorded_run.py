@@ -27,10 +27,12 @@ def make_run(folder: Path) -> Path:
         run.write_config("schema = 1\n")
         for method in ("push-pull", "docrime-whitened", "escape"):
             name = method.replace("-", "_")
-            run.add(name, save_matrix(run.file(f"{name}.fits"), calibration(method), fake.ORIGIN))
+            run.add_product(name, save_matrix(run.file(f"{name}.fits"), calibration(method), fake.ORIGIN))
         gains = save_gains(run.file("gains.fits"), fake.gains_result(), "razor-shwfs", True, fake.ORIGIN)
-        run.add("gains", gains)
-        run.add("loop", save_loop(run.file("loop.fits"), fake.loop(), "razor-shwfs", True, fake.ORIGIN))
+        run.add_product("gains", gains)
+        run.add_product(
+            "loop", save_loop(run.file("loop.fits"), fake.loop(), "razor-shwfs", True, fake.ORIGIN)
+        )
         document = {
             **documents.header_fields("calibrate", "razor-shwfs", True, 1),
             "title": "A run",

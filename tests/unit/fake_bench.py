@@ -61,7 +61,7 @@ class FakeProcedures:
 
     def _calibrate(self, bench: FakeBench, name: str, **options: Any):
         # Where the state of a run goes is no option of the calibration.
-        shown = {key: value for key, value in options.items() if value is not None and key != "keep"}
+        shown = {key: value for key, value in options.items() if value is not None and key != "checkpoint"}
         self.calls.append((name, shown))
         bench.screen_seen[name] = bench.screen.state.inserted
         try:
@@ -121,24 +121,20 @@ class FakeProcedures:
 def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
     """Put the stand-ins where the command line looks for the real ones."""
     made = FakeProcedures()
-    homes = {
-        "push_pull": ("push_pull",),
-        "docrime": ("docrime",),
-        "escape": ("escape",),
-        "sprint": ("sprint_steps",),
-        "closed_loop": ("closed_loop",),
-        "gain_search": ("best_gain",),
-        "model_psf": ("measure_model_psf",),
-        "pseudo_synthetic": ("simulated", "synthetic_of"),
+    places = {
+        "push_pull.procedure": ("push_pull",),
+        "docrime.open_loop": ("docrime",),
+        "escape.method": ("escape",),
+        "sprint.fit": ("estimate_registration",),
+        "loop.performance": ("close_loop",),
+        "loop.gain_search": ("best_gain",),
+        "acquisition.model_psf": ("measure_model_psf",),
+        "sprint.synthetic_matrix": ("simulated", "synthesise_from_measurement"),
     }
-    for module, names in homes.items():
-        stand_in = types.ModuleType(f"escape_hw.calibration.{module}")
+    for module, names in places.items():
         for name in names:
-            setattr(stand_in, name, getattr(made, name))
-        if module == "docrime":
-            stand_in.require_enough_frames = lambda *_: None
-            stand_in.minimum_frames = lambda settings, n_modes: 2 * n_modes
-        monkeypatch.setitem(sys.modules, stand_in.__name__, stand_in)
+            monkeypatch.setattr(f"escape_hw.calibration.{module}.{name}", getattr(made, name))
+    monkeypatch.setattr("escape_hw.calibration.docrime.open_loop.require_enough_frames", lambda *_: None)
 
     def open_system(system: str, *, set: Any = (), seed: Any = None, mode: Any = None) -> FakeBench:
         made.benches.append(FakeBench(load_system(system, overrides=set, seed=seed, mode=mode)))

@@ -116,7 +116,8 @@ def test_a_missing_peer_is_a_row_without_a_figure(monkeypatch):
 def test_the_core_does_not_import_the_peer():
     code = (
         "import sys, escape_hw.cli.system.perf\n"
-        "from escape_benchmarks import docrime, pipeline\n"
+        "from escape_benchmarks.calibration import docrime\n"
+        "from escape_benchmarks.real_time import pipeline\n"
         "print(sorted({'pyrtc', 'OOPAO', 'escape_sim'} & set(sys.modules)))"
     )
     env = {"PYTHONPATH": ":".join(p for p in sys.path if p)}
@@ -137,7 +138,7 @@ def test_the_docrime_run_counts_real_frames_against_the_benchs_rate(monkeypatch)
     ticks = iter([10.0, 12.0])
     monkeypatch.setattr(docrime_frames, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
     monkeypatch.setattr(docrime_frames, "drive", lambda run: (run.close(), TAKEN)[1])
-    row = docrime_frames.frames_row()
+    row = docrime.frames_row()
     assert row.ours == pytest.approx(600 / 2.0)
     assert row.peer == 500.0
     assert row.ratio == pytest.approx(0.6)
@@ -145,7 +146,7 @@ def test_the_docrime_run_counts_real_frames_against_the_benchs_rate(monkeypatch)
 
 
 def test_turbulence_of_the_docrime_stage_has_unit_rms_and_falls_steeply():
-    slow = docrime.frozen_flow(np.random.default_rng(0))
+    slow = docrime.frozen_flow_turbulence(np.random.default_rng(0))
     assert slow.std() == pytest.approx(1.0)
     power = (np.abs(np.fft.rfft(slow * np.hanning(len(slow))[:, None], axis=0)) ** 2).mean(axis=1)
     f = np.arange(len(power)) / len(slow)
@@ -159,4 +160,4 @@ def test_the_peers_name_carries_its_version_where_it_is_installed():
         want = f"pyrtcao {importlib.metadata.version('pyrtcao')}: kernel"
     except importlib.metadata.PackageNotFoundError:
         want = "pyrtcao: kernel"
-    assert peer.name("kernel") == want
+    assert peer.peer_name("kernel") == want

@@ -14,7 +14,7 @@ from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError
 from escape_hw.io.fits.matrix import load_matrix, save_matrix
-from escape_hw.io.interchange import optional_packages as optional
+from escape_hw.io.interchange import optional_packages
 from escape_hw.io.interchange.pyrtc.calibration import (
     FrameSettings,
     PyrtcConfig,
@@ -279,7 +279,7 @@ def test_what_does_not_fit_the_system_is_refused(tmp_path: Path) -> None:
 
 def test_a_missing_package_names_the_way_out() -> None:
     with pytest.raises(ConfigError, match=r"'no_such_package'.*pip install 'escape-hw\[interchange\]'"):
-        optional.library("no_such_package", "Reading nothing")
+        optional_packages.import_optional("no_such_package", "Reading nothing")
 
 
 # ------------------------------------------------------------------ command line

@@ -26,7 +26,7 @@ from escape_hw.report.figures import bench as figures_bench
 from escape_hw.report.figures import matrix as figures_matrix
 from escape_hw.report.figures import registration as figures_registration
 from escape_hw.report.figures import style
-from escape_hw.report.run_report import draw, write_picture, write_report
+from escape_hw.report.run_report import draw_picture, write_picture, write_report
 
 LOOPS = {
     "push-pull": fake.loop("push-pull", strehl=0.63),
@@ -40,10 +40,10 @@ def make_run(folder, *, simulated=True, partial=False, lean=False, title="A <tit
         run.write_config("# <script>alert(1)</script>\nschema = 1\n")
         for method in ("push-pull",) if lean else ("push-pull", "escape"):
             result = fake.calibration(method, n=8, n_modes=6, partial=partial)
-            run.add(method, save_matrix(run.file(f"{method}.fits"), result))
+            run.add_product(method, save_matrix(run.file(f"{method}.fits"), result))
         for label, loop in () if lean else LOOPS.items():
             loop = dataclasses.replace(loop, partial=partial)
-            run.add(
+            run.add_product(
                 f"loop {label}", save_loop(run.file(f"loop-{label}.fits"), loop, "razor-shwfs", simulated)
             )
         run.write_result(
@@ -220,8 +220,8 @@ def test_a_mirror_without_a_grid_is_drawn_where_its_actuators_stand(tmp_path):
     run = RunContent(tmp_path, {"bench": {"layout": [], "places_m": places.tolist()}})
     assert run.layout is None
     assert run.places_m == pytest.approx(places)
-    assert build._mirror(run, command) is not None
-    assert build._mirror(run, np.zeros(5)) is None
+    assert build._mirror_figure(run, command) is not None
+    assert build._mirror_figure(run, np.zeros(5)) is None
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ def test_picture_of_a_run(tmp_path):
     run = make_run(tmp_path / "run")
     write_picture(run, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
-    figure = draw(read_run(run))
+    figure = draw_picture(read_run(run))
     texts = {text.get_text() for part in figure.subfigs for axes in part.axes for text in (axes.title,)}
     assert {"push-pull", "DO-CRIME", "ESCAPE", "model"} <= texts
     assert "SIMULATED" in figure.get_suptitle()

@@ -77,7 +77,7 @@ def test_a_real_mirror_differs_from_the_ideal_one():
 
 def test_without_specula_there_is_a_row_that_says_so(monkeypatch, alike, modes):
     monkeypatch.setattr(sprint, "specula_peer", lambda *given: None)
-    monkeypatch.setattr(sprint, "alternate", lambda ours, peer, **given: (ours() and 1.0, None))
+    monkeypatch.setattr(sprint, "time_alternately", lambda ours, peer, **given: (ours() and 1.0, None))
     (row,) = sprint._specula_rows(alike, modes)
     assert row.peer is None
     assert row.ratio is None

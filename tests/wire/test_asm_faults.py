@@ -141,7 +141,7 @@ def test_a_mirror_that_comes_back_dirty_is_not_taken_over() -> None:
         mirror = driver(port_of(made), heartbeat_s=0.02, retry_s=0.05).open()
         made.inject("dust:12")
         broken(mirror, made)
-        wait_for(lambda: "came back, but actuators [12]" in mirror._link.why, "the dust is noticed")
+        wait_for(lambda: "came back, but actuators [12]" in mirror._link.reason, "the dust is noticed")
         with pytest.raises(DeviceLost, match=r"disabled = \[12, 248"):
             mirror.send(np.zeros(336))
         with pytest.raises(DeviceLost):
@@ -294,7 +294,7 @@ def test_dust_on_the_way_stops_the_work_and_says_what_to_configure() -> None:
 def test_a_fault_of_another_hour_is_heard_while_nothing_is_sent() -> None:
     with emulator() as made, driver(port_of(made), heartbeat_s=0.02) as mirror:
         made.inject("trip")
-        wait_for(lambda: mirror._known is ShellState.FAULT, "the sign of life has brought the news")
+        wait_for(lambda: mirror._last_state is ShellState.FAULT, "the sign of life has brought the news")
         mirror.recover()
 
 

@@ -51,7 +51,7 @@ def test_only_devices_whose_serial_number_was_typed_are_touched(bench_file: Path
     assert "obeys_its_limits" not in done.stdout, "the full range was not allowed"
     gentle = run(f"--hardware={bench_file}", "--serial", "SIM97", "--serial", "SIMWFS", path)
     assert gentle.returncode == 0, gentle.stdout[-3000:] + gentle.stderr
-    assert "[wfs-camera_frames_are_kept] PASSED" in gentle.stdout
+    assert "[wfs-camera_frames_are_not_overwritten] PASSED" in gentle.stdout
     assert "mirror_flattens" not in gentle.stdout, "without --maxchange nothing moves"
 
 

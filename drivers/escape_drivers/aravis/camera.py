@@ -117,7 +117,7 @@ class AravisCamera(BlockingCamera):
         width, height = library.get_ints("camera_get_sensor_size", 2)
         self._require_sensor((width, height), "to what the camera is")
         library.call("camera_set_region", 0, 0, width, height)
-        self._read_limits = _read_limits(library)
+        self._limits = _read_limits(library)
         self._info = self._build_info(model, library.stand_in or self._options.interface == "Fake")
         log.info("%s: %s, serial number %s", self.name, model, self._section.serial)
         self._settings = self._apply_settings(self._check(self._section.settings()))

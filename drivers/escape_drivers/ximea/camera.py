@@ -182,7 +182,7 @@ class XimeaCamera(BlockingCamera):
         for name, value in self._options.sdk_parameters(self._section.bit_depth):
             library.set(name, value)
         _reset_offset(library)
-        limits = self._read_limits = _read_limits(library)
+        limits = self._limits = _read_limits(library)
         sensor = (round(limits.width.high), round(limits.height.high))
         self._require_sensor(sensor, "or the option 'downsampling'")
         model, serial, version = (
