@@ -156,7 +156,7 @@ def test_on_the_twin_a_planted_shear_is_found_and_told():
 def test_what_a_model_or_solver_does_not_know_is_refused():
     model = make_model(small_lenslets(), None)
     matrix = noisy(model.zonal_matrix(Registration()), model, 0)
-    with pytest.raises(ConfigError, match="knows no shift of the pupil"):
+    with pytest.raises(ConfigError, match="has no shift of the pupil"):
         sprint(matrix, model, extra_parameters=("pupil_shift",))
     with pytest.raises(ConfigError, match="takes solver = 'effects'"):
         sprint(matrix, model, extra_parameters=("anamorphosis",), solver="light")

@@ -29,14 +29,14 @@ def case():
     n = N_COMMON + N_LINES + N_TRENDS + 2 * N_ACT + N_SLOPES
     return {
         "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
-        "slopes_gain": rng.standard_normal((N_SLOPES, N_ACT)),
-        "slopes_width": rng.standard_normal((N_SLOPES, N_ACT)),
+        "gain_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
+        "width_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
         "modes": rng.standard_normal((N_ACT, N_MODES)),
         "model": rng.standard_normal((N_SLOPES, N_MODES)),
         "residual": rng.standard_normal((N_SLOPES, N_MODES)),
         "precision": rng.uniform(0.5, 3, n),
         "offset": np.zeros(n),
-        "sampled": rng.standard_normal((N_SLOPES, N_MODES)),
+        "sampling_derivative": rng.standard_normal((N_SLOPES, N_MODES)),
         "lines": np.arange(N_SLOPES) % N_LINES,
         "trends": rng.standard_normal((N_SLOPES, N_TRENDS)),
     }
@@ -45,10 +45,10 @@ def case():
 def jacobian(c):
     """Derivatives of the matrix by every unknown ``(n_unknowns, n_slopes, n_modes)``."""
     rows = list(c["common"])
-    rows += [np.where((c["lines"] == k)[:, None], c["sampled"], 0.0) for k in range(N_LINES)]
+    rows += [np.where((c["lines"] == k)[:, None], c["sampling_derivative"], 0.0) for k in range(N_LINES)]
     rows += [trend[:, None] * c["model"] for trend in c["trends"].T]
     rows += [
-        np.outer(z[:, a], c["modes"][a]) for z in (c["slopes_gain"], c["slopes_width"]) for a in range(N_ACT)
+        np.outer(z[:, a], c["modes"][a]) for z in (c["gain_derivative"], c["width_derivative"]) for a in range(N_ACT)
     ]
     rows += [np.where((np.arange(N_SLOPES) == s)[:, None], c["model"], 0.0) for s in range(N_SLOPES)]
     return np.stack(rows)

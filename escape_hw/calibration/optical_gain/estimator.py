@@ -99,11 +99,7 @@ class OpticalGainEstimator:
         self._signal_whitening = np.eye(len(rows))
 
     def __call__(
-        self,
-        index: int,
-        slopes: NDArray[np.float32],
-        command: NDArray[np.float64],
-        poke: NDArray[np.float64],
+        self, index: int, slopes: NDArray[np.float32], command: NDArray[np.float64], poke: NDArray[np.float64]
     ) -> None:
         """Add a frame, the modal command computed from it, and the poke in that command."""
         signals = np.dot(self._rows, slopes, out=self._signals)

@@ -207,8 +207,8 @@ class _GainSearch:
             raise CalibrationError(
                 f"the loop does not close: gains {tried_gains} were tried; {observed}, "
                 f"{self._open_nm:.0f} nm in open loop. The turbulence may be beyond the sensor's range "
-                "(raise sensor.modulation), the matrix too noisy (drop more modes, loop.dropped_modes), or of "
-                "another state of the bench"
+                "(raise sensor.modulation), the matrix too noisy (drop more modes, loop.dropped_modes), or "
+                "of another state of the bench"
             )
         loop.control.set_gain(best.gain)
         return best

@@ -52,16 +52,12 @@ def search_registration(
 
     Parameters
     ----------
-    matrix, model
-        The measured matrix and the model to fit.
-    columns
-        Columns to use.
+    matrix, model, columns
+        The measured matrix, the model to fit, and the columns to use.
     start
         Initial registration ``(5,)``.
-    iterations
-        Limit of the iterations of each descent.
-    learning_rate
-        Fraction of each step that is taken.
+    iterations, learning_rate
+        Limit of the iterations of each descent, and fraction of each step that is taken.
     frozen
         Whether the descent on all columns keeps the derivatives of its start.
 

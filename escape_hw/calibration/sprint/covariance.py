@@ -152,10 +152,8 @@ def sandwich_covariance(
 
     Parameters
     ----------
-    weighted
-        The measured matrix.
-    system
-        The problem linearised at its solution.
+    weighted, system
+        The measured matrix, and the problem linearised at its solution.
     noise
         Covariance of the noise of the slopes ``(n_slopes, n_slopes)`` up to a factor, where it is known.
     """

@@ -58,12 +58,8 @@ def compute_registration_bound(
     covariance
         Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``, or only its diagonal
         ``(n_slopes,)``.
-    model
-        The synthetic model on the same sub-apertures.
-    registration
-        Registration at which to compute the bound.
-    priors
-        Scatter of the random effects.
+    model, registration, priors
+        Synthetic model on the same sub-apertures, registration of the bound, scatter of the random effects.
     """
     variance = np.diag(covariance) if covariance.ndim == 2 else covariance
     unit = modal_matrix(model, registration, matrix.m2c)
@@ -102,16 +98,11 @@ def correlated_information(
     Parameters
     ----------
     system
-        The linearised problem, weighted by the slopes' standard errors.
+        The linearised problem, weighted by the standard errors of the slopes.
     precision
-        Prior precision of every unknown.
+        Prior precision of every unknown ``(n,)``.
     metric
         Inverse of the correlation matrix of the noise of the slopes ``(n_slopes, n_slopes)``.
-
-    Returns
-    -------
-    ndarray, ``(n, n)``
-        In the order of the unknowns.
     """
     common, sampling_derivative = system.common, system.sampling_derivative
     model, modes, k = system.model, system.modes, len(system.common)

@@ -59,17 +59,10 @@ _REASONS = (
 
 
 def describe_degeneracies(covariance: NDArray[np.float64], names: Sequence[str]) -> tuple[str, ...]:
-    """Describe groups of parameters with strongly correlated errors, one sentence each.
+    """Describe groups of parameters with strongly correlated errors, from their covariance ``(n, n)``.
 
     The eigenvectors of the correlation matrix with the smallest eigenvalues are combinations of parameters
     that are determined much better than each parameter alone.
-
-    Parameters
-    ----------
-    covariance
-        Covariance of the parameters ``(n, n)``.
-    names
-        Their names ``(n,)``.
     """
     sigma = np.sqrt(np.diag(covariance))
     if not (np.isfinite(sigma).all() and (sigma > 0).all()):
@@ -110,11 +103,6 @@ def check_orientation(
     matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp]
 ) -> str | None:
     """Find a flip, quarter turn or transposition with which the model explains a matrix.
-
-    Parameters
-    ----------
-    matrix, model, columns
-        The measured matrix, the synthetic model, and the fitted columns.
 
     Returns
     -------

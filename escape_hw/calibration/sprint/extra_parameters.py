@@ -32,10 +32,8 @@ class Anamorphosis:
 
     Parameters
     ----------
-    model
-        The synthetic model.
-    name, unit
-        Name and unit of the parameter.
+    model, name, unit
+        The synthetic model, name and unit of the parameter.
     prior_sigma
         Prior standard deviation about zero, in that unit.
     """
@@ -125,15 +123,7 @@ class FittedExtraParameter:
     def to_estimate(
         self, sigma: NDArray[np.float64], registration_systematic_error: NDArray[np.float64]
     ) -> Estimate:
-        """Value and standard error.
-
-        Parameters
-        ----------
-        sigma
-            Standard errors of all unknowns.
-        registration_systematic_error
-            Systematic errors of the registration ``(5,)``.
-        """
+        """Value and standard error, from those of all unknowns and the systematic ones ``(5,)``."""
         statistical = float(sigma[self.index]) * self.model.prior_sigma
         return Estimate(
             self.scaled_value * self.model.prior_sigma,
@@ -145,19 +135,9 @@ class FittedExtraParameter:
 def build_extra_parameters(
     model: SyntheticModel, names: Sequence[ExtraParameter]
 ) -> tuple[ExtraParameterModel, ...]:
-    """Extra parameters by their names in the configuration.
+    """Extra parameters by their names in the configuration; ``"pupil_shift"`` is one along x and one along y.
 
-    Parameters
-    ----------
-    model
-        The synthetic model.
-    names
-        ``"anamorphosis"``, ``"pupil_shift"`` (one along x and one along y).
-
-    Raises
-    ------
-    ConfigError
-        The model has no pupil images that could be shifted.
+    Raises :class:`ConfigError` if the model has no pupil images that could be shifted.
     """
     parameters: list[ExtraParameterModel] = []
     if "anamorphosis" in names:
@@ -186,14 +166,9 @@ def build_fitted_extra_parameters(
 def priors_from_fit(
     parameters: Sequence[ExtraParameterModel], earlier: Mapping[str, Estimate]
 ) -> tuple[tuple[float, float], ...]:
-    """Prior mean and standard deviation of each parameter from an earlier fit, in its default ones.
+    """Prior mean and standard deviation of each parameter from earlier estimates, in default ones.
 
-    Parameters
-    ----------
-    parameters
-        The parameters.
-    earlier
-        Estimates of the earlier fit by name; a parameter that is not among them keeps its default prior.
+    A parameter without an earlier estimate keeps its default prior.
     """
     known = [(earlier.get(one.name), one.prior_sigma) for one in parameters]
     return tuple(

@@ -33,10 +33,8 @@ class LeastSquaresFit:
 
     Parameters
     ----------
-    alpha
-        The registration ``(5,)``.
-    gain
-        The best gain at that registration.
+    alpha, gain
+        The registration ``(5,)``, and the best gain there.
     model_matrix
         The model's matrix at gain 1 ``(n_slopes, n_modes)``, in standard errors.
     derivatives
@@ -75,17 +73,9 @@ class LeastSquaresFit:
 class LeastSquaresProblem:
     """Fit of gain and registration to a weighted matrix.
 
-    Parameters
-    ----------
-    weighted
-        The measured matrix.
-    model
-        The synthetic model.
-    learning_rate
-        Fraction of each step that is taken, in (0, 1] (paper: gamma).
-    frozen
-        Keep the derivatives of the start, as in the first publications: an iteration then computes a matrix
-        without its derivatives, but more iterations are needed.
+    The learning rate (paper: gamma) is the fraction of each step that is taken, in (0, 1]. With ``frozen``
+    the derivatives of the start are kept, as in the first publications: an iteration then computes a matrix
+    without its derivatives, but more iterations are needed.
     """
 
     def __init__(
@@ -181,15 +171,8 @@ BATCH_SIZE = 5
 class BatchProblem:
     """Fit of gain and registration to batches of a few modes, one after the other.
 
-    Parameters
-    ----------
-    weighted
-        The measured matrix.
-    model
-        The synthetic model.
-    learning_rate
-        Fraction of each step that is taken (paper: gamma). At 1 the result is that of the last batch alone;
-        the smaller it is, the more batches the result averages over.
+    At a learning rate of 1 the result is that of the last batch alone; the smaller the rate, the more batches
+    it averages over.
     """
 
     def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, learning_rate: float) -> None:
@@ -245,17 +228,7 @@ class BatchProblem:
 
 
 class DiagonalProblem:
-    """Fit of the registration and one gain per mode, in alternation.
-
-    Parameters
-    ----------
-    weighted
-        The measured matrix.
-    model
-        The synthetic model.
-    learning_rate
-        Fraction of each step of the registration that is taken.
-    """
+    """Fit of the registration and one gain per mode, in alternation."""
 
     def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, learning_rate: float) -> None:
         self.weighted, self._model, self._learning_rate = weighted, model, learning_rate

@@ -62,12 +62,6 @@ class MixedEffectsState:
     actuator_width: NDArray[np.float64]
     slope_gain: NDArray[np.float64]
 
-    def offset(self, mean_width: float, mean_variant: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance from the prior means, in the order of the unknowns."""
-        head = np.concatenate([[0.0], np.zeros(5), [self.width - mean_width, self.shape]])
-        many = self.sampling, self.trend, self.actuator_gain, self.actuator_width, self.slope_gain
-        return np.concatenate([head, self.variant - mean_variant, *many])
-
 
 @dataclass(slots=True, eq=False)
 class _ZonalMatrices:
@@ -85,12 +79,8 @@ class MixedEffectsProblem:
 
     Parameters
     ----------
-    weighted
-        The measured matrix.
-    model
-        The synthetic model.
-    priors
-        Prior scatter of the random effects.
+    weighted, model, priors
+        The measured matrix, the synthetic model, and the prior scatter of the random effects.
     command_curves
         Matrices ``(n_act, n_act)`` that commands may be multiplied with, one prior standard deviation each,
         such as optical gains that depend on the mode; fitted after the model's own variants and ``extras``.
@@ -111,24 +101,18 @@ class MixedEffectsProblem:
         self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
         rows, cols = np.nonzero(weighted.valid)
-        means, scatters = self._prior_moments()
-        self._means = priors.mean_width, means
+        self._mean_variant, scatters = self._prior_moments()
         # The x slopes of a column of sub-apertures share a sampling position, and the y slopes of a row.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
         self.trends = slope_trends(model, weighted.valid)
-        self.precision = np.concatenate(
-            [
-                np.zeros(6),
-                [priors.width**-2, priors.shape**-2],
-                scatters**-2,
-                np.full(self.n_lines, priors.sampling**-2),
-                np.ones(self.trends.shape[1]),
-                np.full(model.n_act, priors.noise_inflation * priors.actuator_gain**-2),
-                np.full(model.n_act, priors.actuator_width**-2),
-                np.full(weighted.data.shape[0], priors.slope_gain**-2),
-            ]
-        )
+        self.precision = np.concatenate([
+            np.zeros(6), [priors.width**-2, priors.shape**-2], scatters**-2,
+            np.full(self.n_lines, priors.sampling**-2), np.ones(self.trends.shape[1]),
+            np.full(model.n_act, priors.noise_inflation * priors.actuator_gain**-2),
+            np.full(model.n_act, priors.actuator_width**-2),
+            np.full(weighted.data.shape[0], priors.slope_gain**-2),
+        ])  # fmt: skip
 
     def initial_state(self, registration: Registration) -> MixedEffectsState:
         """A registration, the gain that fits best there, and the prior means."""
@@ -137,17 +121,9 @@ class MixedEffectsProblem:
         model = self.weighted.weigh(modal_matrix(self.model, registration, self.modes))
         gain = float(np.vdot(model, self.weighted.data) / np.vdot(model, model))
         return MixedEffectsState(
-            gain,
-            registration.to_array(),
-            self.priors.mean_width,
-            0.0,
-            self._means[1].copy(),
-            np.zeros(self.n_lines),
-            np.zeros(self.trends.shape[1]),
-            zeros,
-            zeros.copy(),
-            np.zeros(n_slopes),
-        )
+            gain, registration.to_array(), self.priors.mean_width, 0.0, self._mean_variant.copy(),
+            np.zeros(self.n_lines), np.zeros(self.trends.shape[1]), zeros, zeros.copy(), np.zeros(n_slopes),
+        )  # fmt: skip
 
     def _prior_moments(self) -> NDArray[np.float64]:
         """Prior means and scatters of the shares of variants, extras and curves ``(2, n_variants)``."""
@@ -159,7 +135,9 @@ class MixedEffectsProblem:
 
     def offset(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Distance of a state from the prior means, in the order of the unknowns."""
-        return state.offset(*self._means)
+        common = [*np.zeros(6), state.width - self.priors.mean_width, state.shape]
+        effects = state.sampling, state.trend, state.actuator_gain, state.actuator_width, state.slope_gain
+        return np.concatenate([common, state.variant - self._mean_variant, *effects])
 
     @property
     def n_variants(self) -> int:
@@ -216,38 +194,24 @@ class MixedEffectsProblem:
     def linearise(self, state: MixedEffectsState) -> NormalEquations:
         """Model and derivatives about a state."""
         z = self._zonal_matrices(state)
-        jacobian, by_width, by_shape, variants, total = (
-            z.jacobian,
-            z.by_width,
-            z.by_shape,
-            z.variants,
-            z.total,
-        )
         rows, actuator_factor = self._slope_gains(state)[:, None], 1 + state.actuator_gain
         scaled_modes = actuator_factor[:, None] * self.modes
 
-        def modal(z: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.asarray(rows * (z @ scaled_modes))
+        def modal(zonal: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(rows * (zonal @ scaled_modes))
 
-        unit = modal(total)
-        common = np.stack([unit, *(state.gain * modal(z) for z in (*jacobian, by_shape, *variants))])
+        unit = modal(z.total)
+        parts = (*z.jacobian, z.by_shape, *z.variants)
+        common = np.stack([unit, *(state.gain * modal(part) for part in parts)])
         # A sampling position acts as a shift shared by the lenslets of a column (x) or a row (y).
         half = unit.shape[0] // 2
         sampling_derivative = np.concatenate([common[1, :half], common[2, half:]])
         model = state.gain * unit + state.sampling[self.lines, None] * sampling_derivative
         return normal_equations(
-            common,
-            state.gain * rows * total,
-            state.gain * rows * by_width * actuator_factor,
-            self.modes,
-            state.gain * (total @ scaled_modes),
-            self.weighted.data - model,
-            self.precision,
-            self.offset(state),
-            sampling_derivative,
-            self.lines,
-            self.trends,
-        )
+            common, state.gain * rows * z.total, state.gain * rows * z.by_width * actuator_factor, self.modes,
+            state.gain * (z.total @ scaled_modes), self.weighted.data - model, self.precision,
+            self.offset(state), sampling_derivative, self.lines, self.trends,
+        )  # fmt: skip
 
     def _slope_gains(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Gain of every slope relative to the common one ``(n_slopes,)``."""
@@ -269,11 +233,6 @@ class MixedEffectsProblem:
         a group of effects is the mean square of their estimates plus their mean posterior variance. Where
         the data have no information that is the prior; the scatter of an absent effect decreases from step
         to step.
-
-        Parameters
-        ----------
-        state, system
-            The solution, and the linearised problem there.
         """
         variance = system.posterior_variance()
         head, n_act = SHAPE + 1 + self.n_variants, self.model.n_act
@@ -291,13 +250,7 @@ class MixedEffectsProblem:
         return PriorEstimate(replace(self.priors, **scatter), n_effective_parameters)
 
     def actuator_corrections(self, state: MixedEffectsState, system: NormalEquations) -> ActuatorCorrections:
-        """Differences between the mirror of a solution and the nominal one.
-
-        Parameters
-        ----------
-        state, system
-            The solution, and the linearised problem there.
-        """
+        """Differences between the mirror of a solution and the nominal one."""
         # The slope gains, eliminated first, come last.
         inner = len(system.schur_complement)
         n_act = self.model.n_act
@@ -325,17 +278,12 @@ class MixedEffectsProblem:
         gain = state.gain + step[GAIN]
         gain_ratio = state.gain / gain if gain > _MIN_GAIN_RATIO * state.gain else 1.0
         return MixedEffectsState(
-            gain,
-            state.alpha + step[1:6],
+            gain, state.alpha + step[1:6],
             float(np.clip(state.width + step[WIDTH], -0.5, 1.0)),
             float(np.clip(state.shape + gain_ratio * step[SHAPE], -0.5, 0.5)),
-            state.variant + gain_ratio * variant,
-            state.sampling + sampling,
-            state.trend + trend,
-            state.actuator_gain + gains,
-            state.actuator_width + widths,
-            state.slope_gain + slopes,
-        )
+            state.variant + gain_ratio * variant, state.sampling + sampling, state.trend + trend,
+            state.actuator_gain + gains, state.actuator_width + widths, state.slope_gain + slopes,
+        )  # fmt: skip
 
 
 def slope_trends(model: SyntheticModel, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -348,8 +296,7 @@ def slope_trends(model: SyntheticModel, valid: NDArray[np.bool_]) -> NDArray[np.
     Parameters
     ----------
     model
-        Its prior scatter of a trend is used (:class:`~escape_hw.api.synthetic_model.HasGainTrend`), 0 if
-        it has none.
+        A model with a prior scatter of trends (:class:`~escape_hw.api.synthetic_model.HasGainTrend`).
     valid
         Valid sub-apertures ``(n_rows, n_columns)``.
 

@@ -28,10 +28,8 @@ def choose_modes(
 
     Parameters
     ----------
-    matrix
-        The measured matrix with its standard errors.
-    n_modes
-        Number of modes.
+    matrix, n_modes
+        The measured matrix with its standard errors, and number of modes to choose.
     modes_choice
         ``"first"``: the first ones. ``"snr"``: those with the highest signal-to-noise ratio; on open-loop
         data these are not the first, which contain most of the turbulence. ``"d-optimal"``: those that
@@ -82,10 +80,8 @@ def choose_by_fisher_information(
 
     Parameters
     ----------
-    by_mode
-        From :func:`mode_information`.
-    n_modes
-        Number of modes.
+    by_mode, n_modes
+        Information from :func:`mode_information`, and number of modes to choose.
     modes_choice
         ``"d-optimal"``: smallest ``log det`` of the covariance of the registration, with unknown gain;
         ``"a-optimal"``: smallest trace, in units of the largest step.

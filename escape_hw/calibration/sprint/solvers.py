@@ -49,17 +49,7 @@ MATRIX_ONLY_SOLVERS: tuple[Solver, ...] = ("batches", "diagonal")
 
 @dataclass(slots=True, eq=False)
 class SolverContext:
-    """Inputs of a fit, and the record of its iterations.
-
-    Parameters
-    ----------
-    matrix, model, columns
-        The measured matrix, the model, and the columns to fit.
-    solver, learning_rate, max_iterations, priors
-        As for :func:`~escape_hw.calibration.sprint.fit.sprint`.
-    extras
-        Extra parameters to fit beside the registration.
-    """
+    """Inputs of a fit, as for :func:`~escape_hw.calibration.sprint.fit.sprint`, and its iterations."""
 
     matrix: InteractionMatrix
     model: SyntheticModel
@@ -128,18 +118,9 @@ class SprintSolution:
 def solve(
     context: SolverContext, weighted: WeightedMatrix, start: NDArray[np.float64], coarse_search: bool
 ) -> Procedure[SprintSolution]:
-    """Solve for a weighted matrix with the solver of the context.
+    """Solve for weighted columns, from a registration ``start (5,)``, with the solver of the context.
 
-    Parameters
-    ----------
-    context
-        Matrix, model and options; the iterations are recorded there.
-    weighted
-        The weighted columns.
-    start
-        Initial registration ``(5,)``.
-    coarse_search
-        Whether to search from far away first.
+    The iterations are recorded in the context. With ``coarse_search`` the start is searched from far away.
     """
     model, solver, rate = context.model, context.solver, context.learning_rate
     n = context.max_iterations

@@ -34,10 +34,8 @@ def compute_fitted_matrix(
 
     Parameters
     ----------
-    model
-        The synthetic model.
-    registration
-        Registration at which to compute the matrix.
+    model, registration
+        The synthetic model, and the registration at which to compute the matrix.
     estimate
         Result of SPRINT, of which extra parameters, actuator corrections and width are used; without
         corrections the mirror is the nominal one at the estimated width.
@@ -74,9 +72,8 @@ def compute_fitted_jacobian(
     actuator_variance = np.zeros_like(unit)
     if corrections is not None:
         scaled_value, single = corrections.pedestal, model.zonal_matrix(registration, width)
-        derivatives = derivatives + scaled_value * (
-            pedestal_jacobian(model, registration, width, scaled_modes)[1] - derivatives
-        )
+        broad = pedestal_jacobian(model, registration, width, scaled_modes)[1]
+        derivatives = derivatives + scaled_value * (broad - derivatives)
         single = single + scaled_value * (model.zonal_matrix(registration, width * PEDESTAL) - single)
         actuator_variance = np.square(single) @ np.square(corrections.gain_sigma[:, None] * m2c)
     return _add_corrections(unit, model, registration, estimate, scaled_modes), derivatives, actuator_variance
@@ -103,9 +100,8 @@ def _add_corrections(
     if corrections is None:
         return unit
     scaled_value, wider = corrections.pedestal, corrections.width[:, None] * scaled_modes
-    pedestal_change = modal_matrix(model, registration, scaled_modes, width * PEDESTAL) - modal_matrix(
-        model, registration, scaled_modes, width
-    )
+    broad = modal_matrix(model, registration, scaled_modes, width * PEDESTAL)
+    pedestal_change = broad - modal_matrix(model, registration, scaled_modes, width)
     own = modal_jacobian(model, registration, wider, width)[1][5]
     width_change = own + scaled_value * (pedestal_jacobian(model, registration, width, wider)[1][5] - own)
     return np.asarray(unit + scaled_value * pedestal_change + width * width_change)
@@ -114,16 +110,7 @@ def _add_corrections(
 def compute_pseudo_synthetic_matrix(
     model: SyntheticModel, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pseudo-synthetic matrix and its standard errors.
-
-    Parameters
-    ----------
-    model
-        The synthetic model.
-    estimate
-        Result of SPRINT.
-    m2c
-        Modal basis ``(n_act, n_modes)``.
+    """Pseudo-synthetic matrix and its standard errors for modes ``m2c (n_act, n_modes)``.
 
     Returns
     -------
@@ -141,19 +128,7 @@ def compute_pseudo_synthetic_matrix(
 def synthesise_calibration(
     bench: Bench, grid: SensorGeometry, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
 ) -> CalibrationResult:
-    """Calibration with the pseudo-synthetic matrix of an estimate; moves no device.
-
-    Parameters
-    ----------
-    bench
-        Bench with the configured model.
-    grid
-        Geometry of the sensor.
-    estimate
-        Result of SPRINT.
-    m2c
-        Modal basis ``(n_act, n_modes)``.
-    """
+    """Calibration with the pseudo-synthetic matrix of an estimate for modes ``m2c``; moves no device."""
     data, sigma = compute_pseudo_synthetic_matrix(bench.model(grid), estimate, m2c)
     matrix = build_interaction_matrix(bench, grid, m2c, data, sigma, "escape", gain=estimate.gain.value)
     return CalibrationResult(matrix, grid, 0, 0, 0.0, registration=estimate)
@@ -162,17 +137,7 @@ def synthesise_calibration(
 def synthesise_from_measurement(
     measured: CalibrationResult, model: SyntheticModel, estimate: RegistrationEstimate
 ) -> CalibrationResult:
-    """The same from a measured calibration, without a bench.
-
-    Parameters
-    ----------
-    measured
-        The calibration whose matrix was fitted.
-    model
-        The synthetic model on the geometry of that calibration.
-    estimate
-        Result of SPRINT for that matrix.
-    """
+    """The same for a measured calibration and a model on its geometry, without a bench."""
     data, sigma = compute_pseudo_synthetic_matrix(model, estimate, measured.matrix.m2c)
     matrix = replace(
         measured.matrix, data=data.astype(np.float32), sigma=sigma.astype(np.float32), method="escape",
@@ -188,13 +153,6 @@ def static_light_matrix(bench: Bench, calibration: CalibrationResult) -> Interac
     shape. For lenslets the response does not depend on the motion, and their model is better with it, because
     it averages over the pixels. Moves no device.
 
-    Parameters
-    ----------
-    bench
-        Bench with the configured model.
-    calibration
-        A calibration with a registration.
-
     Returns
     -------
     InteractionMatrix or None
@@ -209,7 +167,7 @@ def static_light_matrix(bench: Bench, calibration: CalibrationResult) -> Interac
 
 
 def nominal_calibration(bench: Bench, grid: SensorGeometry, m2c: NDArray[np.float64]) -> CalibrationResult:
-    """Calibration with the synthetic matrix at the nominal registration; parameters as above."""
+    """Calibration with the synthetic matrix at the nominal registration; moves no device."""
     data = modal_matrix(bench.model(grid), Registration(), m2c)
     matrix = build_interaction_matrix(bench, grid, m2c, data, np.zeros_like(data), "simulated")
     return CalibrationResult(matrix, grid, 0, 0, 0.0)

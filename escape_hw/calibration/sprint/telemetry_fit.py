@@ -317,10 +317,8 @@ def fit_whitener(
     ----------
     data
         Slopes and pokes, or in closed loop total commands.
-    matrix
-        ``(n_slopes, n_modes)``.
-    response
-        Temporal response.
+    matrix, response
+        Interaction matrix ``(n_slopes, n_modes)`` and temporal response.
     order, lags
         Past frames of the filter, and frames of the response.
     """
