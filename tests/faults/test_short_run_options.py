@@ -1,4 +1,4 @@
-"""Targets and checkpoints of runs that are too short for a measured matrix: used or refused, never ignored."""
+"""Targets and checkpoints of runs too short for a measured matrix are used or refused, never ignored."""
 
 from __future__ import annotations
 
@@ -33,17 +33,19 @@ def test_a_signal_to_noise_ratio_is_refused_before_anything_moves(loop):
         assert bench.dm.sent_count == 0
 
 
-@pytest.mark.parametrize(("accuracy", "text"), [(50.0, "(reached)"), (1e-3, "(not reached; use more frames)")])
-def test_the_result_says_whether_the_accuracy_was_reached(loop, accuracy, text):
+@pytest.mark.parametrize(
+    ("accuracy", "text"), [(50.0, "(reached)"), (1e-3, "(not reached; use more frames)")]
+)
+def test_a_note_states_whether_the_accuracy_was_reached(loop, accuracy, text):
     with small() as bench:
         result = bench.run(escape(bench, frames=FRAMES, until=Target(accuracy=accuracy), **loop))
     assert result.notes[-1].endswith(text)
 
 
 def test_the_former_keywords_warn(good, tmp_path):
-    with small() as bench:
-        with (
-            pytest.warns(DeprecationWarning, match=r"escape\(\): keep= is called checkpoint="),
-            pytest.raises(ConfigError, match="cannot be resumed"),
-        ):
-            bench.run(escape(bench, frames=FRAMES, keep=Checkpoint(tmp_path / "state.fits")))
+    with (
+        small() as bench,
+        pytest.warns(DeprecationWarning, match=r"escape\(\): keep= is called checkpoint="),
+        pytest.raises(ConfigError, match="cannot be resumed"),
+    ):
+        bench.run(escape(bench, frames=FRAMES, keep=Checkpoint(tmp_path / "state.fits")))

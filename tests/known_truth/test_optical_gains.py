@@ -237,7 +237,12 @@ def test_another_matrix_lends_its_shape(
     shape = scaled(baseline, 2.0).matrix
     run = bench.run(
         bootstrap_gains(
-            bench, opened, accuracy=0.2, frames=900, closed_loop_matrix=shape, comparisons={"baseline": baseline.matrix}
+            bench,
+            opened,
+            accuracy=0.2,
+            frames=900,
+            closed_loop_matrix=shape,
+            comparisons={"baseline": baseline.matrix},
         )
     )
     assert list(run.result.comparisons) == ["baseline"]

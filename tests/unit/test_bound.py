@@ -48,7 +48,9 @@ def jacobian(c):
     rows += [np.where((c["lines"] == k)[:, None], c["sampling_derivative"], 0.0) for k in range(N_LINES)]
     rows += [trend[:, None] * c["model"] for trend in c["trends"].T]
     rows += [
-        np.outer(z[:, a], c["modes"][a]) for z in (c["gain_derivative"], c["width_derivative"]) for a in range(N_ACT)
+        np.outer(z[:, a], c["modes"][a])
+        for z in (c["gain_derivative"], c["width_derivative"])
+        for a in range(N_ACT)
     ]
     rows += [np.where((np.arange(N_SLOPES) == s)[:, None], c["model"], 0.0) for s in range(N_SLOPES)]
     return np.stack(rows)

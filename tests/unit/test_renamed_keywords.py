@@ -23,7 +23,7 @@ def test_the_former_name_is_passed_on_with_a_warning():
 
 
 def test_both_names_are_refused():
-    with pytest.warns(DeprecationWarning), pytest.raises(TypeError, match="give one"):
+    with pytest.warns(DeprecationWarning, match="old="), pytest.raises(TypeError, match="give one"):
         function(2, old=3, new=3)
 
 

@@ -141,19 +141,8 @@ def is_short_run(
 ) -> bool:
     """Whether a run has fewer frames than a measured matrix takes, so that telemetry is fitted directly.
 
-    Parameters
-    ----------
-    c
-        Configuration of the calibration.
-    n_modes
-        Number of modes.
-    frames, whiten, estimator
-        As for :func:`escape`.
-
-    Raises
-    ------
-    ConfigError
-        Unknown estimator, or one that does not go with the configured solver.
+    Parameters as for :func:`escape`. Raises :class:`ConfigError` for an unknown estimator, or one that does
+    not go with the configured solver.
     """
     n_frames = c.frames if frames is None else frames
     return not _fits_matrix(c, whiten, estimator) and n_frames < minimum_frames(c, n_modes)

@@ -44,6 +44,7 @@ from escape_hw.calibration.sprint.telemetry_fit import (
 from escape_hw.config.system import CalibrationSection
 from escape_hw.errors import Aborted, TooFewFrames
 
+_NOTE = "too few frames for a measured matrix: the registration was fitted to the telemetry"
 #: Frames per past frame of the whitening filter, so that there are enough to estimate it.
 _FRAMES_PER_ORDER = 3
 
@@ -121,24 +122,18 @@ def fit_recorded_frames(
 
     Parameters
     ----------
-    bench
-        An open bench.
     record
         Frame indices, slopes and pokes.
-    template
-        A matrix of this sensor and basis; its data are not used.
-    grid
-        Geometry on which the model is built.
+    template, grid
+        A matrix of this sensor and basis, whose data are not used, and the geometry of the model.
     order
         Order of the whitening filter.
     """
     c = bench.config.calibration
     data = telemetry_from_frames(*record, before=2 * c.whiten_order + c.lags)
-    return (
-        yield from fit_telemetry(
-            data, template, bench.model(grid), order=order, lags=c.lags, options=sprint_options_from_config(c)
-        )
-    )
+    options = sprint_options_from_config(c)
+    fit = fit_telemetry(data, template, bench.model(grid), order=order, lags=c.lags, options=options)
+    return (yield from fit)
 
 
 def _choose_whitening_order(c: CalibrationSection, frames: int) -> int:
@@ -175,11 +170,7 @@ def _build_result(
         lost_frames=lost,
         sky_seconds=(frames + lost) / bench.wfs.settings.frame_rate_hz,
         response=fit.response,
-        notes=(
-            *fit.estimate.warnings,
-            *fit.estimate.notes,
-            "too few frames for a measured matrix: the registration was fitted to the telemetry",
-        ),
+        notes=(*fit.estimate.warnings, *fit.estimate.notes, _NOTE),
     )
 
 
@@ -188,32 +179,23 @@ def calibrate_short_run_closed_loop(
 ) -> Procedure[CalibrationResult]:
     """Fit the registration to the telemetry of a few frames of a closed loop, and synthesise the matrix.
 
+    Parameters and result as for :func:`calibrate_short_run`, except:
+
     Parameters
     ----------
-    bench
-        An open bench.
     closed_loop
-        Calibration whose matrix closes the loop.
+        Calibration whose matrix closes the loop, on whose grid the result is.
     frames
         Number of frames with pokes, without those in which the loop settles.
-    poke
-        Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
-
-    Returns
-    -------
-    CalibrationResult
-        On the grid of ``closed_loop``, without a measured matrix.
 
     Raises
     ------
-    TooFewFrames
-        Too few frames for an estimate of the noise; nothing moved.
+    TooFewFrames, Aborted
+        As for :func:`calibrate_short_run`.
     IncompatibleProduct
         The matrix belongs to another mirror, grid or camera region; nothing moved.
     CalibrationError
         The loop diverged, the sensor went dark, or it does not respond to the pokes.
-    Aborted
-        Stopped before the last frame.
     """
     c = bench.config.calibration
     order, poke = _choose_whitening_order(c, frames), c.poke if poke is None else poke

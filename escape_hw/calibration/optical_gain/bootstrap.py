@@ -202,7 +202,9 @@ def _run_rounds(
         state.comparisons = {name: _smooth(segment.gains, k + 1) for k, name in enumerate(comparison_names)}
         _record_round(loop, segment, segment.gains, amplitude, accuracy, target.model_psf, state)
         yield _progress(state)
-        state.converged = is_last_poke and _is_consistent(state.rounds[-1])
+        last = state.rounds[-1]
+        is_confirmed = last.reached and last.change <= max(_TOLERANCE, 2 * last.expected_change)
+        state.converged = is_last_poke and is_confirmed
         repeats += is_last_poke
         poke_size = max(target.poke, poke_size * _POKE_FACTOR)
 
@@ -289,11 +291,6 @@ def _strehl(segment: LoopSegment, model_psf: NDArray[np.float32] | None) -> Stre
     if model_psf is None or segment.record.science.count < MIN_SAMPLES:
         return None
     return strehl(segment.record.science.images(), model_psf)
-
-
-def _is_consistent(one: GainRound) -> bool:
-    """Whether a round confirmed the gains that it ran with, at the requested accuracy."""
-    return one.reached and one.change <= max(_TOLERANCE, 2 * one.expected_change)
 
 
 def _smooth(measured: OpticalGainEstimate, reference: int = 0) -> OpticalGains:

@@ -134,20 +134,14 @@ class OpticalGainEstimator:
         # Variance of an element: noise of its signal over the power of the pokes of its mode.
         inverse_poke_power = np.square(solution.sigma[0]) / solution.variance[0]
         spread = solution.variance / np.diag(solution.covariance)
-        noise = np.einsum(
-            "ij,jk,ik->i",
-            inverse_whitening,
-            solution.covariance * np.sqrt(np.outer(spread, spread)),
-            inverse_whitening,
-        )
+        covariance = solution.covariance * np.sqrt(np.outer(spread, spread))
+        noise = np.einsum("ij,jk,ik->i", inverse_whitening, covariance, inverse_whitening)
         return OpticalGainEstimate(
             matrix[:, modes, modes],
             np.sqrt(np.maximum(noise, 0).reshape(-1, n) * inverse_poke_power),
             ResponseEstimate(solution.response.weights, solution.response_covariance),
-            solution.gain_sigma,
-            solution.frames,
-            solution.lost_frames,
-        )
+            solution.gain_sigma, solution.frames, solution.lost_frames,
+        )  # fmt: skip
 
     def _start_estimator(self) -> None:
         """Whiten the signals over the modes by the noise of the first frames, and start the estimator."""
@@ -253,12 +247,9 @@ class GainMeasurementLoop:
             self._science.stop()
 
     def scale(self, gains: NDArray[np.float64]) -> None:
-        """Exchange the reconstructor for that of the matrix scaled by gains ``(n_modes,)``, bumplessly.
+        """Exchange the reconstructor, bumplessly, for that of the matrix scaled by gains ``(n_modes,)``.
 
-        Raises
-        ------
-        CalibrationError
-            The scaled matrix cannot be inverted.
+        Raises :class:`CalibrationError` if the scaled matrix cannot be inverted.
         """
         matrix = scale_matrix(self.reference, gains)
         self.control.set_reconstructor(
@@ -321,12 +312,9 @@ class GainMeasurementLoop:
     def _new_estimator(self) -> OpticalGainEstimator:
         c = self.bench.config.calibration
         return OpticalGainEstimator(
-            self._references,
-            self._weights,
-            order=c.whiten_order,
-            lags=c.lags,
+            self._references, self._weights, order=c.whiten_order, lags=c.lags,
             known_response=self._known_response,
-        )
+        )  # fmt: skip
 
 
 def _require_same_modes(reference: InteractionMatrix, name: str, matrix: InteractionMatrix) -> None:

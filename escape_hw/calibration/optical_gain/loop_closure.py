@@ -60,14 +60,10 @@ def bootstrap_loop(
 
     Parameters
     ----------
-    loop
-        Started, and open.
-    target_gain
-        Effective gain.
-    amplitude
-        Amplitude of the pokes ``(n_modes,)``.
-    frames
-        Frames at each gain.
+    loop, target_gain
+        The started, open loop, and its effective gain.
+    amplitude, frames
+        Amplitude of the pokes ``(n_modes,)``, and frames at each gain.
     steps
         Each gain tried is appended to it.
 
@@ -191,13 +187,7 @@ class _GainSearch:
         return self._next_gain
 
     def best_closure(self, loop: GainMeasurementLoop, steps: list[ClosureStep]) -> LoopClosure:
-        """Set the best gain and return its measurement.
-
-        Raises
-        ------
-        CalibrationError
-            No gain closed the loop.
-        """
+        """Set the best gain and return its measurement; raises if no gain closed the loop."""
         best = self._best_closure
         if best is None or best.residual_nm > _CLOSED_RESIDUAL_RATIO * self._open_nm:
             tried_gains = ", ".join(f"{step.gain:.3g}" for step in steps[1:])

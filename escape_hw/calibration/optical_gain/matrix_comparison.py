@@ -43,10 +43,8 @@ def deviation_ratio(measured: InteractionMatrix, reference: InteractionMatrix) -
         raise CalibrationError(f"mode {int(np.argmin(reference_deviation))} of the reference matrix is empty")
     value = measured_deviation / reference_deviation
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative = (
-            np.where(measured_deviation > 0, measured_variance / measured_deviation**2, np.inf)
-            + reference_variance / reference_deviation**2
-        )
+        relative = np.where(measured_deviation > 0, measured_variance / measured_deviation**2, np.inf)
+        relative = relative + reference_variance / reference_deviation**2
     return value, value * np.sqrt(relative)
 
 
@@ -129,7 +127,7 @@ def projection(measured: InteractionMatrix, reference: InteractionMatrix) -> Val
     Raises
     ------
     CalibrationError
-        The matrices have different slopes or modes, or a mode of the reference is dominated by noise.
+        As for :func:`deviation_ratio`, or a mode of the reference is dominated by noise.
     """
     _require_same_basis(measured, reference)
     weights = slope_weights(measured)
@@ -164,12 +162,8 @@ def scale_matrix(
     error = np.zeros_like(gains) if sigma is None else sigma
     variance = np.square(matrix.sigma * gains) + np.square(matrix.data * error)
     metrics = {**matrix.metrics, "optical_gain": float(np.mean(gains))}
-    return replace(
-        matrix,
-        data=(matrix.data * gains).astype(np.float32),
-        sigma=np.sqrt(variance).astype(np.float32),
-        metrics=metrics,
-    )
+    scaled, scaled_sigma = (matrix.data * gains).astype(np.float32), np.sqrt(variance).astype(np.float32)
+    return replace(matrix, data=scaled, sigma=scaled_sigma, metrics=metrics)
 
 
 def _require_same_basis(measured: InteractionMatrix, reference: InteractionMatrix) -> None:

@@ -65,11 +65,9 @@ def smooth_over_modes(
     largest_log_likelihood = max(fit.log_likelihood for fit in fits)
     weighted_fits = [(np.exp(fit.log_likelihood - largest_log_likelihood), fit) for fit in fits]
     likely_fits = [(weight, fit) for weight, fit in weighted_fits if weight > _MIN_RELATIVE_LIKELIHOOD]
-    trend, trend_sigma = _model_average(
-        [(weight, fit.posterior(with_departures=False)) for weight, fit in likely_fits]
-    )
-    best, best_sigma = _model_average(
-        [(weight, fit.posterior(with_departures=True)) for weight, fit in likely_fits]
+    (trend, trend_sigma), (best, best_sigma) = (
+        _model_average([(weight, fit.posterior(with_departures=which)) for weight, fit in likely_fits])
+        for which in (False, True)
     )
     return OpticalGains(value, sigma, trend, trend_sigma, best, best_sigma, common_sigma)
 
@@ -177,12 +175,8 @@ class _KrigingFit:
 def gain_curve_basis(n_modes: int, coefficients: int = len(COEFFICIENT_SIGMA)) -> NDArray[np.float64]:
     """Legendre curves over the modes, one prior standard deviation each ``(coefficients, n_modes)``.
 
-    Parameters
-    ----------
-    n_modes
-        Number of modes, in the order of a Karhunen-Loeve basis.
-    coefficients
-        Number of curves, at most that of :data:`COEFFICIENT_SIGMA`.
+    The modes are in the order of a Karhunen-Loeve basis; there are at most as many curves as in
+    :data:`COEFFICIENT_SIGMA`.
     """
     x = np.sqrt(np.arange(1, n_modes + 1))
     x = (2 * x - x[0] - x[-1]) / max(x[-1] - x[0], 1.0)
@@ -191,14 +185,6 @@ def gain_curve_basis(n_modes: int, coefficients: int = len(COEFFICIENT_SIGMA)) -
 
 
 def compute_command_curves(m2c: NDArray[np.float64], basis: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Change of a command due to each gain curve, as matrices ``(n_act, n_act)``.
-
-    Parameters
-    ----------
-    m2c
-        Mode-to-command matrix ``(n_act, n_modes)``.
-    basis
-        From :func:`gain_curve_basis`.
-    """
+    """Change of a command due to each gain curve of a ``basis``, as matrices ``(n_act, n_act)``."""
     to_modes = np.linalg.pinv(m2c)
     return [(m2c * curve) @ to_modes for curve in basis]

@@ -152,14 +152,6 @@ class MixedEffectsProblem:
             for k, one in enumerate(self.extras)
         )
 
-    def _extra_parameter_changes(self, state: MixedEffectsState) -> list[NDArray[np.float64]]:
-        """Change of the unweighted zonal matrix per share of each extra parameter."""
-        registration, w, first = Registration.from_array(state.alpha), 1.0 + state.width, len(self.variants)
-        return [
-            one.matrix_change(registration, w, float(state.variant[first + k]))
-            for k, one in enumerate(self.extras)
-        ]
-
     def _zonal_matrices(self, state: MixedEffectsState) -> _ZonalMatrices:
         """The weighted zonal matrix of a state and its parts."""
         registration, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
@@ -180,7 +172,9 @@ class MixedEffectsProblem:
             broad, changes = (weigh(part) for part in pedestal_jacobian(self.model, registration, w))
             jacobian = jacobian + state.shape * (changes - base)
         by_width, by_shape = jacobian[5] * w, broad - zonal_matrix
-        variants += [weigh(change) for change in self._extra_parameter_changes(state)]
+        first = len(self.variants)
+        for extra, share in zip(self.extras, state.variant[first:], strict=False):
+            variants.append(weigh(extra.matrix_change(registration, w, float(share))))
         variants += [zonal_matrix @ command_curve for command_curve in self.command_curves]
         total = zonal_matrix + state.shape * by_shape + state.actuator_width * by_width
         for share, difference in zip(state.variant, variants, strict=True):

@@ -33,14 +33,8 @@ DIVERGED_FACTOR, DIVERGED_AT_LIMIT_FACTOR, _AT_LIMIT_FRACTION, _MIN_BASELINE_SEC
 class AlarmMonitor:
     """Checks every update for changes that a new registration does not explain.
 
-    Parameters
-    ----------
-    start
-        Registration at the start of tracking.
-    largest_shift
-        Shift of the mirror that needs a new calibration, % of a sub-aperture.
-    response
-        Temporal response at the measurement of the matrix, if it is known.
+    ``start`` and ``response`` are registration and temporal response at the start; a shift of the mirror
+    above ``largest_shift`` [% of a sub-aperture] needs a new calibration.
     """
 
     def __init__(

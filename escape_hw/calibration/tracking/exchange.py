@@ -22,21 +22,12 @@ MIN_SIGNIFICANCE = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActiveReconstructor:
-    """The matrix and reconstructor in use.
-
-    Parameters
-    ----------
-    matrix, reconstructor
-        ``(n_slopes, n_modes)`` and ``(n_modes, n_slopes)``.
-    registration
-        The registration of the matrix.
-    gain
-        Mean gain of the modes relative to the synthetic model.
-    """
+    """The matrix and its reconstructor ``(n_modes, n_slopes)`` in use, and the registration of the matrix."""
 
     matrix: InteractionMatrix
     reconstructor: NDArray[np.float32]
     registration: RegistrationEstimate
+    #: Mean gain of the modes relative to the synthetic model.
     gain: float
 
 
@@ -68,14 +59,10 @@ def propose_exchange(
 
     Parameters
     ----------
-    synthetic
-        Pseudo-synthetic matrix at the live registration and the live common gain.
-    model
-        The model of that matrix.
-    live
-        The live registration.
-    in_use
-        The matrix in use.
+    synthetic, model
+        Pseudo-synthetic matrix at the live registration and the live common gain, and its model.
+    live, in_use
+        The live registration, and the matrix in use.
     dropped
         Number of eigenmodes that the reconstructor omits.
     seconds
@@ -88,9 +75,8 @@ def propose_exchange(
     mismatch = float(np.linalg.norm(new.data - in_use.matrix.data)) / scale
     live_gain = Estimate(live.registration.gain.value, float(live.gains_sigma.mean()))
     drift_only = replace(live.registration, covariance=live.change_covariance, gain=live_gain)
-    sigma = (
-        float(np.linalg.norm(compute_pseudo_synthetic_matrix(model, drift_only, synthetic.m2c)[1])) / scale
-    )
+    errors = compute_pseudo_synthetic_matrix(model, drift_only, synthetic.m2c)[1]
+    sigma = float(np.linalg.norm(errors)) / scale
     loop = np.linalg.eigvals(in_use.reconstructor.astype(float) @ new.data.astype(float))
     # The loop gain of dropped eigenmodes is 0.
     loop_gains = np.sort(np.abs(loop))[dropped:]

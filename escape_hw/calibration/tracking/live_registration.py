@@ -140,11 +140,8 @@ class LiveRegistration:
         self._template, self._model, self._start = template, model, start.registration
         scatter = min(Priors().width, max(start.width.sigma, _MIN_WIDTH_SIGMA))
         self._extras = build_fitted_extra_parameters(model, start.extras)
-        self._priors = Priors(
-            width=scatter,
-            mean_width=start.width.value - 1,
-            extras=priors_from_fit(self._extras, start.extras),
-        )
+        extras = priors_from_fit(self._extras, start.extras)
+        self._priors = Priors(width=scatter, mean_width=start.width.value - 1, extras=extras)
         # Small pokes hardly determine single actuators, so the corrections of the calibration are kept.
         self._actuator_corrections = start.actuator_corrections
         self._order, self._lags, self._response = order, lags, response
@@ -246,9 +243,8 @@ class LiveRegistration:
         state = self._state
         for _ in range(_FIRST_ITERATIONS if state is None else 1):
             columns = self._sums.columns(self._template, self._matrix)
-            weighted = apply_model_weights(
-                WeightedMatrix.from_columns(columns, np.arange(columns.n_modes)), self._model
-            )
+            weighted = WeightedMatrix.from_columns(columns, np.arange(columns.n_modes))
+            weighted = apply_model_weights(weighted, self._model)
             problem = MixedEffectsProblem(
                 weighted, self._model, self._priors, self._command_curves, self._extras
             )
@@ -277,12 +273,9 @@ class LiveRegistration:
         self._current_matrix = problem.matrix(current_state, self._template.m2c)
         self._start = Registration.from_array(value[1:6])
         columns = whiten_columns(
-            self._template,
-            block_sums.cross,
-            block_sums.command_poke_products,
-            block_sums.gram,
+            self._template, block_sums.cross, block_sums.command_poke_products, block_sums.gram,
             self._sums.variance,
-        )
+        )  # fmt: skip
         residual = columns.data - self._current_matrix @ np.linalg.lstsq(self._template.m2c, columns.m2c)[0]
         residual /= columns.sigma
         gain, timing_sigma = present.value[GAIN], value[GAIN] * self._weights.gain_sigma(response)
@@ -318,9 +311,8 @@ class LiveRegistration:
         first_curve = _first_curve_index(problem)
         first_curve_index = SHAPE + 1 + first_curve
         selected = np.r_[0:6, first_curve_index : first_curve_index + len(self._command_curves)]
-        total_covariance = sandwich_covariance(problem.weighted, system, self._sums.covariance)[
-            np.ix_(selected, selected)
-        ]
+        total_covariance = sandwich_covariance(problem.weighted, system, self._sums.covariance)
+        total_covariance = total_covariance[np.ix_(selected, selected)]
         noise = system.noise_covariance(problem.precision)[np.ix_(selected, selected)]
         total_covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(systematic_error(self._model))
         eigenvalues, directions = np.linalg.eigh(total_covariance - noise)
@@ -415,10 +407,8 @@ class DoubleExponentialSmoother:
         ----------
         mean
             The estimate ``(n,)``.
-        noise
-            Covariance of its noise, independent from frame to frame ``(n, n)``.
-        static
-            Covariance of its errors that are constant in time ``(n, n)``.
+        noise, static
+            Covariances ``(n, n)`` of its noise, independent from frame to frame, and of its constant errors.
         """
         self._weight = self._forgetting * self._weight + 1
         share = 1 / self._weight
@@ -434,11 +424,8 @@ class DoubleExponentialSmoother:
         shares = np.broadcast_to(first, (len(mean), len(first)))
         if second_age > first_age:
             unshrunk_rate = (mean - self._second) / (second_age - first_age)
-            rate_variance = (
-                np.diag(single_update_covariance)
-                * float(np.square(first - second).sum())
-                / (second_age - first_age) ** 2
-            )
+            rate_variance = np.diag(single_update_covariance) * float(np.square(first - second).sum())
+            rate_variance = rate_variance / (second_age - first_age) ** 2
             shrinkage = np.square(self._max_rate) / (np.square(self._max_rate) + rate_variance)
             rate = shrinkage * unshrunk_rate
             value = mean + first_age * rate
@@ -451,9 +438,8 @@ class DoubleExponentialSmoother:
             np.minimum(np.square(raw_innovation), _MAX_INNOVATION) - self._innovation_variance
         )
         error_scale = np.sqrt(np.maximum(self._innovation_variance, 1.0))
-        random_covariance = random_covariance * np.outer(error_scale, error_scale) + np.diag(
-            curvature_variance
-        )
+        random_covariance = random_covariance * np.outer(error_scale, error_scale)
+        random_covariance = random_covariance + np.diag(curvature_variance)
         present = SmoothedState(value, rate, static + random_covariance, random_covariance, innovation)
         # The data of the next update have a mean age of half a step.
         self._expected = value + 0.5 * self._step_s * rate, np.diag(random_covariance)
@@ -475,13 +461,11 @@ class DoubleExponentialSmoother:
         noise = np.diag(single_update_covariance) + variance
         raw_innovation = new_estimate - value
         self._mean_innovation += _LEARNING_RATE * (raw_innovation - self._mean_innovation)
-        excess = np.square(self._mean_innovation) - _BIAS_THRESHOLD * noise * _LEARNING_RATE / (
-            2 - _LEARNING_RATE
-        )
+        threshold = _BIAS_THRESHOLD * noise * _LEARNING_RATE / (2 - _LEARNING_RATE)
+        excess = np.square(self._mean_innovation) - threshold
         self._curvature_variance = np.maximum(excess, self._curvature_variance * (1 - _LEARNING_RATE / 2))
-        return raw_innovation / np.sqrt(
-            noise + np.square(self._step_s * self._max_rate)
-        ), self._curvature_variance
+        sigma = np.sqrt(noise + np.square(self._step_s * self._max_rate))
+        return raw_innovation / sigma, self._curvature_variance
 
     def _trim(self) -> None:
         """Drop the oldest weights once they are negligible."""

@@ -78,10 +78,8 @@ def track(
 
     Parameters
     ----------
-    bench
-        An open bench.
-    matrix, grid
-        The matrix at the start, and its geometry.
+    bench, matrix, grid
+        An open bench, the matrix at the start, and its geometry.
     seconds
         Duration.
     registration
@@ -126,26 +124,16 @@ def track(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackerUpdate:
-    """Result of one update of the tracker.
+    """Result of one update of the tracker."""
 
-    Parameters
-    ----------
-    seconds
-        Time of the last frame, since the loop was closed.
-    live
-        The live registration.
-    synthetic
-        Its pseudo-synthetic matrix.
-    proposal
-        That matrix at the live gains, compared with the one in use.
-    strehl
-        Strehl ratio and its error; NaN without one.
-    """
-
+    #: Time of the last frame, since the loop was closed.
     seconds: float
     live: LiveEstimate
+    #: Pseudo-synthetic matrix at the live registration.
     synthetic: CalibrationResult
+    #: That matrix at the live gains, compared with the one in use.
     proposal: ExchangeProposal
+    #: Strehl ratio and its error; NaN without one.
     strehl: tuple[float, float]
 
 
@@ -256,7 +244,9 @@ class _Tracker:
             steps = loop.run(self.frames, inject=self._draw_poke, observe=[self.buffer])
             yield from self._forward_progress(steps, report, second)
             if loop.record.diverged or self.divergence_monitor(loop.record, frames, shortened):
-                self._report_divergence()
+                self.result.stable = False
+                text = "the loop diverged and was opened; calibrate again"
+                self.result.alarms.append(Alarm(self._elapsed_s(), "diverged", text))
                 return
             # The loop of a real bench does not wait for the update; the clock of a twin stands still.
             if self.pending_update is not None and (self.pending_update.done() or self.bench.simulated):
@@ -354,12 +344,6 @@ class _Tracker:
         self.metrics = {name: row[name] for name in PROGRESS_COLUMNS}
         self.arrays = progress_arrays(result)
 
-    def _report_divergence(self) -> None:
-        self.result.stable = False
-        self.result.alarms.append(
-            Alarm(self._elapsed_s(), "diverged", "the loop diverged and was opened; calibrate again")
-        )
-
 
 def build_row(
     update: TrackerUpdate,
@@ -370,16 +354,8 @@ def build_row(
 ) -> dict[str, float]:
     """Row of the table for an update.
 
-    Parameters
-    ----------
-    update
-        Result of the update.
-    gains, gains_sigma
-        Gain of every mode relative to the matrix at the start ``(n_modes,)``, and its error.
-    residual
-        Residuals of the frames since the last row ``(n,)``, in nm.
-    exchanged
-        Whether the proposed matrix is in use.
+    ``gains (n_modes,)`` are relative to the matrix at the start; ``residual (n,)`` is that of the frames
+    since the last row, in nm.
     """
     live, parameters = update.live, update.live.registration.measured()
     return {
