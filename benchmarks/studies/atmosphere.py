@@ -1,4 +1,4 @@
-"""Structure function and boiling of the twin's open air against theory, as a figure.
+"""Structure function and boiling of the twin's open-air turbulence against theory, as a figure.
 
     python benchmarks/studies/atmosphere.py --out docs/figures
 
@@ -65,7 +65,7 @@ def draw_structure(axes: Axes) -> None:
 
 
 def draw_boiling(axes: Axes) -> None:
-    """Correlation of still air with itself after a time, in units of the boiling time."""
+    """Correlation of static turbulence with itself after a time, in units of the boiling time."""
     lags = np.linspace(0, 2.4, 13)
     source = TurbulenceSource(256, PIXEL_M, R0_M, 2.0, N + 3)
     products = []

@@ -1,15 +1,14 @@
-"""From how far SPRINT finds home: random plants two actuator pitches away, turned by up to ten degrees.
+"""From how far SPRINT finds home: random realisations two actuator pitches away, turned by up to ten degrees.
 
-    python benchmarks/studies/capture_range.py --system razor-shwfs --plants 100 --out docs/figures
-    python benchmarks/studies/capture_range.py --system razor-pywfs --plants 100 --out docs/figures
+    python benchmarks/studies/capture_range.py --system razor-shwfs --realisations 100 --out docs/figures
+    python benchmarks/studies/capture_range.py --system razor-pywfs --realisations 100 --out docs/figures
 
-Each plant is a twin with all its imperfections, measured by push-pull on the calm beam, two frames per
-sign. SPRINT gets that matrix and a model built on the images found, and starts from zero. A plant is
-recovered when SPRINT says it converged and every parameter is right within the tolerance, flagged when
-it says it did not, and wrong otherwise. Writes ``capture-SYSTEM.jsonl``, a line per plant as soon as it is
-done; plants that the file has already are not run again. Exits with 1 when a plant was wrong or fewer than
-95 in 100 were recovered. A plant takes five seconds on an idle core, on a
-pyramid twenty.
+Each realisation is a twin with all its imperfections, measured by push-pull on the calm beam, two frames per
+sign. SPRINT gets that matrix and a model built on the images found, and starts from zero. A realisation is
+recovered when SPRINT says it converged and every parameter is right within the tolerance, flagged when it
+says it did not, and wrong otherwise. Writes ``capture-SYSTEM.jsonl``, a line per realisation as soon as it is
+done; realisations that the file has already are not run again. Exits with 1 when a realisation was wrong or
+fewer than 95 in 100 were recovered. A realisation takes five seconds on an idle core, on a pyramid twenty.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from plant_tables import Line, each_realisation
+from realisation_tables import Line, each_realisation
 
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.fit import sprint
@@ -33,7 +32,7 @@ TOLERANCE_PITCH, TOLERANCE_REST = 0.05, np.array([0.3, 1.0, 1.0])
 
 
 def distant_registration(number: int, pitch: float) -> Registration:
-    """Registration of plant ``number``; ``pitch`` is the actuators' in % of a sub-aperture."""
+    """Registration of realisation ``number``; ``pitch`` is the actuators' in % of a sub-aperture."""
     rng = np.random.default_rng(5000 + number)
     shift = rng.uniform(-1, 1, 2) * PITCHES * pitch
     return Registration.from_array(
@@ -42,7 +41,7 @@ def distant_registration(number: int, pitch: float) -> Registration:
 
 
 def run_realisation(system: str, number: int) -> Line:
-    """Measure one plant and look for it."""
+    """Measure one realisation and look for it."""
     config = simulated_config(system)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
     injected = distant_registration(number, pitch)
@@ -55,24 +54,24 @@ def run_realisation(system: str, number: int) -> Line:
     right = bool((np.abs(error) <= limits).all())
     outcome = ("recovered" if right else "wrong") if found.converged else "flagged"
     return {
-        "outcome": outcome, "planted": injected.to_array().tolist(), "error": error.tolist(),
+        "outcome": outcome, "injected": injected.to_array().tolist(), "error": error.tolist(),
         "steps": len(found.iterations), "warnings": list(found.warnings),
     }  # fmt: skip
 
 
 def main() -> int:
-    """Run the plants, count, write."""
+    """Run the realisations, count, write."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--system", default="razor-shwfs")
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--plants", type=int, default=100)
+    parser.add_argument("--realisations", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
     target = options.out / f"capture-{options.system}.jsonl"
     rows = each_realisation(
-        target, {"system": options.system}, range(options.first, options.first + options.plants),
+        target, {"system": options.system}, range(options.first, options.first + options.realisations),
         lambda number: run_realisation(options.system, number),
         lambda row: f"{row['outcome']} after {row['steps']} steps",
     )  # fmt: skip

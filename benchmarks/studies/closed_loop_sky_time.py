@@ -1,12 +1,12 @@
-"""Error of the registration from small pokes in a running loop, over random plants.
+"""Error of the registration from small pokes in a running loop, over random realisations.
 
-    python benchmarks/studies/closed_loop_sky_time.py --plants 10 --frames 1000 --poke 0.002 --out closed
+    python benchmarks/studies/closed_loop_sky_time.py --realisations 10 --frames 1000 --out closed
 
-Each plant is calibrated in open loop first (1,200 frames at the usual poke); its pseudo-synthetic matrix
-closes the loop, and pokes of the given size beside the integrator find the registration again, from nothing
-of the calibration before but its matrix. Writes ``closed-sky-time.jsonl``, a line per plant as soon as it is
-done; plants that the file has already are not run again. Prints rms errors with, in brackets, normalised
-chi-squared and mean error. A plant takes half a minute on one core.
+Each realisation is calibrated in open loop first (1,200 frames at the usual poke); its pseudo-synthetic
+matrix closes the loop, and pokes of the given size beside the integrator find the registration again, from
+nothing of the calibration before but its matrix. Writes ``closed-sky-time.jsonl``, a line per realisation as
+soon as it is done; realisations that the file has already are not run again. Prints rms errors with, in
+brackets, normalised chi-squared and mean error. A realisation takes half a minute on one core.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from plant_tables import Line, array, each_realisation, row, to_json
+from realisation_tables import Line, array, each_realisation, row, to_json
 
 from escape_hw.errors import CalibrationError
 from escape_hw.paper.sky_time import GOAL, random_registration, registration_overrides, simulated_config
@@ -26,7 +26,7 @@ START_FRAMES = 1200
 
 
 def measure_realisation(options: argparse.Namespace, number: int) -> Line:
-    """Errors and stated errors of a plant ``(n_frames, 5)``, that of the closing calibration first."""
+    """Errors and stated errors of a realisation ``(n_frames, 5)``, that of the closing calibration first."""
     injected = random_registration(number)
     config = simulated_config(options.system, registration_overrides(injected), seed=number + 1)
     errors, sigmas = np.full((2, 1 + len(options.frames), 5), np.nan)
@@ -38,7 +38,7 @@ def measure_realisation(options: argparse.Namespace, number: int) -> Line:
     for k, calibration in enumerate(found):
         estimate = calibration.registration
         if estimate is None:
-            raise CalibrationError(f"plant {number}: no registration from calibration {k}")
+            raise CalibrationError(f"realisation {number}: no registration from calibration {k}")
         errors[k], sigmas[k] = estimate.registration.to_array() - injected.to_array(), estimate.sigma
     return {"errors": to_json(errors), "sigmas": to_json(sigmas)}
 
@@ -50,13 +50,13 @@ def main() -> None:
     )
     parser.add_argument("--system", default="razor-shwfs")
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--plants", type=int, default=10)
+    parser.add_argument("--realisations", type=int, default=10)
     parser.add_argument("--frames", type=int, nargs="+", default=[1000])
     parser.add_argument("--poke", type=float, default=0.002)
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
     target = options.out / "closed-sky-time.jsonl"
-    numbers = range(options.first, options.first + options.plants)
+    numbers = range(options.first, options.first + options.realisations)
     asked = {"system": options.system, "frames": options.frames, "poke": options.poke}
     lines = each_realisation(target, asked, numbers, lambda number: measure_realisation(options, number))
     errors, sigmas = (np.stack([array(line[name]) for line in lines]) for name in ("errors", "sigmas"))

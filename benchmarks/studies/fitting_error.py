@@ -21,7 +21,7 @@ from escape_sim.mirror.influence_functions import InfluenceFunctions
 from escape_sim.models.pyramid_turbulence import unit_screens
 from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_geometry
 
-#: Wavelength in metres at which the Fried parameter of open air is given.
+#: Wavelength in metres at which the Fried parameter of open-air turbulence is given.
 _FRIED_M = 5e-7
 
 
@@ -32,7 +32,7 @@ def residuals(
     config = load_system(system)
     open_air, wavelength = config.twin.atmosphere, config.system.wavelength_m
     if open_air is None:
-        raise SystemExit(f"{system} has no open air (twin.atmosphere)")
+        raise SystemExit(f"{system} has no open-air turbulence (twin.atmosphere)")
     pupil, diameter = pupil_geometry(config), config.system.pupil_m
     x, lit = pupil.coordinates_m, pupil.lit
     at = actuator_positions(config)

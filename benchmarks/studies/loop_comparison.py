@@ -1,12 +1,13 @@
-"""Strehl ratios on equal air of ESCAPE with optical gains, push-pull (the baseline) and DO-CRIME alone.
+"""Strehl ratios on equal turbulence of ESCAPE with optical gains, push-pull (the baseline) and DO-CRIME
+alone.
 
     python benchmarks/studies/loop_comparison.py --seeds 1 2 3 4 5 6 7 8 9 10 --keep paired
 
-Each seed is a twin with a mirror and air of its own. Every matrix is closed at its own best gain, found
-on the first seconds of that air, and judged on later ones, the same for all three. Matrices and loops are
-kept in a folder as soon as they are done and are not made again; with ``--minutes 4`` nothing new is begun
-after four minutes, and the next call goes on. Prints the table of the seeds that are finished, with the
-differences paired by seed. A seed of the pyramid bench takes some six minutes on an idle core.
+Each seed is a twin with a mirror and turbulence of its own. Every matrix is closed at its own best gain,
+found on the first seconds of that turbulence, and judged on later ones, the same for all three. Matrices and
+loops are kept in a folder as soon as they are done and are not made again; with ``--minutes 4`` nothing new
+is begun after four minutes, and the next call goes on. Prints the table of the seeds that are finished, with
+the differences paired by seed. A seed of the pyramid bench takes some six minutes on an idle core.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.true_optical_gains import get_simulated_bench
 
 ESCAPE, BASELINE, DOCRIME = "ESCAPE with optical gains", "push-pull", "DO-CRIME alone"
-#: Where on the twin's clock the judged loops begin, and the bootstrap: each behind the air of the one before.
+#: Start times of judged loops and bootstrap on the twin's clock, each after the previous turbulence.
 EVALUATION_START_S, BOOTSTRAP_START_S = 4.0, 10.0
 #: Gains tried, relative to the usual one in effect; the best at an end is followed one further.
 FACTORS, BELOW, ABOVE = (0.85, 1.0, 1.2), 0.7, 1.4

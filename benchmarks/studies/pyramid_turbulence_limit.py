@@ -1,13 +1,13 @@
-"""What the air alone costs a pyramid's registration: error against frames at the truth.
+"""What turbulence alone costs a pyramid's registration: error against frames at the truth.
 
-    python benchmarks/studies/pyramid_turbulence_limit.py --system maps-nir --plants 17 --frames 75 150 300 750 1500 3000
+    python benchmarks/studies/pyramid_turbulence_limit.py --system maps-nir --frames 75 300 1500 3000
 
-Everything but gain, registration and the model's variants is known here: where the images lie, how strong
-the air is, and the model is taken about the planted registration. Frames are fitted directly, by least
+Everything but gain, registration and the model's variants is known here: where the images lie, how strong the
+turbulence is, and the model is taken about the injected registration. Frames are fitted directly, by least
 squares with each slope's noise, as they are (plain) and as differences of neighbours (whitened), with no
-matrix in between. What is left is noise and the states of the air; the third curve is what the model says
-of these: the scatter of one state over the root of the states that were seen. Writes
-``pyramid-frames-SYSTEM.json`` and ``.png``; a plant takes some ten seconds.
+matrix in between. What is left is noise and the states of the turbulence; the third curve is what the model
+says of these: the scatter of one state over the root of the states that were seen. Writes
+``pyramid-frames-SYSTEM.json`` and ``.png``; a realisation takes some ten seconds.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from escape_hw.report.figures.registration import error_curves
 from escape_hw.runtime.session.system import System
 from escape_sim.models.pyramid import PyramidModel
 
-NAMES = ("plain", "whitened", "states of the air")
+NAMES = ("plain", "whitened", "states of turbulence")
 
 
 def fit_registration(
@@ -58,7 +58,8 @@ def fit_registration(
 def run_realisation(
     system: str, number: int, frames: list[int], overrides: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Errors ``(2, n_frames, 5)`` of one plant, and the variance that the air's states explain."""
+    """Errors ``(2, n_frames, 5)`` of one realisation, and the variance that the turbulence's states
+    explain."""
     injected = random_registration(number)
     config = simulated_config(system, [*overrides, *registration_overrides(injected)], seed=number + 1)
     with System.from_config(config) as bench:
@@ -97,7 +98,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--system", default="maps-nir")
-    parser.add_argument("--plants", type=int, default=10)
+    parser.add_argument("--realisations", type=int, default=10)
     parser.add_argument("--frames", type=int, nargs="+", default=[150, 300, 750, 1500])
     parser.add_argument("--set", dest="overrides", nargs="*", default=[])
     parser.add_argument("--curves", type=Path, help="draw what was measured before")
@@ -107,13 +108,13 @@ def main() -> None:
         curves = json.loads(options.curves.read_text())
     else:
         found = []
-        for number in range(options.plants):
+        for number in range(options.realisations):
             found.append(run_realisation(options.system, number, sorted(options.frames), options.overrides))
-            print(f"plant {number}: {np.round(found[-1][0][:, -1], 3).tolist()}", flush=True)
+            print(f"realisation {number}: {np.round(found[-1][0][:, -1], 3).tolist()}", flush=True)
         rms = np.sqrt(np.mean(np.square([errors for errors, _ in found]), axis=0))
         states = np.sqrt(np.mean([variance for _, variance in found], axis=0))
         curves = {
-            "plants": options.plants,
+            "realisations": options.realisations,
             "frames": sorted(options.frames),
             "estimators": {
                 name: {p: errors[:, k].tolist() for k, p in enumerate(PARAMETERS)}

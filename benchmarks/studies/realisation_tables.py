@@ -1,4 +1,4 @@
-"""Errors of campaigns over random plants: kept line by line, told as the rows of a Markdown table."""
+"""Errors of campaigns over random realisations: kept line by line, told as the rows of a Markdown table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: What a campaign keeps of a plant: JSON numbers and nested lists, with null for what was refused.
+#: What a campaign keeps of a realisation: JSON numbers and nested lists, with null for what was refused.
 Line = dict[str, Any]
 
 
@@ -21,7 +21,8 @@ def each_realisation(
     measure: Callable[[int], Line],
     describe: Callable[[Line], str] = lambda line: "done",
 ) -> list[Line]:
-    """The lines of some plants, measured unless the file has them already, a line as soon as it is done.
+    """The lines of some realisations, measured unless the file has them already, a line as soon as it is
+    done.
 
     Parameters
     ----------
@@ -30,30 +31,30 @@ def each_realisation(
     asked
         What was asked for, such as frames and settings; kept in every line.
     numbers
-        The plants.
+        The realisations.
     measure
-        Gives the line of a plant.
+        Gives the line of a realisation.
     told
         What to print of a new line.
 
     Raises
     ------
     SystemExit
-        The file has plants that were asked for otherwise, which do not belong into the same table.
+        The file has realisations that were asked for otherwise, which do not belong into the same table.
     """
     asked = json.loads(json.dumps(asked))
     target.parent.mkdir(parents=True, exist_ok=True)
     known = [*map(json.loads, target.read_text().splitlines())] if target.exists() else []
     if any(line["asked"] != asked for line in known):
-        raise SystemExit(f"{target} has plants that were asked for otherwise; choose another --out")
-    lines = {line["plant"]: line for line in known}
+        raise SystemExit(f"{target} has realisations that were asked for otherwise; choose another --out")
+    lines = {line["realisation"]: line for line in known}
     for number in numbers:
         if number in lines:
             continue
-        lines[number] = {"plant": number, "asked": asked, **measure(number)}
+        lines[number] = {"realisation": number, "asked": asked, **measure(number)}
         with target.open("a") as file:
             file.write(json.dumps(lines[number]) + "\n")
-        print(f"plant {number}: {describe(lines[number])}", flush=True)
+        print(f"realisation {number}: {describe(lines[number])}", flush=True)
     return [lines[number] for number in sorted(lines)]
 
 

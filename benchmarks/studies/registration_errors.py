@@ -1,14 +1,16 @@
-"""What a calibration's registration errs by: random plants, one run each, as `escape calibrate` does it.
+"""What a calibration's registration errs by: random realisations, one run each, as `escape calibrate` does
+it.
 
-    python benchmarks/studies/registration_errors.py --system razor-pywfs --frames 1000 --plants 20
-    python benchmarks/studies/registration_errors.py --system maps-nir --frames 1500 --plants 20 --name soiled --soiled 0.28
+    python benchmarks/studies/registration_errors.py --system razor-pywfs --frames 1000 --realisations 20
+    python benchmarks/studies/registration_errors.py --system maps-nir --frames 1500 --contaminated 0.28
 
-Each plant is a twin with all its imperfections, shifted by up to a sub-aperture, turned by up to two degrees
-and scaled by up to 4 %. On a telescope ``--soiled`` is the share of the circumference that dirt covers: 0.28,
-to a fifth of the radius, are a tenth of the pupil, and 0 is a clean and evenly lit one. Writes
-``plants-SYSTEM-NAME.jsonl``, a line per plant as soon as it is done; plants that the file has already
-are not run again. At the end: rms error, mean error and normalised chi-squared of those that converged, and
-the rms error of the images' mean place in pixels. A plant takes about half a minute on an idle core.
+Each realisation is a twin with all its imperfections, shifted by up to a sub-aperture, turned by up to two
+degrees and scaled by up to 4 %. On a telescope ``--contaminated`` is the share of the circumference that dirt
+covers: 0.28, to a fifth of the radius, are a tenth of the pupil, and 0 is a clean and evenly lit one. Writes
+``realisations-SYSTEM-NAME.jsonl``, a line per realisation as soon as it is done; realisations that the file
+has already are not run again. At the end: rms error, mean error and normalised chi-squared of those that
+converged, and the rms error of the images' mean place in pixels. A realisation takes about half a minute on
+an idle core.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from plant_tables import Line, each_realisation
+from realisation_tables import Line, each_realisation
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.config.sensor import PyramidSection
@@ -26,7 +28,7 @@ from escape_hw.runtime.session.system import System
 
 
 def run_realisation(system: str, number: int, frames: int, overrides: list[str]) -> Line:
-    """Calibrate one plant, and compare with what was planted."""
+    """Calibrate one realisation, and compare with what was injected."""
     injected = random_registration(number)
     config = simulated_config(system, [*overrides, *registration_overrides(injected)], seed=number + 1)
     with System.from_config(config) as bench:
@@ -54,9 +56,10 @@ def contamination_overrides(share: float) -> list[str]:
 
 
 def print_table(rows: list[Line]) -> None:
-    """Print what the plants that converged say."""
+    """Print what the realisations that converged say."""
     converged_rows = [row for row in rows if row["converged"]]
-    print(f"{len(rows)} plants, {len(converged_rows)} converged" + ("; of these:" if converged_rows else ""))
+    of_these = "; of these:" if converged_rows else ""
+    print(f"{len(rows)} realisations, {len(converged_rows)} converged{of_these}")
     if not converged_rows:
         return
     errors, sigmas = (np.array([row[key] for row in converged_rows]) for key in ("error", "sigma"))
@@ -74,26 +77,26 @@ def print_table(rows: list[Line]) -> None:
 
 
 def main() -> None:
-    """Run the plants, count, write."""
+    """Run the realisations, count, write."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--system", default="razor-pywfs")
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--plants", type=int, default=20)
+    parser.add_argument("--realisations", type=int, default=20)
     parser.add_argument("--set", dest="overrides", nargs="*", default=[])
-    parser.add_argument("--soiled", type=float)
+    parser.add_argument("--contaminated", type=float)
     parser.add_argument("--name", default="bundled")
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
     overrides = options.overrides + (
-        [] if options.soiled is None else contamination_overrides(options.soiled)
+        [] if options.contaminated is None else contamination_overrides(options.contaminated)
     )
     rows = each_realisation(
-        options.out / f"plants-{options.system}-{options.name}.jsonl",
+        options.out / f"realisations-{options.system}-{options.name}.jsonl",
         {"system": options.system, "frames": options.frames, "set": overrides},
-        range(options.first, options.first + options.plants),
+        range(options.first, options.first + options.realisations),
         lambda number: run_realisation(options.system, number, options.frames, overrides),
         lambda row: str(np.round(row["error"], 3).tolist()),
     )

@@ -1,13 +1,14 @@
 """Error of the registration against the frames spent: runs the campaign and draws its curves.
 
-    python benchmarks/studies/sky_time.py --plants 20 --frames 20 50 220 1000 --out docs/figures
-    python benchmarks/studies/sky_time.py --plants 5 --frames 1000 2000 4000 8000 --estimators plain --out long
+    python benchmarks/studies/sky_time.py --realisations 20 --frames 20 50 220 1000 --out docs/figures
+    python benchmarks/studies/sky_time.py --realisations 5 --frames 1000 8000 --estimators plain --out long
 
-Writes ``sky-time.jsonl``, a line per plant as soon as it is done, ``sky-time.json`` and ``sky-time.png``,
-with the system's name behind for any but ``razor-shwfs``; plants that the file has already are not run again.
-Prints rms errors with, in brackets, their ratio to the bound, normalised chi-squared and mean. Twenty plants
-take about twenty minutes on one core (``escape reproduce sky-time`` uses two); on a pyramid (``--system
-razor-pywfs``) the goal is that of its own sub-apertures, pixels of the pupil image.
+Writes ``sky-time.jsonl``, a line per realisation as soon as it is done, ``sky-time.json`` and
+``sky-time.png``, with the system's name behind for any but ``razor-shwfs``; realisations that the file has
+already are not run again. Prints rms errors with, in brackets, their ratio to the bound, normalised
+chi-squared and mean. Twenty realisations take about twenty minutes on one core (``escape reproduce sky-time``
+uses two); on a pyramid (``--system razor-pywfs``) the goal is that of its own sub-apertures, pixels of the
+pupil image.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-from plant_tables import Line, array, each_realisation, row, to_json
+from realisation_tables import Line, array, each_realisation, row, to_json
 
 from escape_hw.paper.sky_time import (
     ESTIMATORS,
@@ -29,12 +30,12 @@ from escape_hw.paper.sky_time import (
 )
 from escape_hw.report.figures.registration import error_curves
 
-#: What a line keeps of a plant.
+#: What a line keeps of a realisation.
 _KEPT = ("errors", "sigmas", "exact", "hybrid")
 
 
 def measure_realisation(options: argparse.Namespace, number: int) -> Line:
-    """The line of a plant."""
+    """The line of a realisation."""
     found = run_realisation(options.system, number, options.frames, estimators=options.estimators)
     return {name: to_json(getattr(found, name)) for name in _KEPT}
 
@@ -58,7 +59,7 @@ def main() -> None:
     )
     parser.add_argument("--system", default="razor-shwfs")
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--plants", type=int, default=20)
+    parser.add_argument("--realisations", type=int, default=20)
     parser.add_argument("--frames", type=int, nargs="+", default=list(FRAMES))
     parser.add_argument("--estimators", nargs="+", choices=ESTIMATORS, default=list(ESTIMATORS))
     parser.add_argument("--out", type=Path, default=Path("."))
@@ -74,7 +75,7 @@ def main() -> None:
     (options.out / f"{name}.json").write_text(json.dumps(curves, indent=1) + "\n")
     error_curves(curves).savefig(options.out / f"{name}.png", dpi=110, facecolor="white")
     print_table(realisations, options.frames)
-    print(f"{len(realisations)} plants; fewest frames that meet the goal: {curves['fewest_frames']}")
+    print(f"{len(realisations)} realisations; fewest frames that meet the goal: {curves['fewest_frames']}")
 
 
 if __name__ == "__main__":

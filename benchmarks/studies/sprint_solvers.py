@@ -1,9 +1,9 @@
 """SPRINT's variants beside the default: error and time on the same matrices, measured on the twin.
 
-    python benchmarks/studies/sprint_solvers.py --plants 8 --frames 1000
+    python benchmarks/studies/sprint_solvers.py --realisations 8 --frames 1000
 
-Prints a table: rms error over random plants with all imperfections on, normalised chi-squared, and time in
-units of the default's, every variant on every matrix in the same run.
+Prints a table: rms error over random realisations with all imperfections on, normalised chi-squared, and time
+in units of the default's, every variant on every matrix in the same run.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ class Case:
     matrix: InteractionMatrix
     covariance: NDArray[np.float64] | None
     model: SyntheticModel
-    planted: NDArray[np.float64]
+    injected: NDArray[np.float64]
 
 
 def measure(system: str, number: int, frames: int) -> Case:
-    """DO-CRIME on random plant ``number``, all imperfections on."""
+    """DO-CRIME on random realisation ``number``, all imperfections on."""
     injected = random_registration(number)
     config = simulated_config(system, registration_overrides(injected), seed=number + 1)
     with System.from_config(config) as bench:
@@ -88,7 +88,7 @@ def solve_case(case: Case, options: dict[str, Any]) -> tuple[NDArray[np.float64]
     began = time.perf_counter()
     found = sprint(case.matrix, case.model, covariance=case.covariance, **options)
     seconds = time.perf_counter() - began
-    return found.registration.to_array() - case.planted, found.sigma, seconds
+    return found.registration.to_array() - case.injected, found.sigma, seconds
 
 
 def table(system: str, realisations: int, frames: int, only: str = "") -> Iterator[str]:
@@ -119,7 +119,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--system", default="razor-shwfs")
-    parser.add_argument("--plants", type=int, default=8)
+    parser.add_argument("--realisations", type=int, default=8)
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--only", default="", help="part of the names of the variants to try")
     options = parser.parse_args()

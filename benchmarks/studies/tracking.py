@@ -1,4 +1,17 @@
-"""Tracker on a drifting bench, compared with a loop that uses the true registration and one that is never updated; with its figure. (Keep the usage text of the script below this line.)"""
+"""Tracker on a drifting bench, compared with a loop that uses the true registration and one never updated.
+
+    python benchmarks/studies/tracking.py track --seconds 600 --out tracked
+    python benchmarks/studies/tracking.py compare --loop knows --out tracked
+    python benchmarks/studies/tracking.py compare --loop never --out tracked
+    python benchmarks/studies/tracking.py draw --out tracked --figure docs/figures/tracking.png
+
+``track`` calibrates, finds the optical gains on a pyramid, and runs the tracker once over all frames. It
+writes its table with the twin's true values (``track.json``; ``live.jsonl`` while it runs). ``compare``
+closes another loop for a few seconds at a time, at the same moments of the same turbulence, without pokes:
+with the matrix moved to the true registration and scaled to the true gain (``knows``), or with the initial
+matrix (``never``). Intervals that its file already contains are not repeated. ``draw`` prints the
+differences and draws the figure. All take the same options.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +103,7 @@ def exchange_transients(out: Path, t: Any, exchanged: Any) -> str:
         return "no exchange"
     own, others = step[exchanged_here], step[~exchanged_here]
     return (
-        f"wavefront in front of the sensor (mean {before.mean():.0f} nm), {TRANSIENT_S:g} s after beside before "
+        f"wavefront in front of the sensor (mean {before.mean():.0f} nm), {TRANSIENT_S:g} s after and before "
         f"{len(own)} exchanges: {own.mean():+.2f} +- {own.std() / np.sqrt(len(own)):.2f} nm, "
         f"rms {own.std():.2f}, largest {np.abs(own).max():.2f}; at the {len(others)} other seconds "
         f"rms {others.std():.2f}, largest {np.abs(others).max():.2f}"
@@ -105,12 +118,12 @@ def at_same_times(comparisons: NDArray[np.float64], t: Any, ratios: Any) -> NDAr
 def difference(loop: str, comparisons: NDArray[np.float64], t: Any, ratios: Any) -> str:
     """Mean Strehl ratios of the tracked loop and another one at the same moments, and of their difference."""
     here = at_same_times(comparisons, t, ratios)
-    strehl_difference = here - comparisons[:, 1]
+    strehl_difference, mean = here - comparisons[:, 1], comparisons[:, 1].mean()
     error = strehl_difference.std(ddof=1) / np.sqrt(len(strehl_difference))
     return (
-        f"Strehl ratio: tracked {100 * here.mean():.2f} %, {loop} {100 * comparisons[:, 1].mean():.2f} %, tracked "
-        f"minus {loop} {100 * strehl_difference.mean():+.2f} +- {100 * error:.2f} % ({len(strehl_difference)} looks), relative "
-        f"{100 * strehl_difference.mean() / comparisons[:, 1].mean():+.2f} +- {100 * error / comparisons[:, 1].mean():.2f} %; "
+        f"Strehl ratio: tracked {100 * here.mean():.2f} %, {loop} {100 * mean:.2f} %, tracked minus {loop} "
+        f"{100 * strehl_difference.mean():+.2f} +- {100 * error:.2f} % ({len(strehl_difference)} intervals), "
+        f"relative {100 * strehl_difference.mean() / mean:+.2f} +- {100 * error / mean:.2f} %; "
         f"last quarter {100 * strehl_difference[-len(strehl_difference) // 4 :].mean():+.2f} %"
     )
 
@@ -151,7 +164,7 @@ def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]
 
 
 def strehl_panels(panel: Any, deficit_panel: Any, rows: dict[str, Any], others: dict[str, Any]) -> None:
-    """Strehl ratios, and what each loop lacks of the one that knows on the same air."""
+    """Strehl ratios, and what each loop lacks of the one that knows on the same turbulence."""
     t, ratio = rows["seconds"], np.isfinite(rows["strehl"])
     panel.errorbar(
         t[ratio], 100 * rows["strehl"][ratio], 100 * rows["strehl_sigma"][ratio],

@@ -28,7 +28,7 @@ SCHEMA = 1
 
 
 def to_plain_values(value: Any) -> Any:
-    """Plain JSON values; NaN and infinity, which JSON does not know, become ``None``."""
+    """Plain JSON values; NaN and infinity become ``None``."""
     if isinstance(value, Estimate):
         return to_plain_values(value.to_dict())
     if is_dataclass(value) and not isinstance(value, type):
@@ -65,7 +65,7 @@ def header_fields(
 
 
 def snr_document(matrix: InteractionMatrix) -> dict[str, Any]:
-    """Least and median signal-to-noise ratio over the modes; ``None`` for a computed matrix."""
+    """Minimum and median signal-to-noise ratio over the modes; ``None`` for a computed matrix."""
     snr = matrix.snr()
     return {"min": float(snr.min()), "median": float(np.median(snr))}
 
@@ -176,12 +176,12 @@ def _round_document(one: GainRound) -> dict[str, Any]:
     }
 
 
-#: Rows that a document holds at most; the table beside it has all.
+#: Maximum number of rows in a document; the CSV table has all rows.
 _MAX_ROWS = 2000
 
 
 def track_document(result: TrackResult) -> dict[str, Any]:
-    """What ``escape track --json`` says beside the head and the tail."""
+    """Fields of ``escape track --json`` apart from header and footer."""
     n = len(result.rows["seconds"])
     stride = max(1, -(-n // _MAX_ROWS))
     residual, strehl = result.column("residual_nm"), result.column("strehl")

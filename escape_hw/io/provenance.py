@@ -16,7 +16,7 @@ from escape_hw.version import __version__
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """What a product says about its origin.
+    """Origin of a product.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def get_git_state() -> str:
     """
     package_folder = Path(escape_hw.errors.__file__).resolve().parent
     commit = _run_git(package_folder, "rev-parse", "--short=12", "HEAD")
-    # A site-packages folder may lie inside somebody else's repository: ask git whether it owns us.
+    # A site-packages folder may be inside another repository: check that git tracks this package.
     is_tracked = _run_git(package_folder, "ls-files", "--error-unmatch", "errors.py")
     if not commit or not is_tracked:
         return "unknown"

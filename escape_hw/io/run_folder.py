@@ -18,7 +18,7 @@ from escape_hw.io.documents import dumps
 from escape_hw.io.provenance import get_git_state, get_software_version
 from escape_hw.io.storage import check_writable, make_folder, storage_error, write_atomic
 
-#: Room asked for before a run begins, in bytes; a run's products are a few megabytes.
+#: Free space required before a run, in bytes; a run's products are a few megabytes.
 MIN_FREE_BYTES = 50_000_000
 LOG_FILE = "run.log"
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 def default_runs_folder() -> Path:
-    """Where runs go unless told otherwise: ``runs`` in the user's data directory."""
+    """Default folder of runs: ``runs`` in the user's data directory."""
     return Path(platformdirs.user_data_dir("escape", appauthor=False)) / "runs"
 
 
@@ -46,12 +46,12 @@ class RunFolder:
     path
         The folder.
     asked
-        The folder that was asked for, when it could not be had because it holds files already.
+        The requested folder, when it already contained files and another one is used.
 
     Raises
     ------
     StorageError
-        The folder cannot be made or takes no files. Raised here, before anything moves.
+        The folder cannot be created or written. Raised before anything moves.
     """
 
     def __init__(self, system: str, kind: str, out: Path | str | None = None) -> None:
@@ -103,7 +103,7 @@ class RunFolder:
             self._handler = None
 
     def location_fields(self) -> dict[str, Any]:
-        """For documents: the folder used, and the one asked for when that is another."""
+        """Fields of a document: the folder used, and the requested one if different."""
         return {
             "folder": str(self.path),
             "folder_asked": None if self.requested_path is None else str(self.requested_path),
@@ -129,7 +129,7 @@ class RunFolder:
         Raises
         ------
         StorageError
-            It cannot be written.
+            The file cannot be written.
         """
         path = self.file(name)
         write_atomic(path, text.encode())
@@ -153,11 +153,9 @@ def read_result(folder: Path | str) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ProductError(
-            f"{path}: cannot be read ({error.strerror}); is this the folder of a run?"
-        ) from error
+        raise ProductError(f"{path}: cannot be read ({error.strerror}); is this a run folder?") from error
     except ValueError as error:
-        raise ProductError(f"{path}: damaged; it is no JSON document ({error})") from error
+        raise ProductError(f"{path}: damaged; not a JSON document ({error})") from error
     if not isinstance(document, dict) or not isinstance(document.get("products"), dict):
         raise ProductError(f"{path}: it lists no products")
     home = path.parent.absolute()
@@ -185,4 +183,4 @@ def _create_unique_folder(requested: Path) -> Path:
         except OSError as error:
             raise storage_error(path, error) from error
         return path
-    raise storage_error(requested, FileExistsError(17, "too many folders of that name"))
+    raise storage_error(requested, FileExistsError(17, "too many folders with that name"))

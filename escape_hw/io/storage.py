@@ -11,7 +11,7 @@ from pathlib import Path
 
 from escape_hw.errors import StorageError
 
-#: Room to leave on the disk beside the file itself, in bytes.
+#: Free space that must remain after writing a file, in bytes.
 MARGIN_BYTES = 1 << 20
 
 _REMEDIES = {
@@ -38,7 +38,7 @@ def make_folder(folder: Path) -> None:
     Raises
     ------
     StorageError
-        It cannot be created.
+        The folder cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -103,7 +103,7 @@ def write_atomic(path: Path, content: bytes) -> None:
     temporary = Path(name)
     try:
         _write_all(handle, content)
-        temporary.chmod(0o666 & ~_umask())  # mkstemp makes files that nobody else may read
+        temporary.chmod(0o666 & ~_umask())  # mkstemp creates files that only the owner may read
         temporary.replace(path)
         _sync_folder(path.parent)
     except OSError as error:

@@ -69,10 +69,10 @@ def compare(a: CalibrationResult, b: CalibrationResult) -> MatrixComparison:
     """
     if a.grid.kind != b.grid.kind:
         raise IncompatibleProduct(
-            f"one matrix is of a {a.grid.kind} sensor, the other of a {b.grid.kind}; they cannot be compared"
+            f"the matrices are of different sensors ({a.grid.kind}, {b.grid.kind}) and cannot be compared"
         )
     if a.matrix.m2c.shape != b.matrix.m2c.shape or not np.allclose(a.matrix.m2c, b.matrix.m2c, atol=1e-9):
-        raise IncompatibleProduct("the two matrices have different bases; their modes cannot be compared")
+        raise IncompatibleProduct("the matrices have different modal bases; their modes cannot be compared")
     if a.matrix.valid.shape != b.matrix.valid.shape:
         raise IncompatibleProduct(
             f"the grids differ: {a.matrix.valid.shape} and {b.matrix.valid.shape} {a.grid.elements}"
@@ -111,7 +111,7 @@ def summary_lines(result: MatrixComparison) -> list[str]:
     """The comparison in a few lines."""
     return [
         f"{result.correlation.size} modes over {result.common} common {result.elements}",
-        f"correlation per mode: least {np.min(result.correlation):.4f}, "
+        f"correlation per mode: minimum {np.min(result.correlation):.4f}, "
         f"median {np.median(result.correlation):.4f}",
         f"gain of B relative to A: median {np.median(result.gain_ratio):.4f}",
         f"relative rms difference: {100 * result.total_relative_rms:.2f} % over the whole matrix",

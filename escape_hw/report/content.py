@@ -71,7 +71,7 @@ class RunContent:
 
     @property
     def places_m(self) -> NDArray[np.float64] | None:
-        """Where actuators without a grid stand ``(n_act, 2)``, in metres on the mirror."""
+        """Positions of actuators without a grid ``(n_act, 2)``, in metres on the mirror."""
         positions = self.document.get("bench", {}).get("places_m")
         return np.array(positions, float).reshape(-1, 2) if positions else None
 
@@ -170,7 +170,7 @@ def _add_product(run: RunContent, name: str, path: Path, label: Mapping[str, str
         found = load_gains(path).result
         run.gains[label.get("label") or METHOD_LABELS.get(found.method, name)] = found
     elif kind != KIND_TELEMETRY:
-        raise ProductError(f"{path}: its kind is {kind!r}; this version knows IM, PSF, OG and TELEM")
+        raise ProductError(f"{path}: its kind is {kind!r}; this version reads IM, PSF, OG and TELEM")
 
 
 def _unique_label(used: Mapping[str, object], label: str, name: str) -> str:

@@ -70,12 +70,12 @@ def criteria_list(criteria: Sequence[Mapping[str, Any]]) -> str:
 
 
 def link(target: str, text: str) -> str:
-    """A link to a file beside the page."""
+    """A link to a file in the folder of the page."""
     return f'<a href="{escape(quote(target))}">{escape(text)}</a>'
 
 
 def figure_row(*parts: str) -> str:
-    """Figures beside each other where the page is wide enough."""
+    """Figures side by side where the page is wide enough."""
     inside = "".join(part for part in parts if part)
     return f'<div class="two">{inside}</div>' if inside else ""
 

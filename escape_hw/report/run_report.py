@@ -280,7 +280,7 @@ def _sky_time_section(run: RunContent) -> str:
 
 
 def _mirror_figure(run: RunContent, command: NDArray[np.float64]) -> Figure | None:
-    """The command on the map of the actuators, when the run knows where they stand."""
+    """Map of the command, when the run has the actuators' positions."""
     layout, positions = run.layout, run.places_m
     if layout is not None and command.size == int(layout.sum()):
         return figures_bench.mirror_on_grid(command, layout)

@@ -61,7 +61,7 @@ def format_with_error(value: Estimate) -> str:
 
 
 def format_percent(value: Estimate) -> str:
-    """A ratio and its error in percent; a question mark where the run was too short for an error."""
+    """A ratio and its standard error in percent; a question mark if the run was too short for one."""
     if not math.isfinite(value.sigma):
         return f"{100 * value.value:5.1f} ± ? %"
     return f"{100 * value.value:5.1f} ± {100 * value.sigma:.1f} %"
@@ -75,7 +75,7 @@ def registration_table(
     Parameters
     ----------
     estimates
-        By the heading of their column, such as ``SHORT``; an empty heading stands for alpha alone.
+        By column heading, such as ``SHORT``; an empty heading means alpha alone.
     planted
         The truth hidden in a twin, shown in a last column; beside each estimate then stands its
         difference from the truth over its standard error.

@@ -62,7 +62,7 @@ def test_taps_see_what_passes(bench, good):
 def test_nobody_looks_unless_asked(bench, good):
     assert bench.callbacks == Callbacks()
     assert (bench.wfs.callback, bench.dm.callback, bench.science.callback) == (None, None, None)
-    assert type(build_slope_function(bench, good.grid)).__name__ == "SlopeExtractor"
+    assert type(build_slope_function(bench, good.grid)).__name__ == "ShackHartmannSlopes"
     bench.callbacks = Seen().callbacks()
     bench.callbacks = Callbacks()
     assert (bench.wfs.callback, bench.dm.callback, bench.science.callback) == (None, None, None)

@@ -1,4 +1,4 @@
-"""A pyramid from two actuator pitches and ten degrees away; see also `benchmarks/studies/capture_range.py`."""
+"""A pyramid from two actuator pitches and ten degrees away; see `benchmarks/studies/capture_range.py`."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import pytest
 import escape_hw
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = {"escape_hw", "escape_gui", "escape_drivers", "escape_sim"}
+PACKAGES = {"escape_hw", "escape_gui", "escape_drivers", "escape_sim", "escape_benchmarks"}
 
 pytestmark = pytest.mark.xdist_group("wheel")
 
@@ -77,7 +77,7 @@ print(json.dumps({{
     return loaded
 
 
-def test_wheel_holds_four_packages_and_its_data(wheel: Path) -> None:
+def test_wheel_holds_the_packages_and_their_data(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
     stem = f"escape_hw-{escape_hw.__version__}"

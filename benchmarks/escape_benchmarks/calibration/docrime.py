@@ -1,4 +1,7 @@
-"""DO-CRIME: time per frame and error against pyRTC on the same frames; frames per second of a whole run on the twin."""
+"""DO-CRIME: time per frame and error against pyRTC on the same frames.
+
+Frames per second of a whole run on the twin.
+"""
 
 from __future__ import annotations
 

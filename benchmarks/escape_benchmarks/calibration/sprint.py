@@ -45,7 +45,7 @@ MODES = (5, 40)
 NOISE, N_DRAWS = 0.15, 4
 #: A mirror as it comes: scatter of the actuators' gains, and coupling where the model says 0.4.
 GAIN_SCATTER, COUPLING = 0.05, 0.43
-#: Far starts: shifts in actuator pitches, directions in degrees, and what else is planted.
+#: Far starts: shifts in actuator pitches, directions in degrees, and what else is injected.
 PITCHES, DIRECTIONS = (0.25, 0.5, 1.0, 1.5, 2.0), (20.0, 200.0)
 OTHER_PARAMETERS = (1.0, 2.0, 0.0)
 #: What counts as found from afar, in the units of the parameters; there is no noise in these.
@@ -100,7 +100,7 @@ def pyramid_rows() -> list[BenchmarkRow]:
     return rows
 
 
-def planted(config: SystemConfig) -> Registration:
+def injected(config: SystemConfig) -> Registration:
     """:data:`INJECTED` on the pupil of a design, in its own sub-apertures."""
     finer = config.sensor.n_sub / INJECTED_N_SUB
     return replace(INJECTED, shift_x=finer * INJECTED.shift_x, shift_y=finer * INJECTED.shift_y)
@@ -158,7 +158,7 @@ def mirror(real: bool) -> MirrorUnderTest:
 
 def _matrices(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
     """The synthetic matrix, alone and with what a step of the descent needs."""
-    model, m2c, at = make_model(config, None), oopao.m2c, planted(config)
+    model, m2c, at = make_model(config, None), oopao.m2c, injected(config)
     ours, theirs = modal_matrix(model, at, m2c), oopao.matrix(at, mirror(False))
     scale = float(np.vdot(ours, theirs) / np.vdot(ours, ours))
     note = f"relative difference {np.linalg.norm(scale * ours - theirs) / np.linalg.norm(theirs):.1e}"
@@ -216,7 +216,7 @@ def _scaled(seconds: float | None, factor: float) -> float | None:
 
 def _times(config: SystemConfig, oopao: OopaoPeer, what: str, noise: float) -> list[BenchmarkRow]:
     ours, noisy = EscapeSolver(config, oopao.m2c), noise > 0
-    data = oopao.matrix(planted(config), mirror(False))
+    data = oopao.matrix(injected(config), mirror(False))
     if noisy:
         data = _draws(data)[0]
     peer_label, note = f"{oopao.name}, 6 iterations", f"OOPAO's matrix, {noise:.0%} noise"
@@ -247,7 +247,7 @@ def _exact(
 ) -> list[BenchmarkRow]:
     """Errors on a matrix of OOPAO's without noise, for solvers with a label and with misfit or not."""
     oopao.set_up()
-    at, ours = planted(config), EscapeSolver(config, oopao.m2c)
+    at, ours = injected(config), EscapeSolver(config, oopao.m2c)
     matrix = [oopao.matrix(at, mirror(False))]
     theirs, rows = _errors(oopao.solve, matrix, at), []
     for label, solver_name in cases:
@@ -314,7 +314,7 @@ def _specula_rows(config: SystemConfig, modes: NDArray[np.float64]) -> list[Benc
     light, what = ours.solver("light"), f"sprint, {modes.shape[1]} modes"
     our_data = _draws(ours.matrix(INJECTED_EQUAL_SCALINGS))
     peer = specula_peer(config, modes, make_model(config, None))
-    label, note = "each its own sensor, light", "one scaling planted; SPECULA knows no more"
+    label, note = "each its own sensor, light", "one scaling injected; SPECULA knows no more"
     if peer is None:
         seconds = time_alternately(lambda: light(our_data[0]), None, rounds=2)[0]
         return [BenchmarkRow(f"{what}: {label}", seconds, None, "SPECULA", "s", "lower", MISSING)]
@@ -342,10 +342,10 @@ def _sigma(matrix: NDArray[np.float64]) -> float:
 
 
 def _errors(
-    solve: Solve, matrices: Sequence[NDArray[np.float64]], planted: Registration
+    solve: Solve, matrices: Sequence[NDArray[np.float64]], injected: Registration
 ) -> NDArray[np.float64]:
     """Errors ``(n_draws, 5)`` in the units of the parameters."""
-    return np.stack([solve(data).registration.to_array() - planted.to_array() for data in matrices])
+    return np.stack([solve(data).registration.to_array() - injected.to_array() for data in matrices])
 
 
 def _error_rows(

@@ -53,7 +53,7 @@ def _row(system: str, frames: int) -> BenchmarkRow:
         reference_rates: dict[int, list[float]] = {1: [], 2: []}
         try:
             for number in range(1 + ROUNDS):
-                # Each loop draws air of its own: workers share nothing.
+                # Each loop draws its own turbulence: workers share nothing.
                 seeds = range(LOOPS * number, LOOPS * (number + 1))
                 for count in (1, 2):
                     tasks = [TrialSpec(*task, values, frames, seed) for seed in seeds]
@@ -71,7 +71,8 @@ def _row(system: str, frames: int) -> BenchmarkRow:
         float(np.median(seen[1:])) for seen in (loops[2], loops[1], reference_rates[2], reference_rates[1])
     )
     note = (
-        f"{frames} frames each; a loop opens its twin, draws its air and closes; bare arithmetic gains "
+        f"{frames} frames each; a loop opens its twin, draws its turbulence and closes; "
+        f"bare arithmetic gains "
         f"{both / single:.2f} times from a second process here"
     )
     return BenchmarkRow(f"sweep: {system}", two, one, "the same with one worker", "loop/s", "higher", note)

@@ -97,14 +97,14 @@ class SpeculaPeer:
         """Matrix of synim ``(n_slopes, n_modes)``; the two scalings must be equal."""
         self._sprint.misreg_params = self._in_pixels(registration)
         with _ignore_empty_subapertures():
-            return np.asarray(self._sprint._compute_nominal_im())
+            return np.asarray(self._sprint._compute_nominal_im())  # noqa: SLF001
 
     def solve(self, data: NDArray[np.float64], iterations: int = 6) -> SolverResult:
         """The registration of a matrix, from zero; both scalings are its magnification."""
         self._sprint.misreg_params = np.zeros(4)
         self._sprint.max_iterations = iterations
         with _ignore_empty_subapertures():
-            self._sprint._iterative_estimation(data)
+            self._sprint._iterative_estimation(data)  # noqa: SLF001
         x, y, rotation, magnification = (float(v) for v in self._sprint.misreg_params)
         per_cent = 100 / self._pixels
         found = Registration(x * per_cent, y * per_cent, rotation, 100 * magnification, 100 * magnification)

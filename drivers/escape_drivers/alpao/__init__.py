@@ -1,1 +1,4 @@
-"""ALPAO deformable mirrors: the driver and the binding of the vendor's SDK. Exports ``AlpaoMirror``, ``AlpaoOptions``."""
+"""ALPAO deformable mirrors: the driver and the binding of the vendor's SDK.
+
+Exports ``AlpaoMirror``, ``AlpaoOptions``.
+"""

@@ -1,1 +1,4 @@
-"""What several drivers share: loading of vendor libraries, parsing of options, base class and limits of cameras."""
+"""What several drivers share.
+
+Loading of vendor libraries, parsing of options, base class and limits of cameras.
+"""

@@ -1,4 +1,6 @@
-"""PI's General Command Set 2.0 as text: formats commands, parses replies, maps error numbers; no input or output.
+"""PI's General Command Set 2.0 as text.
+
+Formats commands, parses replies, maps error numbers; no input or output.
 
 Rules from the manual of the E-727 (E727T0005): a command is a mnemonic and at most 32 arguments, ended by a line feed. Every line of a reply but the last ends with a blank before the line feed. Values come as ``1=0.000000000e+00``, arrays behind a header of ``# KEY = value`` that ends with ``# END_HEADER``. USB pads with NUL.
 """

@@ -1,4 +1,7 @@
-"""Driver ``pi-e727``: PI's E-727 controller with an S-330 tip-tilt platform, for a modulated pyramid; start-up and shut-down sequence."""
+"""Driver ``pi-e727``: PI's E-727 controller with an S-330 tip-tilt platform.
+
+For a modulated pyramid; start-up and shut-down sequence.
+"""
 
 from __future__ import annotations
 

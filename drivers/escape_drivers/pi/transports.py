@@ -1,4 +1,7 @@
-"""Byte transports to a PI controller (TCP, serial, USB, emulator) and the choice among them from the configuration."""
+"""Byte transports to a PI controller (TCP.
+
+Serial, USB, emulator) and the choice among them from the configuration.
+"""
 
 from __future__ import annotations
 

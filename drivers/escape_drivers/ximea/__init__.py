@@ -1,1 +1,4 @@
-"""XIMEA cameras: the driver and the binding of the vendor's xiAPI. Exports ``XimeaCamera``, ``XimeaOptions``."""
+"""XIMEA cameras: the driver and the binding of the vendor's xiAPI.
+
+Exports ``XimeaCamera``, ``XimeaOptions``.
+"""

@@ -1,1 +1,5 @@
-"""The FITS products, one module per kind (matrix, gains, loop, frames, telemetry, run state), and the checked file format that they share. What a product holds as a Python object is defined in api/."""
+"""The FITS products, one module per kind (matrix.
+
+Gains, loop, frames, telemetry, run state), and the checked file format that they share. What a product holds
+as a Python object is defined in api/.
+"""

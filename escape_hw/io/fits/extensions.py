@@ -31,7 +31,7 @@ _PUPILS = "PUPILS"
 def pack_grid(grid: SensorGeometry) -> list[Any]:
     """The references with all numbers of the geometry as cards, and the flux map.
 
-    The card SENSOR names the kind; the mask stands in VALID.
+    The card SENSOR gives the kind of sensor, the extension VALID the mask.
     """
     pack, _ = _CONVERTERS[grid.kind]
     references, cards, extra_extensions = pack(grid)
@@ -56,11 +56,11 @@ def unpack_grid(path: Path, hdus: fits.HDUList) -> SensorGeometry:
     references = fits_file.read_array(path, hdus, "GRID", np.float32)
     if references.shape != (int(valid.sum()), 2):
         raise ProductError(f"{path}: GRID has shape {references.shape}, VALID marks {int(valid.sum())}")
-    # Products from before there was a second kind do not say theirs.
+    # Products of early versions have no card SENSOR; they are Shack-Hartmann sensors.
     kind = str(header.get("SENSOR", SubApertureGrid.kind))
     if kind not in _CONVERTERS:
         raise ProductError(
-            f"{path}: its sensor is of kind '{kind}'; this version knows {', '.join(_CONVERTERS)}"
+            f"{path}: its sensor is of kind '{kind}'; this version reads {', '.join(_CONVERTERS)}"
         )
     _, unpack = _CONVERTERS[kind]
     common = {
@@ -158,7 +158,7 @@ _CONVERTERS: dict[str, tuple[Callable[[SensorGeometry], _GeometryParts], Callabl
 def pack_metrics(metrics: Mapping[str, Any], name: str = "METRICS") -> fits.BinTableHDU:
     """Scalars by name as a table.
 
-    Numbers stand in the column VALUE, where NaN and infinity are allowed (a header card cannot
+    Numbers are stored in the column VALUE, where NaN and infinity are allowed (a header card cannot
     hold them); whatever is no float is kept exactly as JSON in the column TEXT.
     """
     numbers, as_text = [], []
@@ -190,7 +190,7 @@ def unpack_metrics(path: Path, hdus: fits.HDUList, name: str = "METRICS") -> dic
             for row in data
         }
     except (KeyError, ValueError, TypeError) as error:
-        raise ProductError(f"{path}: extension {name} is no table of metrics ({error})") from error
+        raise ProductError(f"{path}: extension {name} is not a table of metrics ({error})") from error
 
 
 def pack_response(response: TemporalResponse) -> fits.BinTableHDU:
@@ -249,7 +249,7 @@ def _pack_actuators(corrections: ActuatorCorrections) -> fits.BinTableHDU:
 
 
 def _unpack_actuators(hdus: fits.HDUList) -> ActuatorCorrections | None:
-    """``None`` where SPRINT did not look, and in products of earlier versions."""
+    """``None`` where SPRINT did not fit actuators, and in products of earlier versions."""
     if "ACTUATOR" not in hdus:
         return None
     gain, sigma, width = (_column(hdus, "ACTUATOR", name) for name in ("GAIN", "SIGMA", "WIDTH"))

@@ -1,4 +1,8 @@
-"""FITS files with checksums: headers and extensions of a product, atomic writing, verified reading, and the class of a product that was read."""
+"""FITS files with checksums.
+
+Headers and extensions of a product, atomic writing, verified reading, and the class of a product that was
+read.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +41,7 @@ def header_text(text: str) -> str:
 def primary_hdu(
     kind: str, system: str, simulated: bool, partial: bool, origin: Provenance
 ) -> fits.PrimaryHDU:
-    """An empty primary HDU whose header says what the file is and where it comes from."""
+    """An empty primary HDU; its header holds kind, schema and origin of the file."""
     header = fits.Header()
     cards: list[tuple[str, Any, str]] = [
         ("KIND", kind, "kind of product"),
@@ -112,7 +116,7 @@ def write(path: Path, hdus: Sequence[Any]) -> str:
     Raises
     ------
     StorageError
-        It cannot be written; no half product is left.
+        The file cannot be written; no partial file remains.
     """
     hdus[0].header["NHDU"] = len(hdus)
     buffer = io.BytesIO()
@@ -171,8 +175,8 @@ def _check_bytes(path: Path, content: bytes) -> None:
         )
     if b"CHECKSUM=" not in content[: 20 * _BLOCK]:
         raise ProductError(f"{path}: carries no checksum; it is damaged or not an ESCAPE product")
-    # CHECKSUM makes the ones' complement sum of each HDU zero, hence that of the file too. Tested on
-    # the raw bytes, it holds whatever a flipped bit would make a parser believe.
+    # CHECKSUM makes the ones' complement sum of each HDU and of the file zero. It is tested on
+    # the raw bytes, before any parser sees a flipped bit.
     if int(np.frombuffer(content, ">u4").sum(dtype=np.uint64)) % 0xFFFFFFFF:
         raise ProductError(f"{path}: damaged; checksum of the file is wrong (truncated or changed)")
 

@@ -40,7 +40,7 @@ def save_frames(
     Raises
     ------
     StorageError
-        It cannot be written.
+        The file cannot be written.
     """
     origin = origin or Provenance()
     primary = fits_file.primary_hdu(KIND_FRAMES, system, info.simulated, False, origin)

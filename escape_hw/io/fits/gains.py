@@ -46,7 +46,7 @@ def save_gains(
     Raises
     ------
     StorageError
-        It cannot be written; no half product is left.
+        The file cannot be written; no partial file remains.
     """
     origin = origin or Provenance()
     if result.partial:
@@ -97,7 +97,7 @@ def load_gains(path: Path | str) -> GainsProduct:
 
 
 def _round_scalars(one: GainRound) -> dict[str, Any]:
-    """What a round holds beside its gains' rows, as plain values."""
+    """Scalars of a round."""
     scalars = {name: getattr(one, name) for name in _ROUND_FIELDS}
     strehl = (
         None

@@ -45,7 +45,7 @@ def save_loop(
     Raises
     ------
     StorageError
-        It cannot be written; no half product is left.
+        The file cannot be written; no partial file remains.
     """
     origin = origin or Provenance()
     if result.partial:

@@ -54,7 +54,7 @@ def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance 
     Parameters
     ----------
     path
-        Wanted name; the result of an aborted run is written as ``*.partial.fits`` instead.
+        File name; the result of an aborted run is written as ``*.partial.fits``.
     result
         What a calibration procedure returned.
     origin
@@ -68,7 +68,7 @@ def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance 
     Raises
     ------
     StorageError
-        It cannot be written; no half product is left.
+        The file cannot be written; no partial file remains.
     ValueError
         Matrix and grid do not belong together.
     """
@@ -225,7 +225,7 @@ def load_basis(path: Path | str) -> NDArray[np.float64]:
     Parameters
     ----------
     path
-        An interaction matrix of ours, checked as such; or any FITS file whose first image with two axes
+        An interaction matrix written by ESCAPE, or any FITS file whose first image with two axes
         is the matrix, actuators along its rows (``NAXIS2``).
 
     Returns

@@ -29,7 +29,7 @@ class RunState:
     Parameters
     ----------
     identity
-        What the run is: whoever goes on with it must be the same. Plain JSON values.
+        Settings of the run, which a resumed run must share. Plain JSON values.
     values
         Numbers and text of the state, plain JSON values.
     arrays
@@ -50,9 +50,9 @@ def save_state(path: Path, state: RunState, system: str, simulated: bool) -> Non
     Raises
     ------
     StorageError
-        It cannot be written.
+        The file cannot be written.
     """
-    # FITS images have at least one axis and one element; names and shapes go beside them.
+    # FITS images have at least one axis and one element; names and shapes are stored separately.
     non_empty = {name: array for name, array in state.arrays.items() if array.size}
     shapes = {name: [list(array.shape), array.dtype.str] for name, array in state.arrays.items()}
     book = {

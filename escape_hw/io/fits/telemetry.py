@@ -27,7 +27,7 @@ class LoopTelemetry:
     index
         The camera's number of every frame ``(n,)``; gaps are lost frames.
     exposed_s
-        End of its exposure ``(n,)``, seconds since the first; 0 everywhere where nobody knows.
+        End of its exposure ``(n,)``, seconds since the first; all 0 when unknown.
     slopes
         ``(n, n_slopes)``, in the sensor's unit.
     commands
@@ -52,7 +52,7 @@ class LoopTelemetry:
 
     @property
     def rate_hz(self) -> float:
-        """Frames per second, lost ones counted; 0 when nobody knows."""
+        """Frames per second including lost ones; 0 when unknown."""
         seconds = float(np.ptp(self.exposed_s)) if self.index.size else 0.0
         return float(np.ptp(self.index)) / seconds if seconds > 0 else 0.0
 
@@ -70,7 +70,7 @@ def save_telemetry(
     Raises
     ------
     StorageError
-        It cannot be written; no half product is left.
+        The file cannot be written; no partial file remains.
     """
     origin = origin or Provenance()
     hdus = [

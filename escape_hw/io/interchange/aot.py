@@ -1,4 +1,7 @@
-"""Calibrations and loop telemetry in the AOT standard (Gomes et al. 2024), written and read through ``aotpy``."""
+"""Calibrations and loop telemetry in the AOT standard (Gomes et al.
+
+2024), written and read through ``aotpy``.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ from escape_hw.io.storage import make_folder, storage_error, write_atomic
 
 
 def number_mask(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """The mask as the standard has it: the number of each valid sub-aperture, -1 elsewhere."""
+    """The mask in AOT form: the number of each valid sub-aperture, -1 elsewhere."""
     mask = np.full(valid.shape, -1, np.int32)
     mask[valid] = np.arange(int(valid.sum()))
     return mask
@@ -99,7 +102,7 @@ def build_lenslet_grid(
     corners, size
         As :func:`mask_corners` and :func:`subaperture_size_px` give them.
     facts
-        Metadata of the mask; a file that we did not write has none of ours.
+        Metadata of the mask, written by ESCAPE only.
     """
     x, y = corners[0] if corners else (0.0, 0.0)
     half = (size - 1) / 2
@@ -159,7 +162,7 @@ SENSOR, MIRROR, LOOP, ERRORS, SOURCE = "WFS", "DM", "LOOP", "STANDARD ERRORS", "
 
 @dataclass(frozen=True, slots=True)
 class AotSystem:
-    """What the standard wants to know of the system besides its calibration.
+    """Properties of the system that AOT stores besides its calibration.
 
     Parameters
     ----------
@@ -192,7 +195,7 @@ def write_aot(
     """Write one AOT file.
 
     Measurements and commands are the telemetry's, where there is any; commands and modes are converted to
-    metres of surface, as the standard has it. The matrix stands as ``modes_to_measurements``, its standard
+    metres of surface, as AOT defines it. The matrix is stored as ``modes_to_measurements``, its standard
     errors as that of a second loop of the same parts.
 
     Parameters
@@ -377,7 +380,7 @@ def _to_cube(rows: Any) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AotContent:
-    """What an AOT file says of one loop.
+    """Contents of an AOT file for one loop.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ def import_optional(name: str, purpose: str) -> Any:
     Raises
     ------
     ConfigError
-        It is not installed, or cannot be imported.
+        The package is not installed or cannot be imported.
     """
     try:
         return importlib.import_module(name)

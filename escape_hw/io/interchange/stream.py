@@ -10,16 +10,16 @@ from numpy.typing import DTypeLike, NDArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Publication:
-    """One array as it stood in a stream.
+    """One array of a stream.
 
     Parameters
     ----------
     data
-        A copy; of whichever shape and type the stream has.
+        A copy with the stream's shape and type.
     count
         Number of the write, which rises by one with each.
     written_ns
-        When it was written, Unix time in nanoseconds; 0 where the stream does not tell.
+        When it was written, Unix time in nanoseconds; 0 if the stream does not record it.
     """
 
     data: NDArray[Any]
@@ -93,4 +93,4 @@ class Stream(Protocol):
 
 
 class StreamReadError(Exception):
-    """A stream's newest array cannot be read whole."""
+    """A stream's newest array cannot be read without tearing."""

@@ -36,7 +36,7 @@ _COMPRESSION, _COMPRESSION_VIGNETTED = 1.0, 0.25
 #: fourth.
 _FIRST_HARMONIC = 1.4
 #: What the shadow errs by beyond its scatter over time, for light is uneven on its scale too, and what rim
-#: and shadow together do, in pixels (docs/decisions/0018-pyramids-in-truth.md).
+#: and shadow together do, in pixels (docs/decisions/0018-pyramid-registration-uncertainties.md).
 _SHADOW_SIGMA_PX, _COMMON_SIGMA_PX = 0.02, 0.018
 
 

@@ -1,1 +1,4 @@
-"""Matplotlib figures, one module per subject. They take results or JSON documents and return figures; they write no files."""
+"""Matplotlib figures, one module per subject.
+
+They take results or JSON documents and return figures; they write no files.
+"""

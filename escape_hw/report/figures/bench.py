@@ -1,4 +1,7 @@
-"""Figures of the bench: PSFs, mirror command, sensor frame with its geometry, residual wavefront, temporal response, gain scan."""
+"""Figures of the bench.
+
+PSFs, mirror command, sensor frame with its geometry, residual wavefront, temporal response, gain scan.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ def draw_geometry(grid: SensorGeometry, axes: Axes) -> str:
     str
         A few words on it, for the title.
     """
-    raise TypeError(f"there is no drawing of a sensor of kind '{grid.kind}'")
+    raise TypeError(f"no drawing for a sensor of kind '{grid.kind}'")
 
 
 @draw_geometry.register
@@ -85,7 +88,7 @@ def draw_psfs(
 ) -> None:
     """Draw the PSFs into a figure or a part of one.
 
-    All images have the model's flux, for a computed one knows nothing of the star's. Logarithmic
+    All images are scaled to the model's flux. Logarithmic
     stretch relative to the model's maximum, backgrounds taken out; the three Strehl ratios stand
     below each in the paper's order: peak, optical transfer function, encircled energy.
 
@@ -173,7 +176,7 @@ def _subtract_background(image: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _scale_to_flux(image: NDArray[np.float64], flux: float) -> NDArray[np.float64]:
-    """The image scaled to a flux; one without light stays as it is."""
+    """The image scaled to a flux; an image without light is returned unchanged."""
     own = float(image.sum())
     return image * (flux / own) if own > 0 else image
 
@@ -207,7 +210,7 @@ def mirror_on_grid(
 def mirror_without_grid(
     command: NDArray[np.float64], places_m: NDArray[np.float64], title: str = "mirror command"
 ) -> Figure:
-    """A mirror command where the actuators stand, in percent of full stroke.
+    """A mirror command at the actuators' positions, in percent of full stroke.
 
     Parameters
     ----------

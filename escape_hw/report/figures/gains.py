@@ -53,7 +53,7 @@ def _draw_gains(axes: Axes, gains: OpticalGains, label: str, colour: str) -> obj
 
 
 def bootstrap(result: GainsResult) -> Figure:
-    """How closure and rounds went: effective gain and residual of each, and the change of the gains."""
+    """Effective gain and residual of each closure and round, and the change of the gains."""
     figure = style.new_figure(7.8, 4.6)
     top, bottom = figure.subplots(2, 1)
     steps = result.closure

@@ -20,7 +20,7 @@ _SHORT_UNITS = {"% of Sub Aperture": "% sub-ap.", "deg": "deg", "% of Diameter":
 def convergence(estimate: RegistrationEstimate, planted: Registration | None = None) -> Figure:
     """Step norm above, the five parameters below, per iteration (paper: SPRINT convergence figure).
 
-    The band is the final standard error around the final value, the dotted line a planted truth.
+    The band is the final standard error around the final value, the dotted line the injected value.
     """
     steps = estimate.iterations
     number = np.arange(1, len(steps) + 1)
@@ -92,7 +92,7 @@ def error_curves(curves: Mapping[str, Any]) -> Figure:
             panel.axhline(curves["goal"][name], color=style.MUTED, lw=1.0, ls=":", label="goal")
         style.style_axes(panel).set_title(title, fontsize=9.5)
         panel.set(xlabel="frames", ylabel=f"rms error [{_SHORT_UNITS[unit]}]")
-        # The frames themselves, few enough to be read: powers of ten tell little over one decade.
+        # Plain numbers of frames: powers of ten are not useful over one decade.
         labelled = frames[:: -(-frames.size // 5)]
         panel.xaxis.set_major_locator(FixedLocator(list(labelled)))
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))

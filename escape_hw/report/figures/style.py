@@ -1,4 +1,4 @@
-"""One look for all figures; SVG that follows the page's light or dark colours."""
+"""Common style of all figures; SVG that follows the page's light or dark colours."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def colormap(name: str) -> Colormap:
 
 
 def style_axes(axes: Axes, *, grid: bool = True) -> Axes:
-    """Give axes with scales the common look."""
+    """Apply the common style to axes with scales."""
     axes.set_facecolor("none")
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
@@ -94,7 +94,7 @@ def colour_bar(
     label: str,
     shrink: float = 1.0,
 ) -> None:
-    """A slim colour bar beside the axes it belongs to."""
+    """A slim colour bar next to its axes."""
     bar = figure.colorbar(
         ScalarMappable(Normalize(*limits), colormap(name)),
         ax=list(axes),
@@ -116,7 +116,7 @@ def png(figure: Figure, dpi: int = 150) -> bytes:
 
 
 def svg(figure: Figure, key: str) -> str:
-    """The figure as an SVG element to stand inside a page.
+    """The figure as an SVG element for an HTML page.
 
     Its neutral colours become the page's CSS variables, and its ids carry ``key`` so that several
     figures can share a page.

@@ -48,7 +48,7 @@ def track_figure(
         panels[1].plot(t, planted["rotation"], ":", color=style.INK, lw=1.2)
     style.style_axes(panels[1]).set_title("rotation [deg]", fontsize=9.5)
     _draw_with_error(panels[2], t, columns["optical_gain"], columns["optical_gain_sigma"], style.SERIES[0])
-    style.style_axes(panels[2]).set_title("mean optical gain beside the first matrix", fontsize=9.5)
+    style.style_axes(panels[2]).set_title("mean optical gain relative to the first matrix", fontsize=9.5)
     known = np.isfinite(columns["strehl"])
     if known.any():
         _draw_with_error(

@@ -44,7 +44,7 @@ _OUTER_SCALE = 4.0
 #: Turbulence weaker than this many r0 across the pupil leaves the response what it is at rest.
 _NEGLIGIBLE_STRENGTH = 0.5
 #: What scalings may err by in common on a pyramid under turbulence and pokes, in % of the diameter: what the
-#: mean over some twenty twins can hide (docs/decisions/0018-pyramids-in-truth.md, "Scalings that leaned").
+#: mean over some twenty twins can hide (docs/decisions/0018-pyramid-registration-uncertainties.md, "Scalings that leaned").
 _SCALING_SYSTEMATIC = 0.05
 #: Slopes at the rim may answer so much more or less than the model's (found: 0.2 to 0.3): pixels saturate
 #: when pokes gather the light, and what the pokes do at the rim is only nearly known.

@@ -20,7 +20,7 @@ from numpy.typing import DTypeLike
 #: Version written into streams that are made here; readers of another version refuse them.
 VERSION = "2.00"
 SEMAPHORES = 10
-#: A semaphore that nobody waits for does not count beyond this.
+#: Maximum count of a semaphore without a waiting reader.
 SEMAPHORE_MAX = 10
 SEMAPHORE_BYTES = 32
 
@@ -28,11 +28,11 @@ _FOLDERS = ("/milk/shm", "/tmp")
 _SUFFIX = ".im.shm"
 _NAME_BYTES = 80
 _PROCESS_TRACES, _KEYWORD_BYTES, _RING_ENTRY_BYTES = 10, 128, 48
-#: A record of what triggered a writer, and where in it the semaphore's number stands (-1: none).
+#: A record of what triggered a writer, and the offset of the semaphore's number in it (-1: none).
 TRACE_BYTES, TRACE_SEMAPHORE = 64, 48
 #: Time stamp and counter of one slice of a circular buffer.
 STAMP_BYTES, COUNT_BYTES = 16, 8
-#: Bits of ``imagetype``: slices follow each other in time, and each has time stamps of its own.
+#: Bits of ``imagetype``: slices are consecutive in time and have their own time stamps.
 _CIRCULAR, _CIRCULAR_MASK, _STAMPED, _STAMPED_MASK = 0x1, 0xF, 0x20001, 0xF000F
 #: Data types by their code.
 DTYPES: dict[int, np.dtype[np.generic]] = {
@@ -164,7 +164,7 @@ def detect_sections(head: Metadata, file_bytes: int) -> Sections | None:
 
 
 def build_metadata(name: str, shape: tuple[int, ...], dtype: DTypeLike, version: str) -> Metadata:
-    """Metadata of a new stream, apart from what only its file can tell.
+    """Metadata of a new stream, without the parts that depend on its file.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def build_metadata(name: str, shape: tuple[int, ...], dtype: DTypeLike, version:
     if not 1 <= len(shape) <= 3 or min(shape) < 1:
         raise ValueError(f"milk has no images of shape {shape}; one to three axes, none of them empty")
     if not name or "/" in name or len(name.encode()) >= _NAME_BYTES:
-        raise ValueError(f"{name!r} is no name of a stream: no '/', fewer than {_NAME_BYTES} bytes")
+        raise ValueError(f"{name!r} is not a valid stream name: no '/', fewer than {_NAME_BYTES} bytes")
     head = Metadata(name=name.encode(), naxis=len(shape), nelement=math.prod(shape), datatype=codes[0])
     for axis, length in enumerate(reversed(shape)):
         head.size[axis] = length

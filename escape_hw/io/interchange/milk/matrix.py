@@ -20,7 +20,7 @@ def calibration_images(
     result
         The calibration.
     layout
-        Map of the actuators; ``None`` where they do not stand on a grid.
+        Map of the actuators; ``None`` where they are not on a grid.
 
     Returns
     -------

@@ -17,7 +17,7 @@ from escape_hw.io.interchange.milk import layout
 from escape_hw.io.interchange.stream import Publication, StreamReadError
 from escape_hw.io.storage import storage_error
 
-#: Longest wait on a semaphore before the counter is looked at again: not every writer posts.
+#: Maximum wait on a semaphore before the counter is read again: not every writer posts.
 _WAIT_SLICE_S = 0.05
 #: Bytes that a semaphore must be aligned to, or the kernel refuses to wait on it.
 _ALIGNMENT = 4
@@ -25,7 +25,7 @@ _FREE = -1
 
 
 class Semaphores:
-    """The semaphores of an image, and who waits for them.
+    """The semaphores of an image.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Semaphores:
         self._readers[:] = self._writers[:] = _FREE
 
     def post(self) -> None:
-        """Wake whoever waits."""
+        """Wake the waiting readers."""
         self._writers[:] = os.getpid()
         if not self._is_aligned:
             return
@@ -67,9 +67,9 @@ class Semaphores:
                 self._c_library.sem_post(at)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait for a post, for a while at most; false at once where there is no semaphore to wait on.
+        """Wait for a post up to a time limit; returns false at once without a semaphore.
 
-        The first call only claims a semaphore: what was posted before does not count, so look again.
+        The first call only claims a semaphore and ignores earlier posts: read the counter afterwards.
         """
         if self._own_index is None:
             self._own_index = self._reserve()
@@ -86,7 +86,7 @@ class Semaphores:
             self._own_index = None
 
     def _reserve(self) -> int | None:
-        """A semaphore that nobody waits for, marked as this process's, and emptied."""
+        """A free semaphore, claimed for this process and emptied."""
         for k, pid in enumerate(self._readers if self._is_aligned else ()):
             if not _process_exists(int(pid)):
                 self._readers[k] = os.getpid()
@@ -109,12 +109,12 @@ def _process_exists(pid: int) -> bool:
 
 
 def _c_library() -> Any:
-    """The C library of this process, whose semaphores milk uses, too."""
+    """The C library of this process; milk uses its semaphores."""
     return ctypes.CDLL(None, use_errno=True)
 
 
 class Slices:
-    """Where the newest array of an image lies, and where the next one goes.
+    """Offsets of the newest array of an image and of the next one.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class Slices:
         return newest
 
     def put(self, data: NDArray[Any]) -> None:
-        """Write an array; readers see it once the metadata say so."""
+        """Write an array; readers see it when the metadata are updated."""
         head = self._head
         self._data[self._next()] = data
         if head.ring_size:
@@ -183,9 +183,9 @@ class Slices:
         return (self._head.cnt1 + 1) % self._n_slices if self._circular else 0
 
 
-#: Seconds between looks at the counter where no semaphore is free, and before a torn read is given up.
+#: Seconds between reads of the counter without a free semaphore, and before a torn read is an error.
 _POLL_S, _TORN_READ_TIMEOUT_S = 5e-5, 1.0
-#: milk makes its images readable and writable for everybody, whatever the umask.
+#: milk makes its images readable and writable for all users, independent of the umask.
 _MODE = 0o666
 
 
@@ -221,13 +221,13 @@ class MilkStream:
         Raises
         ------
         ProductError
-            There is none of that name, or it is laid out in a way that is not known here.
+            No image has that name, or its layout is unknown.
         """
         path = layout.shm_path(name)
         try:
             with path.open("r+b") as file:
                 if os.fstat(file.fileno()).st_size < layout.HEADER_BYTES:
-                    raise ProductError(f"{path}: too short for an image of milk's")
+                    raise ProductError(f"{path}: too short for a milk image")
                 memory = mmap.mmap(file.fileno(), 0)
         except OSError as error:
             way = "is MILK_SHM_DIR set as for milk?" if isinstance(error, FileNotFoundError) else "see ls -l"
@@ -242,27 +242,27 @@ class MilkStream:
     def create(
         cls, name: str, shape: tuple[int, ...], dtype: DTypeLike, *, version: str = layout.VERSION
     ) -> MilkStream:
-        """Make an image, in place of one of that name; whoever holds that keeps its old file.
+        """Create an image and replace one of that name; processes that have opened the old one keep it.
 
-        Everybody may write to it, as to those that milk makes.
+        All users may write to it, as to images made by milk.
 
         Parameters
         ----------
         name, shape, dtype
             See :func:`~escape_hw.io.interchange.milk.layout.build_metadata`.
         version
-            Version that the metadata claim. milk opens no image whose version is not its own.
+            Version in the metadata. milk opens only images of its own version.
 
         Raises
         ------
         ValueError
             milk has no such image.
         StorageError
-            The file cannot be made.
+            The file cannot be created.
         """
         head = layout.build_metadata(name, shape, dtype, version)
         sections, path = layout.compute_sections(head, 8), layout.shm_path(name)
-        # Nobody sees it before it is whole.
+        # The image gets its name only when it is complete.
         temporary = path.with_name(f"{path.name}.{os.getpid()}")
         try:
             temporary.unlink(missing_ok=True)
@@ -345,7 +345,7 @@ class MilkStream:
         self._memory.close()
 
     def unlink(self) -> None:
-        """Remove the image for everybody who has not opened it yet."""
+        """Remove the image; processes that have opened it keep it."""
         layout.shm_path(self.name).unlink(missing_ok=True)
 
 

@@ -1,4 +1,7 @@
-"""Import of a calibration through pyRTC's configuration, and export of an interaction matrix with the settings that pyRTC needs."""
+"""Import of a calibration through pyRTC's configuration.
+
+And export of an interaction matrix with the settings that pyRTC needs.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,7 @@ class TargetSystem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PyrtcConfig:
-    """The sections of a configuration of pyRTC's that say what its calibration means.
+    """The sections of a pyRTC configuration that define its calibration.
 
     Keys are those of 2.x; pyRTC 1.x wrote the same words in one (``subApSpacing``), and gave the centres of
     pupils by row and column.
@@ -162,14 +165,14 @@ class _CalibrationFiles:
         return cls(*files, frame)
 
     def mask_or_default(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """The mask; everything where no file says."""
+        """The mask; all sub-apertures if no file gives one."""
         if self.mask is None:
             return np.ones(shape, bool)
         mask = np.asarray(self.mask.data, bool)
         return self.frame.map(mask) if self.mask.legacy else mask
 
     def references_or_default(self, shape: tuple[int, int]) -> NDArray[np.float32]:
-        """The reference slopes; zeros where no file says."""
+        """The reference slopes; zeros if no file gives them."""
         if self.references is None:
             return np.zeros(shape, np.float32)
         data = np.asarray(self.references.data, np.float32)
@@ -223,7 +226,8 @@ def import_matrix(
     ProductError
         A file is missing or damaged.
     IncompatibleProduct
-        The parts do not fit each other or the system, or files are old and nobody said how they were made.
+        The parts do not fit each other or the system, or files of pyRTC 1.x lack the description of how they
+        were made.
     """
     files = _CalibrationFiles.read(config, im, frame_order)
     file, record = files.matrix, files.matrix.record or {}
@@ -233,7 +237,8 @@ def import_matrix(
     if sigma.shape != file.data.shape:
         raise ProductError(f"{file.path}: standard errors of shape {sigma.shape} for {file.data.shape}")
     matrix = InteractionMatrix(
-        data.astype(np.float32), sigma[sensor.rows].astype(np.float32), _read_modes(config, target, data.shape[1]),
+        data.astype(np.float32), sigma[sensor.rows].astype(np.float32),
+        _read_modes(config, target, data.shape[1]),
         sensor.grid.valid, target.system, str(record.get("method", "pyrtc")),
         target.simulated or bool(record.get("simulated", False)),
         {"pyrtc_version": str(record.get("pyrtc_version", "1.x" if file.legacy else "2.x"))},
@@ -241,7 +246,7 @@ def import_matrix(
     )  # fmt: skip
     notes = [f"read from pyRTC's {file.path.name}", *sensor.notes]
     if "sigma" not in file.extra_arrays:
-        notes.append("it tells no standard errors; errors of a registration found from it rest on equal ones")
+        notes.append("it has no standard errors; uncertainties of a registration assume equal ones")
     return CalibrationResult(matrix, sensor.grid, int(record.get("frames") or 0), 0, 0.0, notes=tuple(notes))
 
 
@@ -302,7 +307,7 @@ def _read_modes(config: PyrtcConfig, target: TargetSystem, n_modes: int) -> NDAr
     path = config.file(config.wfc, "m2c_file")
     if path is None and config.wfc.get("basis"):
         raise IncompatibleProduct(
-            f"{config.path}: wfc.basis asks pyRTC to compute its modes; save them there "
+            f"{config.path}: wfc.basis lets pyRTC compute its modes; save them there "
             "(numpy.save('m2c.npy', wfc.M2C)) and name the file in wfc.m2c_file"
         )
     if path is None:
@@ -321,13 +326,13 @@ def _read_modes(config: PyrtcConfig, target: TargetSystem, n_modes: int) -> NDAr
 
 SETTINGS_FILE = "pyrtc.yaml"
 _FILE_NAMES = {"im": "im.npz", "valid": "valid_sub_aps.npz", "references": "ref_slopes.npz", "m2c": "m2c.npy"}
-#: Largest part of a wanted mode, relative to it, that a matrix may fail to span.
+#: Maximum relative part of a requested mode outside of the span of the matrix's modes.
 _MAX_RESIDUAL = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSettings:
-    """What pyRTC needs to know of the camera besides the geometry.
+    """Camera properties that pyRTC needs besides the geometry.
 
     Parameters
     ----------
@@ -342,29 +347,30 @@ class FrameSettings:
 
 
 def convert_basis(matrix: InteractionMatrix, m2c: NDArray[np.float64]) -> InteractionMatrix:
-    """The same matrix for other modes, which lie in the span of its own.
+    """The matrix for other modes in the span of its own.
 
     Parameters
     ----------
     matrix
         ``D`` for the modes ``M``.
     m2c
-        Wanted modes ``M' (n_act, n)``: the result is ``D M^+ M'``.
+        Requested modes ``M' (n_act, n)``: the result is ``D M^+ M'``.
 
     Raises
     ------
     IncompatibleProduct
-        A wanted mode is no sum of the matrix's own.
+        A requested mode is not a linear combination of the matrix's modes.
     """
     if m2c.shape[0] != matrix.m2c.shape[0]:
         raise IncompatibleProduct(
-            f"the wanted modes move {m2c.shape[0]} actuators, the matrix {matrix.m2c.shape[0]}"
+            f"the requested modes have {m2c.shape[0]} actuators, the matrix {matrix.m2c.shape[0]}"
         )
     transform = np.linalg.lstsq(matrix.m2c, m2c, rcond=None)[0]
     outside = np.linalg.norm(matrix.m2c @ transform - m2c, axis=0) / np.linalg.norm(m2c, axis=0)
     if outside.max(initial=0.0) > _MAX_RESIDUAL:
         raise IncompatibleProduct(
-            f"mode {int(outside.argmax())} of those wanted is no sum of the matrix's {matrix.n_modes} modes "
+            f"mode {int(outside.argmax())} of those requested is not a linear combination of the "
+            f"matrix's {matrix.n_modes} modes "
             f"({outside.max():.2g} of it is left over); calibrate with basis.n_modes={m2c.shape[0]}, or take "
             "the matrix's own modes"
         )
@@ -400,7 +406,7 @@ def export_matrix(
     Raises
     ------
     IncompatibleProduct
-        pyRTC cannot read a sensor like this, or the modes are not the matrix's.
+        pyRTC cannot read a sensor like this, or the modes differ from the matrix's.
     StorageError
         A file cannot be written.
     """
@@ -460,7 +466,7 @@ def _sensor_parts(
 
 
 def _record(result: CalibrationResult, matrix: InteractionMatrix) -> dict[str, Any]:
-    """What a reader may want to know of the matrix."""
+    """Description of the matrix for readers of the file."""
     return {
         "system": matrix.system,
         "method": matrix.method,

@@ -1,4 +1,7 @@
-"""Calibration files of pyRTC: format 2 read and written, arrays of pyRTC 1.x read and converted to the conventions of 2.x."""
+"""Calibration files of pyRTC.
+
+Format 2 read and written, arrays of pyRTC 1.x read and converted to the conventions of 2.x.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ _RECORD, _DATA = "pyrtc_calibration", "data"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PyrtcFile:
-    """An array of pyRTC's and what its file says of it.
+    """An array of pyRTC with the metadata of its file.
 
     Parameters
     ----------
@@ -59,7 +62,7 @@ def read_file(path: Path | str, kind: str | None = None) -> PyrtcFile:
     path
         The file; its ending does not matter.
     kind
-        What it must be where it says so: :data:`MATRIX`, :data:`VALID` or :data:`REFERENCES`.
+        Expected kind, checked where the file gives one: :data:`MATRIX`, :data:`VALID` or :data:`REFERENCES`.
 
     Raises
     ------
@@ -130,7 +133,7 @@ def write_file(
     Raises
     ------
     StorageError
-        It cannot be written.
+        The file cannot be written.
     """
     full_record = {
         "format": FORMAT,
@@ -156,7 +159,7 @@ def write_array(path: Path, data: NDArray[Any]) -> Path:
     Raises
     ------
     StorageError
-        It cannot be written.
+        The file cannot be written.
     """
     buffer = io.BytesIO()
     np.save(buffer, np.asarray(data), allow_pickle=False)
@@ -180,12 +183,12 @@ class LegacyConvention:
     window
         Pixels across a lenslet's window; 0 for a pyramid.
     default_pupils
-        The pupil images stood where pyRTC puts them by itself. Transposing exchanges two of them.
+        The pupil images were at pyRTC's default places. Transposing exchanges two of them.
 
     Raises
     ------
     ConfigError
-        There is no such way.
+        The name is unknown.
     """
 
     frame_order: str
@@ -236,11 +239,11 @@ def require_frame_order(file: PyrtcFile, frame_order: str | None) -> str:
     Raises
     ------
     IncompatibleProduct
-        Nobody said.
+        The description is missing.
     """
     if frame_order is None:
         raise IncompatibleProduct(
-            f"{file.path}: a file of pyRTC 1.x, which does not say how its frames lay; say it with "
+            f"{file.path}: a file of pyRTC 1.x without the orientation of its frames; give it with "
             "--legacy yx (frames as the camera gave them), xy (transposed by pyRTC's camera adapter) or "
             "as_is (already as 2.x has it)"
         )
@@ -248,7 +251,7 @@ def require_frame_order(file: PyrtcFile, frame_order: str | None) -> str:
 
 
 def slope_positions(valid: NDArray[np.bool_], pyramid: bool) -> NDArray[np.intp]:
-    """Where the slopes of a signal stand in pyRTC's map, rows and columns ``(2, n_slopes)``.
+    """Positions of a signal's slopes in pyRTC's map, rows and columns ``(2, n_slopes)``.
 
     All x come first, each row by row: a Shack-Hartmann map has y below, a pyramid's beside.
     """

@@ -1,4 +1,7 @@
-"""Sensor geometry of pyRTC (Shack-Hartmann windows, pyramid pupil images) and its conversion from and to ours."""
+"""Sensor geometry of pyRTC (Shack-Hartmann windows.
+
+Pyramid pupil images) and its conversion from and to ours.
+"""
 
 from __future__ import annotations
 
@@ -88,7 +91,8 @@ class PyrtcLenslets:
         windows = cls(grid.pitch_px, 0, 0, shape)
         if max(rows.max(initial=0), columns.max(initial=0)) >= windows.n:
             raise IncompatibleProduct(
-                f"pyRTC reads {windows.n} x {windows.n} sub-apertures of {windows.window} pixels on a frame of "
+                f"pyRTC reads {windows.n} x {windows.n} sub-apertures of {windows.window} pixels "
+                f"on a frame of "
                 f"{shape[1]} x {shape[0]}; valid ones lie beyond"
             )
         at_x, at_y = windows.centres()
@@ -143,7 +147,7 @@ class PyrtcLenslets:
         rows : ndarray
             Which rows of pyRTC's signal belong to its slopes, in order.
         note : str or None
-            What is not certain about where the pupil lies.
+            Ambiguities of the pupil's position.
 
         Raises
         ------
@@ -168,7 +172,8 @@ class PyrtcLenslets:
         own = (spots - bare.centres_px()).astype(np.float32)
         grid = SubApertureGrid(self.spacing, origin, valid, own, flux)
         note = (
-            "the mask does not tell on which side of the pupil a row of dark sub-apertures lies; shifts of "
+            "the mask does not determine on which side of the pupil a row of dark sub-apertures "
+            "is; shifts of "
             "the registration may be off by half a sub-aperture"
         )
         return grid, np.arange(2 * len(rows)), note if ambiguous else None
@@ -193,7 +198,7 @@ class PyrtcLenslets:
 
 
 def _centre_box(valid: NDArray[np.bool_], n_sub: int) -> tuple[tuple[int, int], bool]:
-    """Row and column where a box of n_sub lies centred on a mask, and whether that is undecided."""
+    """Row and column of a box of n_sub centred on a mask, and whether they are ambiguous."""
     corner, ambiguous = [], False
     for axis in (1, 0):
         lit = np.flatnonzero(valid.any(axis=axis))
@@ -308,7 +313,7 @@ class PyrtcPupils:
         Raises
         ------
         IncompatibleProduct
-            The images do not stand two by two, or do not fit the design.
+            The images are not arranged two by two, or do not fit the design.
         """
         if references.shape != (self.n, 2 * self.n):
             raise IncompatibleProduct(
@@ -348,7 +353,7 @@ def _image_order(centres: Sequence[tuple[int, int]]) -> tuple[int, ...]:
     right, lower = (places > places.mean(axis=0)).T
     numbers = (2 * lower + right).astype(int)
     if sorted(numbers) != [0, 1, 2, 3]:
-        raise IncompatibleProduct(f"pyRTC's pupils {list(centres)} do not stand two by two")
+        raise IncompatibleProduct(f"pyRTC's pupils {list(centres)} are not arranged two by two")
     return tuple(int(k) for k in np.argsort(numbers))
 
 

@@ -36,7 +36,7 @@ class ShmemStream:
         ConfigError
             ``pyshmem`` is not installed.
         ProductError
-            There is no such stream, or it cannot be read by this version.
+            The stream does not exist or cannot be read by this version.
         """
         pyshmem = import_optional("pyshmem", "Reading pyRTC's streams")
         try:
