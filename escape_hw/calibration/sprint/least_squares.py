@@ -269,7 +269,7 @@ class DiagonalProblem:
         return fit
 
 
-def _is_negligible(step: NDArray[np.float64], sigma: NDArray[np.float64]) -> bool:
+def _is_negligible(step: NDArray[np.floating], sigma: NDArray[np.float64]) -> bool:
     return bool((np.abs(step) < np.maximum(NEGLIGIBLE_STEP, 0.02 * sigma)).all())
 
 

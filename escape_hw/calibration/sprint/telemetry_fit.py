@@ -244,7 +244,7 @@ class _WhitenedFrames:
         """Sufficient statistics of the frames as a matrix whose columns have equal, independent noise.
 
         In closed loop the pokes are the instruments of the commands, and the contribution of the
-        controller, predicted with ``matrix``, is subtracted first (:mod:`~.forgetting_sums`).
+        controller, predicted with ``matrix``, is subtracted first (:mod:`~escape_hw.calibration.docrime.forgetting_sums`).
         """
         delayed_commands, poked = self.delayed_commands(response), np.tensordot(response, self.pokes, axes=1)
         gram, cross = poked.T @ poked, self.slopes.T @ poked

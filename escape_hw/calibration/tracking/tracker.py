@@ -357,7 +357,7 @@ def build_row(
     ``gains (n_modes,)`` are relative to the matrix at the start; ``residual (n,)`` is that of the frames
     since the last row, in nm.
     """
-    live, parameters = update.live, update.live.registration.measured()
+    live, parameters = update.live, update.live.registration.parameters()
     return {
         "seconds": update.seconds,
         **{name: one.value for name, one in parameters.items()},
