@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,6 +13,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
 from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.deprecation import renamed_text, warn_renamed
 
 #: Width of the broad pedestal of the influence functions, relative to their own width.
 PEDESTAL = 1.7
@@ -131,11 +131,7 @@ class RegistrationEstimate:
 
     def measured(self) -> dict[str, Estimate]:
         """Former name of :meth:`parameters`, until version 0.3.0."""
-        warnings.warn(
-            "RegistrationEstimate.measured() is called parameters() since version 0.2.0",
-            DeprecationWarning,
-            stacklevel=2,
-        )
+        warn_renamed(renamed_text("RegistrationEstimate.measured()", "parameters()"))
         return self.parameters()
 
     def __repr__(self) -> str:

@@ -1,4 +1,7 @@
-"""The command line `escape`. Commands parse options, run a procedure or query, and print; the work itself is in escape_hw.runtime."""
+"""The command line `escape`.
+
+Commands parse options, run a procedure or query, and print; the work itself is in escape_hw.runtime.
+"""
 
 from __future__ import annotations
 

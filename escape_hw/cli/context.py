@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ import typer
 from rich.console import Console, RenderableType
 
 from escape_hw.api.concurrency import SignalSafeFlag
+from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError
 
 if TYPE_CHECKING:
@@ -356,13 +358,32 @@ class CommandContext:
 
 
 @contextmanager
+def _deprecations_as_lines(notify: Callable[[str], None]) -> Iterator[None]:
+    """Report each old name that is used as one line, instead of as a Python warning."""
+    reported: set[str] = set()
+    show_others = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if not issubclass(category, RenamedWarning):
+            show_others(message, category, *where, **more)
+        elif str(message) not in reported:
+            reported.add(str(message))
+            notify(f"deprecated: {message}")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RenamedWarning)
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
 def command_context(command: str, *, json: bool = False, quiet: bool = False) -> Iterator[CommandContext]:
     """A command's body; turns every ending into an exit code and at most one document.
 
     Whatever libraries print on standard output goes to standard error meanwhile.
     """
     context = CommandContext(command, json, quiet)
-    with context.interrupts:
+    with context.interrupts, _deprecations_as_lines(context.notify):
         try:
             with contextlib.redirect_stdout(sys.stderr):
                 yield context

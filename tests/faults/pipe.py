@@ -53,7 +53,10 @@ class Peers:
         make = ControllerSettings(serial="SIMMOD", zeroed=zeroed, auto_zero_s=2.0)
         self.controller = E727Controller(make, lambda: HURRY * time.monotonic())
         self.wire = FaultInjector(faults)
-        overrides = [f'devices.modulator.stage.correct="{correct}"', "devices.modulator.stage.settle_s=0.5"]
+        overrides = [
+            f'devices.modulator.stage.correction_source="{correct}"',
+            "devices.modulator.stage.settle_s=0.5",
+        ]
         overrides.append(f"devices.modulator.wire.timeout_s={TIMEOUT_S}")
         section = load_system("razor-pywfs", overrides=overrides).devices.modulator
         assert section is not None

@@ -45,7 +45,7 @@ def test_a_note_states_whether_the_accuracy_was_reached(loop, accuracy, text):
 def test_the_former_keywords_warn(good, tmp_path):
     with (
         small() as bench,
-        pytest.warns(DeprecationWarning, match=r"escape\(\): keep= is called checkpoint="),
+        pytest.warns(DeprecationWarning, match=r"escape\(keep=\) is called escape\(checkpoint=\)"),
         pytest.raises(ConfigError, match="cannot be resumed"),
     ):
         bench.run(escape(bench, frames=FRAMES, keep=Checkpoint(tmp_path / "state.fits")))

@@ -46,7 +46,9 @@ OFFERS = (
                 name="frames", kind="int", default=1000, unit="frame", low=1, high=1e6, help="How many."
             ),
             ProcedureParameter(name="snr", kind="float", low=0.01, help="Goal."),
-            ProcedureParameter(name="pokes", kind="choice", default="white", choices=("white", "shaped")),
+            ProcedureParameter(
+                name="pokes", kind="choice", default="white", choices=("white", "anticorrelated")
+            ),
             ProcedureParameter(name="plain", kind="bool", default=False),
             ProcedureParameter(name="closed_loop", kind="matrix"),
         ),
@@ -263,9 +265,9 @@ def test_from_the_form_to_the_start(calibrate, source, control):
     assert [panel.choice.itemText(k) for k in range(panel.choice.count())] == ["ESCAPE", "Optical gains"]
     assert not panel.start.isEnabled()
     panel.form.set_value("frames", "200")
-    panel.form.set_value("pokes", "shaped")
+    panel.form.set_value("pokes", "anticorrelated")
     until(panel.start.isEnabled, calibrate)
-    arguments = {"frames": 200, "pokes": "shaped"}
+    arguments = {"frames": 200, "pokes": "anticorrelated"}
     assert ("check", {"procedure": "escape", "arguments": arguments}) in control.asked
     assert "frames" in panel.plan.text()
     assert "% of the stroke" in panel.plan.text()

@@ -50,7 +50,7 @@ def advances(bench: Connection, frames: int) -> None:
 def test_the_loop_does_not_notice_a_window_that_dies(number: int, tmp_path: Path) -> None:
     small = tmp_path / "small.toml"
     small.write_text(configuration().to_toml())
-    with serving(small, "--set", "server.silent_s=60", folder=tmp_path) as served:
+    with serving(small, "--set", "server.engine_silence_s=60", folder=tmp_path) as served:
         bench = served.connect(control=True)
         windows: list[subprocess.Popen[bytes]] = []
         try:

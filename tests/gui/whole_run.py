@@ -111,7 +111,7 @@ class Operator:
 def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Operator]:
     """A server of a system, and the window as the command makes it."""
     # On a busy machine frames come late, and that is not what is tried here.
-    patient = ("--set", "server.silent_s=120", "--set", "server.no_frames_s=60")
+    patient = ("--set", "server.engine_silence_s=120", "--set", "server.no_frames_s=60")
     with serving.serving(system, "--quiet", *patient, folder=folder) as served:
         os.environ["XDG_RUNTIME_DIR"] = served.environment["XDG_RUNTIME_DIR"]
         session = Session()

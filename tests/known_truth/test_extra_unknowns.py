@@ -147,7 +147,7 @@ def test_on_the_twin_a_injected_shear_is_found_and_told():
     for seed in (1, 2, 3):
         leaning = Registration(-16.0, -71.0, -0.77, 2.9, 0.0).with_shear(SHEAR)
         injected = [f"twin.registration.{name}={value!r}" for name, value in leaning.to_dict().items()]
-        config = small_lenslets(*injected, 'calibration.also=["anamorphosis"]', seed=seed)
+        config = small_lenslets(*injected, 'calibration.extra_parameters=["anamorphosis"]', seed=seed)
         with System.from_config(config) as bench:
             found = bench.calibrate(frames=400).registration
         shear = found.extras["anamorphosis"]
@@ -162,6 +162,6 @@ def test_what_a_model_or_solver_does_not_know_is_refused():
     matrix = noisy(model.zonal_matrix(Registration()), model, 0)
     with pytest.raises(ConfigError, match="has no shift of the pupil"):
         sprint(matrix, model, extra_parameters=("pupil_shift",))
-    with pytest.raises(ConfigError, match="takes solver = 'effects'"):
-        sprint(matrix, model, extra_parameters=("anamorphosis",), solver="light")
+    with pytest.raises(ConfigError, match="needs solver = 'mixed-effects'"):
+        sprint(matrix, model, extra_parameters=("anamorphosis",), solver="registration-only")
     assert not sprint(matrix, model).extras

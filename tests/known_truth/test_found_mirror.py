@@ -153,7 +153,7 @@ def test_its_errors_know_of_single_actuators(design: Design) -> None:
 def test_alike_is_the_matrix_of_the_drawing(design: Design) -> None:
     matrix = measured(design, injected(design, 0), 0.1, 0)
     found = sprint(matrix, design.model)
-    alike = sprint(matrix, design.model, actuator_model="alike")
+    alike = sprint(matrix, design.model, actuator_model="nominal")
     assert found.actuator_corrections is not None
     assert alike.actuator_corrections is None
     np.testing.assert_array_equal(alike.registration.to_array(), found.registration.to_array())

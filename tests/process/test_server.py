@@ -315,7 +315,7 @@ def test_two_clients_race_for_the_lease_a_thousand_times(served: Served, bench: 
 
 
 def test_a_run_whose_holder_vanished_is_aborted_and_the_fault_latched(system: Path, tmp_path: Path) -> None:
-    limits = ("--set", "server.lease_s=1.5", "--set", "server.abandoned_s=1")
+    limits = ("--set", "server.lease_s=1.5", "--set", "server.unattended_s=1")
     with serving(system, *limits, folder=tmp_path) as served, served.connect() as watcher:
         holder = served.connect(control=True)
         until_idle(watcher)

@@ -194,7 +194,7 @@ def test_an_engine_that_hangs_is_ended_and_its_mirror_made_flat(system, bench, t
     server, spy = bench
     with (
         serving(
-            system, "--mode", "hardware", "--set", OPTIONS[0], "--set", "server.silent_s=2",
+            system, "--mode", "hardware", "--set", OPTIONS[0], "--set", "server.engine_silence_s=2",
             folder=tmp_path, more=server.environment,
         ) as served,
         served.connect(control=True) as client,

@@ -24,8 +24,8 @@ REGION = "devices.wfs.region=[216,152,208,208]"
 #: Short enough for a test, and long enough for a machine whose processors all have other work; the loop's own
 #: patience with a camera ends after five seconds.
 LIMITS = {
-    "lease_s": 15, "abandoned_s": 1, "no_frames_s": 2.5, "diverging_factor": 2, "diverging_s": 0.4,
-    "silent_s": 60,
+    "lease_s": 15, "unattended_s": 1, "no_frames_s": 2.5, "diverging_factor": 2, "diverging_s": 0.4,
+    "engine_silence_s": 60,
 }  # fmt: skip
 
 

@@ -77,7 +77,7 @@ def test_what_it_cannot_do_is_refused_before_it_turns(document, stage):
     code, found, err = document("modulator", "start", "razor-pywfs", "--radius", 30, *here)
     assert code == 3
     assert found["error"]["type"] == "SettingRejected"
-    assert "it does 0 to 0.001 rad" in err
+    assert "the range is 0 to 0.001 rad" in err
     assert not [line for line in emulator.controller.received_commands if line.startswith("WGO ")]
     assert emulator.controller.state.describe() == "at rest"
 

@@ -73,7 +73,7 @@ def test_a_zeroed_stage_with_servos_on_is_only_centred(emulator):
 
 
 def test_a_circle_is_written_started_at_once_and_triggered(emulator):
-    with driver(emulator, 'devices.modulator.stage.correct="none"') as stage:
+    with driver(emulator, 'devices.modulator.stage.correction_source="none"') as stage:
         before = len(emulator.controller.received_commands)
         assert stage.modulate(CIRCLE) == Modulation(141 * URAD, 1 / (66 * 50e-6))
         lines = said(emulator, before)
@@ -126,7 +126,7 @@ def test_the_recorder_makes_the_circle_round(emulator):
 
 
 def test_slow_circles_are_drawn_by_the_controller(emulator):
-    with driver(emulator, 'devices.modulator.stage.correct="none"') as stage:
+    with driver(emulator, 'devices.modulator.stage.correction_source="none"') as stage:
         execute = stage.modulate(Modulation(100 * URAD, 0.5, (5 * URAD, -5 * URAD)))
         assert "WAV 1 X SIN_P 4000 200 905 4000 2000 2000" in emulator.controller.received_commands
         assert "WAV 2 X SIN_P 4000 200 895 4000 3000 2000" in emulator.controller.received_commands
@@ -137,7 +137,7 @@ def test_slow_circles_are_drawn_by_the_controller(emulator):
 
 def test_a_table_of_corrections_is_used_and_has_to_fit(emulator):
     keys = (
-        'devices.modulator.stage.correct="table"',
+        'devices.modulator.stage.correction_source="table"',
         "devices.modulator.stage.corrections=[[303.0,0.5,0.25,0.0,90.0]]",
     )
     with driver(emulator, *keys) as stage:
@@ -160,7 +160,7 @@ def test_auto_zero_may_be_forbidden(emulator, caplog):
 
 def test_axes_may_be_crossed_reversed_and_weak(emulator):
     keys = ('devices.modulator.stage.axes=["2","1"]', "devices.modulator.stage.axis_gain=[-1.0,0.5]")
-    with driver(emulator, *keys, 'devices.modulator.stage.correct="none"') as stage:
+    with driver(emulator, *keys, 'devices.modulator.stage.correction_source="none"') as stage:
         stage.modulate(Modulation(100 * URAD, 500.0))
         tables = emulator.controller.waves.tables
         angle = 2 * np.pi * np.arange(40) / 40
@@ -212,7 +212,7 @@ def test_the_wrong_controller_is_left_alone(emulator, override, says):
 def test_limits_are_the_controllers_own(emulator):
     with driver(emulator, "devices.modulator.max_tilt_rad=0.05") as stage:
         assert stage.info.max_tilt_rad == pytest.approx(1e-3)
-        with pytest.raises(SettingRejected, match=r"it does 0 to 0\.001 rad"):
+        with pytest.raises(SettingRejected, match=r"the range is 0 to 0\.001 rad"):
             stage.check(Modulation(1.1e-3, 300.0))
         with pytest.raises(SettingRejected, match=r"it does up to 1000 Hz"):
             stage.check(Modulation(1e-4, 1500.0))

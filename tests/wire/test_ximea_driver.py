@@ -354,7 +354,7 @@ def test_readers_and_a_closer_in_many_threads(xi) -> None:
                 return
             except DeviceError as error:
                 # Two readers share one counter: the slower of them may be late.
-                if "the counter must rise" not in str(error):
+                if "the counter must increase" not in str(error):
                     unexpected.append(error)
 
         readers = [threading.Thread(target=read) for _ in range(3)]

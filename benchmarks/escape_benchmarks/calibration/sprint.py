@@ -51,7 +51,7 @@ OTHER_PARAMETERS = (1.0, 2.0, 0.0)
 #: What counts as found from afar, in the units of the parameters; there is no noise in these.
 CAPTURE_TOLERANCE = np.array([5.0, 5.0, 0.1, 0.5, 0.5])
 #: Gain and registration only, and with what the model does not know.
-_SOLVERS: tuple[Solver, ...] = ("light", "effects")
+_SOLVERS: tuple[Solver, ...] = ("registration-only", "mixed-effects")
 _OOPAO_SENSOR = ("sensor.pitch_px=16", "sensor.spot_px=2")
 #: OOPAO's pupil images stand on a square around the middle of its grid.
 _OOPAO_PYRAMID = (
@@ -77,7 +77,7 @@ def run() -> list[BenchmarkRow]:
         oopao = OopaoPeer(oopao_like, modes)
         rows += _matrices(oopao_like, oopao, what)
         rows += _times(oopao_like, oopao, what, NOISE)
-        rows += _exact(oopao_like, oopao, what, (("no noise, light", "light"),))
+        rows += _exact(oopao_like, oopao, what, (("no noise, light", "registration-only"),))
         rows += _accuracy(oopao_like, bench, oopao, what)
         rows += _capture_rows(oopao_like, oopao, what)
         rows += _specula_rows(bench, modes)
@@ -94,7 +94,10 @@ def pyramid_rows() -> list[BenchmarkRow]:
         rows += _matrices(oopao_like, oopao, what)
         rows += _times(oopao_like, oopao, what, 0.0)
         rows += _exact(
-            oopao_like, oopao, what, (("no noise, light", "light"), ("no noise, with misfit", "effects"))
+            oopao_like,
+            oopao,
+            what,
+            (("no noise, light", "registration-only"), ("no noise, with misfit", "mixed-effects")),
         )
         rows += _capture_rows(oopao_like, oopao, what)
     return rows
@@ -270,14 +273,14 @@ def _accuracy(
             our_data = _errors(solve, matrices, INJECTED)
             rows += _error_rows(what, f"{kind} mirror, {label}", our_data, theirs, peer_label)
         if kind == "ideal":
-            our_data = _errors(own.solver("light"), _draws(own.matrix(INJECTED)), INJECTED)
+            our_data = _errors(own.solver("registration-only"), _draws(own.matrix(INJECTED)), INJECTED)
             rows += _error_rows(what, "ideal mirror, each its own sensor", our_data, theirs, peer_label)
     return rows
 
 
 def _capture_rows(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
     """How many far registrations are found, and how many wrong ones are vouched for."""
-    light = EscapeSolver(config, oopao.m2c).solver("light", noise=False)
+    light = EscapeSolver(config, oopao.m2c).solver("registration-only", noise=False)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
     # The same share of the pupil on every sensor.
     tolerance = CAPTURE_TOLERANCE * ([config.sensor.n_sub / INJECTED_N_SUB] * 2 + [1] * 3)
@@ -311,7 +314,7 @@ def _capture_rows(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[Ben
 
 def _specula_rows(config: SystemConfig, modes: NDArray[np.float64]) -> list[BenchmarkRow]:
     ours = EscapeSolver(config, modes)
-    light, what = ours.solver("light"), f"sprint, {modes.shape[1]} modes"
+    light, what = ours.solver("registration-only"), f"sprint, {modes.shape[1]} modes"
     our_data = _draws(ours.matrix(INJECTED_EQUAL_SCALINGS))
     peer = specula_peer(config, modes, make_model(config, None))
     label, note = "each its own sensor, light", "one scaling injected; SPECULA knows no more"

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from escape_hw.api.deprecation import renamed_keywords
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
@@ -33,6 +32,7 @@ from escape_hw.calibration.sprint.solvers import MATRIX_ONLY_SOLVERS
 from escape_hw.calibration.sprint.synthetic_matrix import synthesise_calibration
 from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
 from escape_hw.config.system import ESTIMATORS, CalibrationSection
+from escape_hw.deprecation import renamed_keywords
 from escape_hw.errors import Aborted, ConfigError
 
 #: Frames per mode below which the recorded frames are fitted even though there is a matrix: the errors of

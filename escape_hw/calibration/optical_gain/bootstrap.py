@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.deprecation import renamed_keywords
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.optical_gains import ClosureStep, GainRound, GainsResult, OpticalGains
 from escape_hw.api.procedure import Procedure, Progress
@@ -25,6 +24,7 @@ from escape_hw.calibration.optical_gain.estimator import GainMeasurementLoop, Lo
 from escape_hw.calibration.optical_gain.loop_closure import bootstrap_loop
 from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
 from escape_hw.calibration.optical_gain.smoothing import clip_gains, smooth_over_modes
+from escape_hw.deprecation import renamed_keywords
 from escape_hw.errors import Aborted, CalibrationError, ConfigError
 from escape_hw.pipeline.psf.strehl import strehl
 from escape_hw.pipeline.statistics import MIN_SAMPLES

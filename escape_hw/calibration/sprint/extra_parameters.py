@@ -145,8 +145,8 @@ def build_extra_parameters(
     if "pupil_shift" in names:
         if not isinstance(model, HasPupilShift):
             raise ConfigError(
-                f"calibration.also: the model '{model.name}' of this sensor has no shift of the pupil; "
-                "it is for a pyramid and calibration.model = 'fast'"
+                f"calibration.extra_parameters: the model '{model.name}' of this sensor has no shift of the "
+                "pupil; it is for a pyramid and calibration.model = 'fast'"
             )
         parameters.append(PupilShift(model, model.with_pupil_shift(_PUPIL_SHIFT_SIGMA, 0.0), "pupil_shift_x"))
         parameters.append(PupilShift(model, model.with_pupil_shift(0.0, _PUPIL_SHIFT_SIGMA), "pupil_shift_y"))

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.concurrency import limit_to_one_thread
-from escape_hw.api.deprecation import renamed_keywords
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.registration import PARAMETERS, Registration
@@ -35,6 +34,7 @@ from escape_hw.calibration.sprint.weighted_matrix import (
     apply_model_weights,
     huber_weights,
 )
+from escape_hw.config.renamed import present_value
 from escape_hw.config.system import (
     ACTUATOR_MODELS,
     LOSSES,
@@ -47,6 +47,7 @@ from escape_hw.config.system import (
     ModesChoice,
     Solver,
 )
+from escape_hw.deprecation import renamed_keywords
 from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 
 T = TypeVar("T")
@@ -76,9 +77,9 @@ def sprint_options_from_config(section: CalibrationSection) -> SprintOptions:
         "modes_choice": section.modes_choice,
         "solver": section.solver,
         "loss": section.loss,
-        "actuator_model": section.actuators,
+        "actuator_model": section.actuator_model,
         "learning_rate": section.learning_rate,
-        "extra_parameters": section.also,
+        "extra_parameters": section.extra_parameters,
     }
 
 
@@ -112,7 +113,7 @@ def sprint(
     *,
     modes: NDArray[np.intp] | int | None = None,
     modes_choice: ModesChoice = "snr",
-    solver: Solver = "effects",
+    solver: Solver = "mixed-effects",
     loss: Loss = "squares",
     learning_rate: float = 1.0,
     start: Registration | None = None,
@@ -122,7 +123,7 @@ def sprint(
     update_priors: bool = False,
     coarse_search: bool = True,
     extra_parameters: Sequence[ExtraParameter] = (),
-    actuator_model: ActuatorModel = "found",
+    actuator_model: ActuatorModel = "fitted",
 ) -> RegistrationEstimate:
     """Estimate registration and gain from an interaction matrix (paper, SPRINT section).
 
@@ -137,10 +138,10 @@ def sprint(
     modes_choice
         Criterion of the best columns, see :func:`~.mode_choice.choose_modes`.
     solver
-        ``"effects"``: mixed-effects fit, with actuator gains and widths, slope gains and sampling positions
-        as random effects. ``"light"``: registration-only fit, of gain and registration; several times faster
-        and as accurate for a mirror that equals its model; less accurate for a real one, and its errors do
-        not include unequal actuators. ``"frozen"``: the same with the derivatives of the start.
+        ``"mixed-effects"``: with actuator gains and widths, slope gains and sampling positions as random
+        effects. ``"registration-only"``: gain and registration; several times faster and as accurate for a
+        mirror that equals its model; less accurate for a real one, and its errors do not include unequal
+        actuators. ``"frozen-derivatives"``: the same with the derivatives of the start.
         ``"batches"``: the paper's fit of a few modes at a time (Eq. argmin_simple). ``"diagonal"``: one gain
         per mode (Eq. argmin_full).
     loss
@@ -166,8 +167,8 @@ def sprint(
     extra_parameters
         Parameters to fit in addition (:mod:`~.extra_parameters`); mixed-effects fit only.
     actuator_model
-        ``"found"``: the estimate keeps the fitted corrections of the actuators, and a pseudo-synthetic
-        matrix computed from it contains them. ``"alike"``: it does not, and the matrix is that of the
+        ``"fitted"``: the estimate keeps the fitted corrections of the actuators, and a pseudo-synthetic
+        matrix computed from it contains them. ``"nominal"``: it does not, and the matrix is that of the
         nominal actuators. The fit is the same.
 
     Returns
@@ -208,7 +209,7 @@ def fit_registration(
     *,
     modes: NDArray[np.intp] | int | None = None,
     modes_choice: ModesChoice = "snr",
-    solver: Solver = "effects",
+    solver: Solver = "mixed-effects",
     loss: Loss = "squares",
     learning_rate: float = 1.0,
     start: Registration | None = None,
@@ -218,19 +219,21 @@ def fit_registration(
     update_priors: bool = False,
     coarse_search: bool = True,
     extra_parameters: Sequence[ExtraParameter] = (),
-    actuator_model: ActuatorModel = "found",
+    actuator_model: ActuatorModel = "fitted",
 ) -> Procedure[SprintFit]:
     """SPRINT as a procedure; parameters and errors as for :func:`sprint`."""
     if not 0 < learning_rate <= 1:
         raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
+    solver = present_value("calibration.solver", solver)
+    actuator_model = present_value("calibration.actuator_model", actuator_model)
     _require_one_of("solver", solver, SOLVERS)
     _require_one_of("modes_choice", modes_choice, MODES_CHOICES)
     _require_one_of("loss", loss, LOSSES)
     _require_one_of("actuator_model", actuator_model, ACTUATOR_MODELS)
-    if extra_parameters and solver != "effects":
+    if extra_parameters and solver != "mixed-effects":
         raise ConfigError(
-            f"calibration.solver = '{solver}' fits gain and registration alone; calibration.also "
-            "needs solver = 'effects'"
+            f"calibration.solver = '{solver}' fits gain and registration alone; calibration.extra_parameters "
+            "needs solver = 'mixed-effects'"
         )
     initial = start or Registration()
     with limit_to_one_thread():
@@ -246,7 +249,7 @@ def fit_registration(
     )
     with limit_to_one_thread():
         estimate = _build_estimate(context, weighted, solution, covariance)
-        if actuator_model == "found" and solution.actuator_corrections is not None:
+        if actuator_model == "fitted" and solution.actuator_corrections is not None:
             estimate = replace(estimate, actuator_corrections=solution.actuator_corrections())
     yield context.progress(estimate.sigma)
     return SprintFit(estimate, solution.zonal_matrix, solution.estimate_priors)

@@ -134,12 +134,12 @@ def solve(
         batches = BatchProblem(weighted, model, rate).descend(start, n)
         fit, added_covariance = yield from _record_steps(batches, context)
         return _solution_from_least_squares(fit, model, added_covariance)
-    frozen = solver == "frozen"
+    frozen = solver == "frozen-derivatives"
     if coarse_search:
         search = search_registration(context.matrix, model, context.columns, start, n, rate, frozen)
         fit = yield from _record_steps(search, context)
         start = fit.alpha
-    if solver == "effects":
+    if solver == "mixed-effects":
         problem = MixedEffectsProblem(weighted, model, context.priors, extras=context.extras)
         return (yield from _fit_mixed_effects(problem, Registration.from_array(start), context))
     # The coarse search ignores slope weights.

@@ -183,7 +183,7 @@ def fit_telemetry(
         covariance = residual.T @ residual / n if residual.shape[1] <= MAX_CORRELATED_SLOPES else None
         iteration_options = options.copy()
         if number < rounds - 1:  # Corrections of single actuators are needed from the last iteration only.
-            iteration_options["actuator_model"] = "alike"
+            iteration_options["actuator_model"] = "nominal"
         fit = yield from fit_registration(
             frames.columns(template, response.weights, matrix, variance), model, start=start,
             covariance=covariance, priors=priors, coarse_search=start is None, **iteration_options,
@@ -244,7 +244,8 @@ class _WhitenedFrames:
         """Sufficient statistics of the frames as a matrix whose columns have equal, independent noise.
 
         In closed loop the pokes are the instruments of the commands, and the contribution of the
-        controller, predicted with ``matrix``, is subtracted first (:mod:`~escape_hw.calibration.docrime.forgetting_sums`).
+        controller, predicted with ``matrix``, is subtracted first, as in
+        :mod:`~escape_hw.calibration.docrime.forgetting_sums`.
         """
         delayed_commands, poked = self.delayed_commands(response), np.tensordot(response, self.pokes, axes=1)
         gram, cross = poked.T @ poked, self.slopes.T @ poked

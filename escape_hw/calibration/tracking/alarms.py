@@ -34,13 +34,13 @@ class AlarmMonitor:
     """Checks every update for changes that a new registration does not explain.
 
     ``start`` and ``response`` are registration and temporal response at the start; a shift of the mirror
-    above ``largest_shift`` [% of a sub-aperture] needs a new calibration.
+    above ``max_shift`` [% of a sub-aperture] needs a new calibration.
     """
 
     def __init__(
-        self, start: Registration, largest_shift: float, response: TemporalResponse | None = None
+        self, start: Registration, max_shift: float, response: TemporalResponse | None = None
     ) -> None:
-        self._start, self._largest_shift, self._response = start.to_array(), largest_shift, response
+        self._start, self._max_shift, self._response = start.to_array(), max_shift, response
         self._noise: deque[float] = deque(maxlen=_BASELINE_UPDATES)
         self._misfit: deque[float] = deque(maxlen=_BASELINE_UPDATES)
         self._last: dict[str, int] = {}
@@ -98,10 +98,10 @@ class AlarmMonitor:
                 "check it, and disable it (devices.dm.limits.disabled) if it is dead"
             )
         moved = float(np.abs(live.registration.registration.to_array() - self._start)[:2].max())
-        if moved > self._largest_shift:
+        if moved > self._max_shift:
             new_alarms["limit"] = (
                 f"the mirror has shifted by {moved:.0f} % of a sub-aperture since the start, more than "
-                f"tracking.largest_shift ({self._largest_shift:g}); calibrate again"
+                f"tracking.max_shift ({self._max_shift:g}); calibrate again"
             )
         return new_alarms
 

@@ -91,7 +91,7 @@ def calibrate(
         request = CalibrationRequest.from_options(request_options, resume)
         changes: dict[str, object] = {
             "pokes": pokes, "solver": solver, "modes_choice": modes_choice, "loss": loss,
-            "also": options.as_toml_list(also),
+            "extra_parameters": options.as_toml_list(also),
         }  # fmt: skip
         task = CalibrationTask(request, resume=resume, force=force, settings=changes)
         selection = options.SystemSelection.of(_system_or_run(system, resume), set, seed, mode)

@@ -31,7 +31,7 @@ def sprint(
         from escape_hw.runtime.procedures.sprint import SprintTask
 
         selection = options.SystemSelection.of(system, set, seed, mode).with_calibration_settings(
-            solver=solver, modes_choice=modes_choice, loss=loss, also=options.as_toml_list(also)
+            solver=solver, modes_choice=modes_choice, loss=loss, extra_parameters=options.as_toml_list(also)
         )
         config = context.load_config(selection)
         task = SprintTask(im)

@@ -1,1 +1,4 @@
-"""One module per procedure (calibration, registration, gains, loop, tracking, sensor geometry, model PSF) from the request to the saved result, with what they share: task protocol, criteria, saving of products. The algorithms are in calibration/."""
+"""One module per procedure, from the request to the saved result, and the task protocol that they share.
+
+The algorithms are in ``escape_hw.calibration``.
+"""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
+from escape_hw.config.renamed import present_value, update_document
 from escape_hw.config.system import ESTIMATORS, LOSSES, MODES_CHOICES, SOLVERS, SystemConfig
 from escape_hw.errors import ConfigError, ProductError
 from escape_hw.remote.state import Arguments, ProcedureEntry, ProcedureParameter
@@ -44,7 +45,7 @@ def check_arguments(parameters: Sequence[ProcedureParameter], arguments: Mapping
             values[name] = parameter.default
             continue
         try:
-            values[name] = _check_value(parameter, value)
+            values[name] = _check_value(parameter, present_value(f"calibration.{name}", value))
         except ConfigError as error:
             wrong.append(str(error))
     if wrong:
@@ -93,7 +94,7 @@ def _check_number(parameter: ProcedureParameter, value: Value) -> float | int:
 #: Science frames of a model PSF.
 _PSF_FRAMES = 20
 #: DO-CRIME's pokes, as the configuration names them.
-_POKE_PATTERNS: tuple[str, ...] = ("white", "shaped", "equal-snr")
+_POKE_PATTERNS: tuple[str, ...] = ("white", "anticorrelated", "equal-snr")
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,10 +230,11 @@ def _run_settings(folder: Path) -> dict[str, Any]:
     """The section ``calibration`` of the configuration of the run in a folder."""
     path = folder / "config.toml"
     try:
-        declared = tomllib.loads(path.read_text(encoding="utf-8")).get("calibration", {})
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ProductError(f"{path}: cannot be read ({error}); is {folder} the folder of a run?") from error
-    return dict(declared)
+    update_document(document)
+    return dict(document.get("calibration", {}))
 
 
 def _matrix_path(arguments: Arguments, product_store: ProductStore) -> Path:

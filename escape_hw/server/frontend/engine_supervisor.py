@@ -297,7 +297,7 @@ class EngineSupervisor:
         moving = self._state.mirror.peak > 0 or self._state.loop.closed
         silent, limit = (
             now - engine.last_message_s,
-            self._config.server.silent_s if moving else IDLE_SILENCE_LIMIT_S,
+            self._config.server.engine_silence_s if moving else IDLE_SILENCE_LIMIT_S,
         )
         waiting = [one for one in self._pending.values() if isinstance(one.incoming.request, SAFETY_REQUESTS)]
         if silent > limit:
@@ -310,7 +310,7 @@ class EngineSupervisor:
             )
 
     def _check_abandoned_run(self, engine: EngineProcess) -> None:
-        lost, limit = self._leases.seconds_without_holder(), self._config.server.abandoned_s
+        lost, limit = self._leases.seconds_without_holder(), self._config.server.unattended_s
         running = self._state.procedure
         if (
             running is None

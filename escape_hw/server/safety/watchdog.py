@@ -78,7 +78,7 @@ class Watchdog:
         )
 
     def _check_saturation(self, state: State) -> LimitViolation | None:
-        now, limit, max_share = self._clock(), self._limits.saturated_s, self._limits.saturated_share
+        now, limit, max_share = self._clock(), self._limits.saturated_s, self._limits.saturated_fraction
         if not state.loop.closed or state.mirror.clipped <= max_share:
             self._clipped_since = None
             return None
