@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.results import StrehlEstimate
+from escape_hw.deprecation import renamed_members
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,6 +108,7 @@ class ClosureStep:
     stable: bool
 
 
+@renamed_members(beside="comparisons")
 @dataclass(frozen=True, slots=True, eq=False)
 class GainsResult:
     """Result of a bootstrap of the optical gains.

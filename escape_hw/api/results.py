@@ -13,7 +13,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
 from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.sensor import SensorGeometry
-from escape_hw.deprecation import renamed_text, warn_renamed
+from escape_hw.deprecation import renamed_members
 
 #: Width of the broad pedestal of the influence functions, relative to their own width.
 PEDESTAL = 1.7
@@ -84,6 +84,7 @@ class SprintIteration:
     chi2: float
 
 
+@renamed_members(measured="parameters", departures="actuator_corrections")
 @dataclass(frozen=True, slots=True, eq=False)
 class RegistrationEstimate:
     """Registration estimated by SPRINT.
@@ -128,11 +129,6 @@ class RegistrationEstimate:
             name: Estimate(float(v), float(s), UNITS[name])
             for name, v, s in zip(PARAMETERS, values, self.sigma, strict=True)
         }
-
-    def measured(self) -> dict[str, Estimate]:
-        """Former name of :meth:`parameters`, until version 0.3.0."""
-        warn_renamed(renamed_text("RegistrationEstimate.measured()", "parameters()"))
-        return self.parameters()
 
     def __repr__(self) -> str:
         texts = ", ".join(f"{name} {text}" for name, text in self._formatted_values().items())
@@ -222,6 +218,7 @@ class LoopResult:
     ``psf`` and ``model_psf`` are dark-subtracted images of the science camera with the same
     integration; ``latency_us`` holds wall-clock p50, p99 and max of the frame-to-command path.
     ``residual_nm`` is a decimated record of the residual wavefront rms seen by the sensor.
+    ``gain_sigma`` is the standard error of a gain that was found by a search, else ``None``.
     """
 
     method: str
@@ -242,10 +239,12 @@ class LoopResult:
     last_frame: NDArray[np.uint16] | None = None
     partial: bool = False
     notes: tuple[str, ...] = ()
+    gain_sigma: float | None = None
 
     def __repr__(self) -> str:
+        error = f" ± {self.gain_sigma:.1g}" if self.gain_sigma is not None else ""
         words = [
-            f"{self.method} at gain {self.gain:.3g}",
+            f"{self.method} at gain {self.gain:.3g}{error}",
             f"{self.frames} frames at {self.rate_hz:.4g} Hz, {self.lost_frames} lost",
             "stable" if self.stable else "UNSTABLE",
             f"residual {self.residual_rms_nm:.3g} nm rms",

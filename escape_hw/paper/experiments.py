@@ -175,16 +175,18 @@ def close_loop_at_best_gain(
     CalibrationError
         No gain gives a stable loop.
     """
-    from escape_hw.calibration.loop.gain_search import best_gain
+    from escape_hw.calibration.loop.gain_search import find_best_gain
     from escape_hw.calibration.loop.performance import close_loop
 
     matrix, grid = calibration.matrix, calibration.grid
-    gain, scan = yield from best_gain(bench, matrix, grid, model_psf=model)
-    result.scans[label] = list(scan)
-    result.partial = any(run.partial for run in scan)
+    search = yield from find_best_gain(bench, matrix, grid, model_psf=model)
+    result.scans[label] = search.runs
+    result.partial = any(run.partial for run in search.runs)
     if not result.partial:
-        loop = yield from close_loop(bench, matrix, grid, gain=gain, frames=loop_frames, model_psf=model)
-        result.loops[label], result.partial = loop, loop.partial
+        loop = yield from close_loop(
+            bench, matrix, grid, gain=search.gain, frames=loop_frames, model_psf=model
+        )
+        result.loops[label], result.partial = replace(loop, gain_sigma=search.sigma), loop.partial
 
 
 def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -> Procedure[Table1Result]:

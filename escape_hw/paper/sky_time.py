@@ -21,7 +21,8 @@ from escape_hw.calibration.acquisition.frames import build_interaction_matrix
 from escape_hw.calibration.docrime.acquisition import AcquisitionRecord
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 from escape_hw.calibration.docrime.fit import DocrimeSolution
-from escape_hw.calibration.docrime.open_loop import MAX_CORRELATED_SLOPES, docrime_run
+from escape_hw.calibration.docrime.open_loop import docrime_run
+from escape_hw.calibration.docrime.regression import MAX_CORRELATED_SLOPES
 from escape_hw.calibration.docrime.response import filter_telemetry
 from escape_hw.calibration.escape.method import escape
 from escape_hw.calibration.sprint.cramer_rao_bound import compute_registration_bound

@@ -143,8 +143,13 @@ def strehl_table(loops: Mapping[str, LoopResult]) -> Table:
         state = f"stable {loop.frames / loop.rate_hz:.0f} s" if loop.stable else "UNSTABLE"
         if loop.partial:
             state += ", aborted"
-        rows.append((label, *ratios, f"{loop.gain:.3f}", f"{loop.residual_rms_nm:.0f}", state))
+        rows.append((label, *ratios, _format_gain(loop), f"{loop.residual_rms_nm:.0f}", state))
     return Table(headings, tuple(rows))
+
+
+def _format_gain(loop: LoopResult) -> str:
+    error = f" ± {loop.gain_sigma:.3f}" if loop.gain_sigma is not None else ""
+    return f"{loop.gain:.3f}{error}"
 
 
 def rounds_table(result: GainsResult) -> Table:

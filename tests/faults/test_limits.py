@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from small_bench import PLANTED, assert_flat, faulty, small
 
-from escape_hw.calibration.acquisition.sensor_setup import build_modal_basis
 from escape_hw.calibration.docrime.open_loop import docrime_run
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.errors import CalibrationError, ConfigError, ProductError

@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import count, islice
 from math import factorial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from escape_hw.bench import Bench
+from escape_hw.config.system import SystemConfig
 from escape_hw.errors import CalibrationError, ConfigError
-
-if TYPE_CHECKING:
-    from escape_hw.config.system import SystemConfig
-
 
 #: On a symmetric mirror modes come in pairs of equal variance, and rounding would decide how a pair lies
 #: in its plane (and which half of one is cut off). This much anisotropy decides it instead.
@@ -288,6 +285,22 @@ def _fit_shapes(
 _OUTER_SCALE = 4.0
 #: Bases that need nothing but the influence functions.
 _BASIS_BUILDERS = {"zonal": zonal, "zernike": zernike, "fourier": fourier}
+
+
+def build_modal_basis(bench: Bench) -> NDArray[np.float64]:
+    """Build the mode-to-command matrix ``(n_act, n_modes)`` that the configuration asks for.
+
+    Raises
+    ------
+    ConfigError
+        The basis does not fit the mirror, or moves disabled actuators.
+    CalibrationError
+        More modes than the working actuators can make.
+    """
+    surfaces, pupil, pixel_m = bench.model().influence_functions()
+    if surfaces.shape[0] != bench.dm.info.n_act:
+        raise ConfigError(f"the model has {surfaces.shape[0]} actuators, the mirror {bench.dm.info.n_act}")
+    return build_basis(bench.config, surfaces, pupil, pixel_m, bench.dm.limits.disabled)
 
 
 def build_basis(

@@ -21,9 +21,12 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
-from escape_hw.calibration.docrime.closed_loop_response import responses_differ
-from escape_hw.calibration.docrime.forgetting_sums import whiten_columns
-from escape_hw.calibration.docrime.open_loop import MAX_CORRELATED_SLOPES
+from escape_hw.calibration.docrime.regression import (
+    MAX_CORRELATED_SLOPES,
+    InstrumentalEquations,
+    whiten_columns,
+)
+from escape_hw.calibration.docrime.response import select_response
 from escape_hw.calibration.docrime.whitening import (
     apply_filter,
     apply_history_filters,
@@ -59,8 +62,8 @@ class TelemetryFit:
     whitener
         The whitening filter, for frames with a complete history.
     covariance
-        Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``;
-        ``None`` with more than :data:`~escape_hw.calibration.docrime.open_loop.MAX_CORRELATED_SLOPES` slopes.
+        Covariance of the whitened noise of one frame ``(n_slopes, n_slopes)``; ``None`` with more than
+        :data:`~escape_hw.calibration.docrime.regression.MAX_CORRELATED_SLOPES` slopes.
     n_frames
         Number of whitened frames.
     """
@@ -244,14 +247,15 @@ class _WhitenedFrames:
         """Sufficient statistics of the frames as a matrix whose columns have equal, independent noise.
 
         In closed loop the pokes are the instruments of the commands, and the contribution of the
-        controller, predicted with ``matrix``, is subtracted first, as in
-        :mod:`~escape_hw.calibration.docrime.forgetting_sums`.
+        controller, predicted with ``matrix``, is subtracted first
+        (:mod:`~escape_hw.calibration.docrime.regression`).
         """
-        delayed_commands, poked = self.delayed_commands(response), np.tensordot(response, self.pokes, axes=1)
-        gram, cross = poked.T @ poked, self.slopes.T @ poked
+        poked = np.tensordot(response, self.pokes, axes=1)
+        sums = InstrumentalEquations.from_rows(self.slopes, self.delayed_commands(response), poked)
+        cross = sums.cross
         if matrix is not None and self.commands is not self.pokes:
-            cross = cross - matrix @ (delayed_commands.T @ poked - gram)
-        return whiten_columns(template, cross, gram, gram, variance)
+            cross = sums.poke_response(matrix)
+        return whiten_columns(template, cross, sums.poke_products, sums.poke_products, variance)
 
 
 def delay_rows(pokes: NDArray[np.floating], lag: int) -> NDArray[np.floating]:
@@ -300,13 +304,7 @@ def _estimate_response(
     scaled = (np.eye(lags) - weights[:, None]) @ bread / total
     covariance = scaled @ (scores @ scores.T) @ scaled.T
     measured = TemporalResponse(weights, np.sqrt(np.diag(covariance)))
-    if (
-        known is not None
-        and known.sigma.max() < measured.sigma.max()
-        and not responses_differ(measured, known)
-    ):
-        return known
-    return measured
+    return select_response(measured, known)
 
 
 def fit_whitener(

@@ -10,8 +10,7 @@ import numpy as np
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import TemporalResponse
 from escape_hw.api.tracking import Alarm
-from escape_hw.calibration.docrime.closed_loop_response import responses_differ
-from escape_hw.calibration.loop.runner import LoopRecord
+from escape_hw.calibration.docrime.response import responses_differ
 from escape_hw.calibration.tracking.live_registration import LiveEstimate
 
 #: Innovation of an update, in standard errors, above which the registration has jumped.
@@ -25,9 +24,6 @@ ACTUATOR_GAIN_LIMIT = 0.5
 QUIET_UPDATES = 5
 #: Updates of the running medians.
 _BASELINE_UPDATES = 30
-#: Residual, relative to its median, above which the loop has diverged; the lower one if the commands are
-#: limited in this fraction of the frames; and least number of seconds of that median.
-DIVERGED_FACTOR, DIVERGED_AT_LIMIT_FACTOR, _AT_LIMIT_FRACTION, _MIN_BASELINE_SECONDS = 4.0, 2.0, 0.9, 3
 
 
 class AlarmMonitor:
@@ -104,30 +100,6 @@ class AlarmMonitor:
                 f"tracking.max_shift ({self._max_shift:g}); calibrate again"
             )
         return new_alarms
-
-
-class DivergenceMonitor:
-    """Checks every second of a loop for divergence.
-
-    While pokes are injected, a command beyond the limits is scaled as a whole, so a diverging loop has a few
-    actuators at their limits, not many; and the slopes of a pyramid saturate before the mirror does.
-    """
-
-    def __init__(self) -> None:
-        self._residual: deque[float] = deque(maxlen=_BASELINE_UPDATES)
-
-    def __call__(self, record: LoopRecord, frames: int, shortened: int) -> bool:
-        """Whether the loop diverged after ``frames`` frames, ``shortened`` of them with limited commands."""
-        residual = np.array(record.residual[frames:])
-        rms = float(np.sqrt(np.mean(np.square(residual))))
-        baseline = (
-            float(np.median(self._residual)) if len(self._residual) >= _MIN_BASELINE_SECONDS else np.inf
-        )
-        at_limit = record.shortened - shortened > _AT_LIMIT_FRACTION * len(residual)
-        if rms > (DIVERGED_AT_LIMIT_FACTOR if at_limit else DIVERGED_FACTOR) * baseline:
-            return True
-        self._residual.append(rms)
-        return False
 
 
 def _baseline(values: Sequence[float]) -> float:

@@ -338,7 +338,7 @@ class CalibrationTask:
     def finish(self) -> None:
         """See :meth:`~escape_hw.runtime.procedures.task.Task.finish`."""
         if self._checkpoint is not None:
-            self._checkpoint.done()
+            self._checkpoint.remove()
 
 
 def mode_count_overrides(config: SystemConfig, modes: int) -> tuple[tuple[str, ...], int]:

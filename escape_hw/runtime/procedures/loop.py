@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -127,7 +128,7 @@ class LoopTask(TaskWithMatrix):
 
     def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[LoopResult]:
         """Model PSF where the bench can take one, best gain when asked, then the loop itself."""
-        from escape_hw.calibration.loop.gain_search import best_gain
+        from escape_hw.calibration.loop.gain_search import find_best_gain
         from escape_hw.calibration.loop.performance import close_loop
         from escape_hw.runtime.procedures.calibration import model_psf
 
@@ -137,14 +138,17 @@ class LoopTask(TaskWithMatrix):
             self._recorder = LoopTelemetryRecorder(self._record, grid.n_slopes, bench.dm.info.n_act)
             bench.callbacks = self._recorder.callbacks
         model = gain = None
+        gain_sigma = None
         if self._strehl and bench.science is not None:
             model = yield from model_psf(bench)
         if self._search_gain:
-            gain, runs = yield from best_gain(bench, matrix, grid, model_psf=model)
-            stopped = [run for run in runs if run.partial]
+            search = yield from find_best_gain(bench, matrix, grid, model_psf=model)
+            gain, gain_sigma = search.gain, search.sigma
+            stopped = [run for run in search.runs if run.partial]
             if stopped:
                 return stopped[-1]
-        return (yield from close_loop(bench, matrix, grid, gain=gain, frames=self._frames, model_psf=model))
+        result = yield from close_loop(bench, matrix, grid, gain=gain, frames=self._frames, model_psf=model)
+        return replace(result, gain_sigma=gain_sigma)
 
     def save(
         self, folder: RunFolder, record: BenchRecord, result: LoopResult, wall_seconds: float

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from escape_hw.calibration.acquisition.sensor_setup import (
-    SETUP_FRAMES,
-    build_modal_basis,
-    compute_poke_amplitudes,
-)
+from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
+from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
 from escape_hw.calibration.docrime.open_loop import minimum_frames
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.push_pull.demodulation import choose_line_frequencies
 from escape_hw.calibration.push_pull.modulation import BAND
 from escape_hw.errors import TooFewFrames

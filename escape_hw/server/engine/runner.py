@@ -61,7 +61,7 @@ def begin_run(engine: Engine, run: int, name: str, arguments: dict[str, Any], lo
     engine_state = engine.engine_state
     if engine_state.loop_control is not None:
         log.info("the loop is closed: %s", LOOP_IS_RESTORED)
-        engine_state.loop_control.open()
+        engine_state.loop_control.request_open()
     engine_state.stop, engine_state.paused, engine_state.needs_loop = SignalSafeFlag(), False, loop
     engine_state.running = ActiveRun(
         id=run, name=name, arguments=arguments, stage="starting", started_utc=format_utc()
@@ -265,7 +265,7 @@ def change_loop_settings(engine: Engine, request: SetLoop) -> None:
     requested = _requested_settings(engine, request)
     product = None if request.matrix is None else stored_matrix(engine, request.matrix)
     if engine_state.loop_control is not None:
-        engine_state.loop_control.change(
+        engine_state.loop_control.request_change(
             calibration=None if product is None else product.result,
             gain=request.gain, leak=request.leak, dropped_modes=request.dropped_modes,
         )  # fmt: skip
