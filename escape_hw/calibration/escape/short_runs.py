@@ -238,9 +238,9 @@ def _record_frames(
             observers = (buffer, lambda _index, slopes, _command, _poke: slope_statistics.add(slopes))
             yield from loop.run(frames, inject=pokes, observe=observers, report=Reporter(stage, frames))
         except Aborted:
+            n_frames = settling_frames + past + frames
             raise Aborted(
-                f"aborted after {loop.record.frames} of {settling_frames + past + frames} frames, too few for "
-                "a registration"
+                f"aborted after {loop.record.frames} of {n_frames} frames, too few for a registration"
             ) from None
     require_not_diverged(loop.record)
 

@@ -2,8 +2,8 @@
 
 The updates use sums of the whitened telemetry with exponential forgetting
 (:mod:`~escape_hw.calibration.docrime.forgetting_sums`), start from the last estimate, and have the unknowns
-of a full fit: gain, registration, random effects, and on a pyramid the optical gains as a smooth curve over the
-modes. Double exponential smoothing (:class:`DoubleExponentialSmoother`) removes the lag of the memory.
+of a full fit: gain, registration, random effects, and on a pyramid the optical gains as a smooth curve over
+the modes. Double exponential smoothing (:class:`DoubleExponentialSmoother`) removes the lag of the memory.
 """
 
 from __future__ import annotations
