@@ -14,7 +14,7 @@ from escape_hw.calibration.docrime.open_loop import docrime_run
 from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
 from escape_hw.calibration.push_pull.modulation import modulation_demodulation
 from escape_hw.calibration.push_pull.procedure import push_pull
-from escape_hw.calibration.sprint.fit import fit_registration
+from escape_hw.calibration.sprint.fit import estimate_registration
 from escape_hw.calibration.tracking.tracker import track
 from escape_hw.runtime.session.record import without_turbulence
 
@@ -85,8 +85,7 @@ def test_modes_not_measured_yet_are_nan(bench, often, procedure):
 
 @pytest.mark.parametrize("solver", ["mixed-effects", "registration-only", "batches"])
 def test_sprint_shows_every_iteration(bench, good, solver):
-    fit, shown = watched(bench, fit_registration(good.matrix, good.model, solver=solver))
-    found = fit.estimate
+    found, shown = watched(bench, estimate_registration(good.matrix, good.model, solver=solver))
     course = shown["registration"][-1]
     assert course.shape == (len(found.iterations), 5)
     assert shown["step_norm"][-1].shape == (len(found.iterations),)
@@ -141,6 +140,6 @@ def test_pictures_take_a_small_share_of_the_time(monkeypatch):
     pictures = MatrixPreview(3, lambda: None)
     for _ in range(100_000):
         clock[0] += 0.001
-        if pictures.is_due():
+        if pictures.due():
             assert pictures(slow)["matrix"].shape == (4, 3)
     assert 0.02 < sum(spent) / clock[0] < 0.05

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypedDict, TypeVar
+from typing import Any, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -253,6 +253,13 @@ def fit_registration(
             estimate = replace(estimate, actuator_corrections=solution.actuator_corrections())
     yield context.progress(estimate.sigma)
     return SprintFit(estimate, solution.zonal_matrix, solution.estimate_priors)
+
+
+def estimate_registration(
+    matrix: InteractionMatrix, model: SyntheticModel, **options: Any
+) -> Procedure[RegistrationEstimate]:
+    """The same for the estimate alone."""
+    return (yield from fit_registration(matrix, model, **options)).estimate
 
 
 def _in_one_thread(steps: Procedure[T]) -> Procedure[T]:

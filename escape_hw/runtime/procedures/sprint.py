@@ -56,18 +56,18 @@ class SprintTask(TaskWithMatrix):
 
     def fit(self) -> Procedure[CalibrationResult]:
         """Find the registration; the result's matrix is the measured one."""
-        from escape_hw.calibration.sprint.fit import fit_registration, sprint_options_from_config
+        from escape_hw.calibration.sprint.fit import estimate_registration, sprint_options_from_config
 
         settings, product = self.config.calibration, self.product
         measured = product.result.measured or product.matrix
         yield Reporter("synthetic model", 1, "model")(0)
-        fit = yield from fit_registration(
+        estimate = yield from estimate_registration(
             measured,
             self._synthetic_model(),
             modes=min(settings.sprint_modes, measured.n_modes),
             **sprint_options_from_config(settings),
         )
-        return replace(product.result, matrix=measured, measured=None, registration=fit.estimate)
+        return replace(product.result, matrix=measured, measured=None, registration=estimate)
 
     def _synthetic_model(self) -> SyntheticModel:
         """The model that is inverted; a pyramid's takes seconds to make."""
