@@ -1,7 +1,7 @@
 """Our cameras and mirrors as components of pyRTC 2.x.
 
-This module extends classes of pyRTC (package ``pyrtcao``, GPL-3.0-or-later) and stands under
-GPL-3.0-or-later for that reason, too. Nothing else in ESCAPE imports it; pyRTC finds it by its name::
+This module extends classes of pyRTC (package ``pyrtcao``, GPL-3.0-or-later) and is licensed under
+GPL-3.0-or-later as well. Nothing else in ESCAPE imports it; pyRTC finds it by its name::
 
     wfs:
       class_name: escape_drivers.pyrtc_components.EscapeCamera
@@ -38,7 +38,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, FrameTimeout
 
 _KEYS = ("system", "set", "mode", "timeout_s")
-#: Longest wait for a frame before pyRTC may look whether it is to stop, in seconds.
+#: Maximum wait for a frame before pyRTC can check for a stop request, in seconds.
 _WAIT_S = 0.5
 
 _benches: dict[tuple[str, ...], Bench] = {}
@@ -162,7 +162,7 @@ class EscapeMirror(WavefrontCorrector):  # type: ignore[misc]  # pyRTC is not ty
             raise
 
     def basis_actuator_positions(self) -> NDArray[np.float64]:
-        """Where the actuators stand ``(n_act, 2)`` in metres, for the bases that pyRTC computes."""
+        """Positions of the actuators ``(n_act, 2)`` in metres, for modal bases computed by pyRTC."""
         return self.mirror.info.positions_m
 
     def send_to_hardware(self) -> None:

@@ -110,7 +110,7 @@ def test_a_failure_without_a_reason_is_one(asdk) -> None:
     library = stand_in("asdk")
     with make("alpao") as dm:
         library.script("asdkSend 1 error 0")
-        with pytest.raises(DeviceError, match="asdkSend failed, and the SDK does not say why"):
+        with pytest.raises(DeviceError, match="asdkSend failed; the SDK gives no reason"):
             dm.send(np.zeros(97))
 
 
@@ -139,7 +139,7 @@ def test_every_error_of_the_sdk_is_explained(asdk, number) -> None:
 
 
 def test_an_unknown_error_keeps_the_librarys_words() -> None:
-    assert describe_error(0x999, "smoke") == "error 0x999, unknown error; the library says: smoke"
+    assert describe_error(0x999, "smoke") == "error 0x999, unknown error; library: smoke"
 
 
 @given(st.integers(0, 9), st.integers(0, 99), st.integers(0, 99), st.integers(0, 99999))

@@ -195,7 +195,7 @@ def test_a_port_that_never_answers_is_told() -> None:
 def test_a_port_where_nobody_listens_is_told() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    with pytest.raises(DeviceLost, match=r"nobody answers at 127.0.0.1:\d+ .* check host, port"):
+    with pytest.raises(DeviceLost, match=r"no answer at 127.0.0.1:\d+ .* check host, port"):
         driver(port).open()
 
 

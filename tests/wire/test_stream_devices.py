@@ -135,7 +135,7 @@ def test_a_silent_stream_times_out_and_says_who_to_ask(kind: str) -> None:
     try:
         with (
             make(kind, "wfs", name) as camera,
-            pytest.raises(FrameTimeout, match=f"who writes the stream '{name}'"),
+            pytest.raises(FrameTimeout, match=f"the program that writes the stream '{name}'"),
         ):
             camera.next_frame(0.05)
     finally:

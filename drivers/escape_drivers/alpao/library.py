@@ -1,6 +1,7 @@
 """Binding of ALPAO's libasdk: prototypes, error numbers and their explanations, errors raised as exceptions.
 
-Prototypes follow the public headers asdkDM.h, asdkType.h and asdkErrNo.h: ``Scalar`` is double, ``UInt`` uint32, ``COMPL_STAT`` an int (0 success, -1 failure), ``asdkDM`` opaque.
+Prototypes follow the public headers asdkDM.h, asdkType.h and asdkErrNo.h: ``Scalar`` is double, ``UInt``
+uint32, ``COMPL_STAT`` an int (0 success, -1 failure), ``asdkDM`` opaque.
 """
 
 from __future__ import annotations
@@ -52,14 +53,14 @@ ERRORS: dict[int, tuple[str, str]] = {
     0x10D: ("no acknowledgement in time", f"{_CABLE_HINT}, or allow a longer ack_timeout_ms"),
     0x10E: ("no trigger in time", "check the trigger's cable, or set trigger_in to 'off'"),
 }
-#: The mirror has gone; nothing but opening it again helps.
+#: Errors after which the mirror must be opened again.
 LOST_CODES = frozenset({0x101})
 
 
 def describe_error(number: int, text: str) -> str:
     """One line: number, meaning, the library's own text, and the way out."""
     meaning, remedy = ERRORS.get(number, ("unknown error", ""))
-    library_text = f"; the library says: {text}" if text and text.lower() != meaning else ""
+    library_text = f"; library: {text}" if text and text.lower() != meaning else ""
     return f"error 0x{number:X}, {meaning}{library_text}{'; ' if remedy else ''}{remedy}"
 
 
@@ -123,7 +124,7 @@ class AlpaoLibrary:
         if handle:
             self.c.asdkRelease(handle)
         if error is None:
-            raise DeviceError(self.device, f"the SDK did not open mirror {serial!r} and does not say why")
+            raise DeviceError(self.device, f"the SDK did not open mirror {serial!r} and gives no reason")
         raise DeviceError(self.device, f"the SDK did not open mirror {serial!r}: {describe_error(*error)}")
 
     def last_error(self) -> tuple[int, str] | None:
@@ -134,7 +135,7 @@ class AlpaoLibrary:
         return number.value, text.value.decode(errors="replace").strip()
 
     def _clear_errors(self) -> tuple[int, str] | None:
-        """Empty the error stack, which outlives mirrors; what cannot be taken off is returned."""
+        """Empty the error stack, which is kept between mirrors; returns an error that cannot be removed."""
         error = None
         for _ in range(_MAX_STACKED_ERRORS):
             error = self.last_error()
@@ -146,12 +147,12 @@ class AlpaoLibrary:
         """The error to raise after a call that failed."""
         error = self.last_error()
         if error is None:
-            return DeviceError(self.device, f"{call} failed, and the SDK does not say why")
+            return DeviceError(self.device, f"{call} failed; the SDK gives no reason")
         kind = DeviceLost if error[0] in LOST_CODES else DeviceError
         return kind(self.device, f"{call} failed: {describe_error(*error)}")
 
     def call(self, name: str, handle: c_void_p, *arguments: Any) -> None:
-        """Call a function whose outcome is a ``COMPL_STAT``.
+        """Call a function that returns a ``COMPL_STAT``.
 
         Raises
         ------

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 #: ``TriggerIn`` and ``TriggerMode`` as the SDK numbers them.
 _TRIGGER_IN = {"off": 0.0, "rising": 1.0, "falling": 2.0}
 _TRIGGER_OUT = {"long": 0.0, "short": 1.0}
-#: Where the SDK looks for a mirror's configuration files.
+#: Folder of the mirrors' configuration files in the SDK.
 _CONFIG_VARIABLE = "ACECFG"
 
 
@@ -78,7 +78,7 @@ def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> A
     Raises
     ------
     ConfigError
-        No serial number, or an option that this driver does not know.
+        The serial number is missing, or an option is unknown.
     """
     section = config.devices.dm
     require_serial(name, section)
@@ -162,7 +162,7 @@ class AlpaoMirror(DeformableMirror):
             self._playing = True
             pointer = c_void_p(sequence.ctypes.data)
             library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
-            # What the mirror shows from now on nobody knows: the next flatten() always sends.
+            # The mirror's shape is unknown from here on: the next flatten() always sends.
             self._guard_when_open().reset(sequence[-1])
             self._shape_known = False
 
@@ -184,7 +184,7 @@ class AlpaoMirror(DeformableMirror):
         Raises
         ------
         NotOpen, DeviceError
-            The mirror is not connected, or there is no such parameter.
+            The mirror is not connected, or the parameter does not exist.
         """
         with self._lock:
             self.require_open()
@@ -195,7 +195,7 @@ class AlpaoMirror(DeformableMirror):
         if self._options.config_folder:
             os.environ[_CONFIG_VARIABLE] = self._options.config_folder
         library = self._library = AlpaoLibrary(self.name, self._options.library)
-        # The files of a mirror are named in capitals, and so is what the SDK looks for.
+        # Configuration files have names in capitals, and the SDK searches for capitals.
         handle = self._handle = library.init(self._section.serial.strip().upper())
         n_act = round(library.get(handle, "NbOfActuator"))
         if n_act != self._section.n_act:
@@ -224,7 +224,7 @@ class AlpaoMirror(DeformableMirror):
             try:
                 library.call(name, handle)
             except DeviceError as error:
-                # It may have gone; what is left to do is still tried.
+                # The mirror may be disconnected; the remaining steps are still tried.
                 log.warning("while closing: %s", error)
 
     def _release_after_failed_open(self) -> None:

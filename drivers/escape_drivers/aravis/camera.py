@@ -70,7 +70,7 @@ def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> A
     Raises
     ------
     ConfigError
-        No such camera, no serial number, or an option that this driver does not know.
+        The camera or its serial number is missing, or an option is unknown.
     """
     section = camera_section(name, config)
     require_serial(name, section)
@@ -181,7 +181,7 @@ class AravisCamera(BlockingCamera):
             library.push_buffer(buffer)
 
     def _require_responding(self, library: AravisLibrary, wait_ms: int) -> None:
-        """Find out whether a silent camera is still there; not asked when nothing was waited for."""
+        """Check the connection of a camera that sends no frames; not called when no frame is expected."""
         if wait_ms == 0:
             return
         try:
@@ -202,7 +202,7 @@ class AravisCamera(BlockingCamera):
         )
 
     def _pixel_counts(self, buffer_info: ReceivedBuffer) -> NDArray[np.uint16]:
-        """Counts in a buffer; a look at it where that is possible."""
+        """Counts in a buffer, as a view where possible."""
         region = self._settings.region
         kind: Any = np.uint8 if self._options.pixel_format == "Mono8" else np.uint16
         needed = region.width * region.height * np.dtype(kind).itemsize
@@ -213,7 +213,8 @@ class AravisCamera(BlockingCamera):
         ):
             raise DeviceError(
                 self.name,
-                f"delivered {buffer_info.width} x {buffer_info.height} pixels in {buffer_info.size} bytes for a region of "
+                f"delivered {buffer_info.width} x {buffer_info.height} pixels in {buffer_info.size} bytes "
+                f"for a region of "
                 f"{region.width} x {region.height} in {self._options.pixel_format}",
             )
         raw_bytes = (ctypes.c_ubyte * needed).from_address(buffer_info.address)
@@ -229,7 +230,7 @@ class AravisCamera(BlockingCamera):
 
 
 def _read_limits(library: AravisLibrary) -> CameraLimits:
-    """Ask the camera, whose region must be the whole sensor."""
+    """Read the limits from the camera, whose region must be the whole sensor."""
     sides = ("width", "height", "x_offset", "y_offset")
     steps = [library.call(f"camera_get_{name}_increment") for name in sides]
     width, height = (library.get_ints(f"camera_get_{name}_bounds", 2) for name in ("width", "height"))

@@ -143,13 +143,13 @@ class AravisLibrary:
         self.camera = c_void_p(self.call("camera_new", found[serial], with_camera=False))
 
     def close(self) -> None:
-        """Give the camera back, whose stream has ended."""
+        """Release the camera after its stream has ended."""
         camera, self.camera = self.camera, None
         if camera is not None:
             self.c.g_object_unref(camera)
 
     def call(self, name: str, *arguments: Any, with_camera: bool = True) -> Any:
-        """Call ``arv_NAME`` with this camera first (unless not ``with_camera``) and a place for an error last.
+        """Call ``arv_NAME`` with this camera first, if ``with_camera``, and an error pointer last.
 
         Raises
         ------
@@ -196,7 +196,8 @@ class AravisLibrary:
         self._stream = c_void_p(self.call("camera_create_stream", None, None))
         if not self._stream:
             raise DeviceError(
-                self.device, "Aravis made no stream and does not say why; is it in use elsewhere?"
+                self.device,
+                "Aravis created no stream and gives no reason; is another program using the camera?",
             )
         for _ in range(n_buffers):
             self.c.arv_stream_push_buffer(self._stream, self.c.arv_buffer_new_allocate(payload))

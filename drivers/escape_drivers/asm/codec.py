@@ -1,7 +1,7 @@
 """The wire of ESCAPE's own adaptive-secondary link, version 1: bytes in, messages out, no sockets.
 
 The format is ours; ``docs/devices/asm-link.md`` defines it. All numbers are little-endian. A frame is
-a header of 28 bytes with a checksum of its own, so that the length can be trusted, then the payload
+a header of 28 bytes with a checksum of its own, which protects the length, then the payload
 and its checksum.
 """
 
@@ -64,7 +64,7 @@ class AsmCodec:
         Raises
         ------
         ValueError
-            It does not fit: a text or a list that is too long.
+            A text or a list is too long.
         """
         kind, payload = _encode_request(message)
         return encode_frame(kind, sequence, time_ns, payload)
@@ -93,7 +93,7 @@ class AsmCodec:
         Raises
         ------
         ProtocolError
-            Not this protocol, or damaged; said again at every further call.
+            Not this protocol, or damaged; raised again at every further call.
         """
         if self._error:
             raise m.ProtocolError(self._error)
@@ -134,7 +134,7 @@ def _parse_frame(buffer: bytearray) -> tuple[int, bytes, int] | None:
     Raises
     ------
     ProtocolError
-        What has arrived cannot become a frame; told at the first byte that shows it.
+        The bytes received cannot become a frame; raised at the first wrong byte.
     """
     if not MAGIC.startswith(buffer[: len(MAGIC)]):
         raise m.ProtocolError(f"a frame begins with {bytes(buffer[:4])!r}, not {MAGIC!r}")
@@ -268,7 +268,8 @@ def _decode_health(read: _PayloadReader) -> m.HealthReport:
     )
     contaminated, owner, fault = read.indices(), read.text(), read.text()
     return m.HealthReport(
-        echo, _STATES[state], time_ns, gap, current, warmest, coolant, humidity, dew, applied, skipped, crc_errors,
+        echo, _STATES[state], time_ns, gap, current, warmest, coolant, humidity, dew, applied, skipped,
+        crc_errors,
         contaminated, owner, fault,
     )  # fmt: skip
 

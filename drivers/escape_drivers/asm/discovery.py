@@ -1,4 +1,4 @@
-"""Asks hosts for adaptive secondaries, without taking control."""
+"""Finds adaptive secondaries on given hosts, without taking control."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def discover(hosts: Sequence[str]) -> list[DiscoveredDevice]:
 
 
 def _ignore(message: m.Reply) -> None:
-    """What is told unasked does not matter here."""
+    """Ignore unsolicited messages."""
 
 
 def _make_entry(address: tuple[str, int], welcome: m.Welcome, health: m.HealthReport) -> DiscoveredDevice:

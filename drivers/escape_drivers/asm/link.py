@@ -31,7 +31,7 @@ class RequestRefused(DeviceError):
     Attributes
     ----------
     nak
-        What it said.
+        Text of the refusal.
     """
 
     def __init__(self, device: str, nak: m.Nak) -> None:
@@ -42,7 +42,7 @@ class RequestRefused(DeviceError):
 class AsmLink:
     """A TCP connection over which questions are answered one by one.
 
-    An exchange ends with its answer or it ends the connection: after a time-out nobody could tell a
+    An exchange ends with its answer or it ends the connection: after a time-out it is impossible to tell a
     late answer from the next one. Nothing is ever sent twice. Not thread-safe; the driver has a lock.
 
     Parameters
@@ -79,9 +79,9 @@ class AsmLink:
         self._sequence = self._counter = self._token = 0
         #: When the last answer came, on this computer's monotonic clock, seconds.
         self.last_reply_s = 0.0
-        #: Why there is no connection.
+        #: Reason for the missing connection.
         self.reason = "it was never connected"
-        #: Answers to questions that nobody asks any more.
+        #: Late answers to requests that have timed out.
         self.late_replies = 0
 
     @property
@@ -97,7 +97,7 @@ class AsmLink:
         Refused
             The mirror has an owner already, or speaks no version of ours.
         DeviceLost
-            Nobody answers there.
+            The host does not answer.
         """
         self.disconnect("it is being connected anew")
         host, port = self.address
@@ -106,7 +106,7 @@ class AsmLink:
         except OSError as error:
             self.reason = f"cannot be connected ({error})"
             raise DeviceLost(
-                self.name, f"nobody answers at {host}:{port} ({error}); check host, port, network and power"
+                self.name, f"no answer at {host}:{port} ({error}); check host, port, network and power"
             ) from error
         _configure_socket(sock)
         self._socket, self._codec, self._sequence = sock, self._make_codec(), 0
@@ -145,12 +145,12 @@ class AsmLink:
         return self._exchange(data, m.Ack)
 
     def _next_sequence(self) -> int:
-        """The next sequence number; 0 stands for what nobody asked."""
+        """The next sequence number; 0 marks unsolicited messages."""
         self._sequence = self._sequence % _MAX_SEQUENCE + 1
         return self._sequence
 
     def receive(self, timeout_s: float) -> list[m.Reply]:
-        """Whatever comes unasked within a time; what arrived together is delivered together.
+        """Unsolicited messages received within a time; messages that arrive together are returned together.
 
         Raises
         ------
@@ -166,7 +166,7 @@ class AsmLink:
         """Close the connection, if there is one."""
         if self._socket is not None:
             with contextlib.suppress(OSError):
-                # It may be gone already, which is all the same here.
+                # The connection may already be closed.
                 self._socket.close()
             self._socket, self.reason = None, reason
 
@@ -220,7 +220,7 @@ class AsmLink:
         return answer
 
     def _read(self, deadline: float) -> list[m.Reply]:
-        """Replies that arrive before a moment; at least one.
+        """Replies received before a deadline; at least one.
 
         Raises
         ------
@@ -255,7 +255,7 @@ class AsmLink:
 
 
 def _configure_socket(sock: socket.socket) -> None:
-    """Send at once, and have the system find out when the peer has gone without a word."""
+    """Disable Nagle's algorithm and enable keep-alive, which detects a peer that disappeared."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in (("TCP_KEEPIDLE", 1), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3)):

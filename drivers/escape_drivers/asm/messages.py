@@ -1,4 +1,4 @@
-"""What client and adaptive secondary say to each other, apart from how it looks on the wire.
+"""Messages between client and adaptive secondary, without their encoding.
 
 An observatory's own protocol keeps these and brings another codec, see :class:`Codec`.
 """
@@ -46,7 +46,7 @@ class Result(enum.IntEnum):
 class Hello:
     """First message of a connection.
 
-    ``token`` is that of a session to be resumed, 0 for a new one; ``name`` tells a second owner who
+    ``token`` is that of a session to be resumed, 0 for a new one; ``name`` tells a second client who
     has the mirror.
     """
 
@@ -62,7 +62,7 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class GetHealth:
-    """Asks for :class:`HealthReport`."""
+    """Request a :class:`HealthReport`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class Recover:
 
 @dataclass(frozen=True, slots=True)
 class SetDisabled:
-    """Take exactly these actuators out of service, beside those that the mirror itself took out."""
+    """Disable exactly these actuators, in addition to those disabled by the mirror."""
 
     actuators: tuple[int, ...]
     reason: str
@@ -87,7 +87,7 @@ class SetDisabled:
 
 @dataclass(frozen=True, slots=True)
 class GetParam:
-    """Ask for a parameter."""
+    """Request a parameter."""
 
     key: str
 
@@ -106,10 +106,10 @@ Request = Hello | Heartbeat | GetHealth | SetState | Recover | SetDisabled | Get
 # --------------------------------------------------------------------- replies
 @dataclass(frozen=True, slots=True, eq=False)
 class Welcome:
-    """Answer to :class:`Hello`: who the mirror is and what it allows.
+    """Answer to :class:`Hello`: identity and limits of the mirror.
 
     ``last_command_m`` is its shape ``(n_act,)`` in metres from flat, as last commanded; ``disabled`` are
-    the actuators out of service for whatever reason.
+    all disabled actuators.
     """
 
     echo: int
@@ -130,8 +130,8 @@ class Welcome:
 class Ack:
     """Answer to a command or heartbeat, with measured positions ``(n_act,)`` in metres from flat.
 
-    ``received_ns`` and ``applied_ns`` are on the mirror's clock; ``holding`` says that the watchdog
-    holds the last shape for want of news.
+    ``received_ns`` and ``applied_ns`` are on the mirror's clock; ``holding`` is true when the watchdog
+    holds the last shape because no message arrives.
     """
 
     echo: int
@@ -174,7 +174,7 @@ class Param:
 
 @dataclass(frozen=True, slots=True)
 class HealthReport:
-    """What the mirror says of itself; ``echo`` 0 when it speaks unasked."""
+    """Health of the mirror; ``echo`` is 0 in an unsolicited report."""
 
     echo: int
     state: ShellState
@@ -220,7 +220,7 @@ Reply = Welcome | Ack | Nak | Done | Param | HealthReport | FaultReport | Teleme
 
 
 class Codec(Protocol):
-    """Bytes for requests, replies for bytes; knows no socket and no clock of its own."""
+    """Encodes requests and decodes replies; uses no socket and no clock."""
 
     def request(self, sequence: int, time_ns: int, message: Request) -> bytes | bytearray:
         """The bytes of a request."""
@@ -236,5 +236,5 @@ class Codec(Protocol):
         Raises
         ------
         ProtocolError
-            What arrived is not this protocol; nothing after it is believed.
+            The bytes received are not this protocol; later bytes are ignored.
         """

@@ -33,7 +33,7 @@ _ROUNDING = 1e-6
 
 
 def require_identity(name: str, section: MirrorConfig, welcome: Welcome) -> None:
-    """Require the mirror that was meant; who only looks needs no more.
+    """Require the expected mirror; an observer needs no further checks.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def require_compatible(name: str, section: MirrorConfig, welcome: Welcome) -> tu
     section
         Its configuration.
     welcome
-        What the mirror says.
+        Welcome message of the mirror.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def require_compatible(name: str, section: MirrorConfig, welcome: Welcome) -> tu
 
 log = logging.getLogger(__name__)
 
-#: Pause between two looks at a step that is on its way, seconds.
+#: Interval between two checks of a state transition, seconds.
 _STEP_POLL_S = 0.02
 
 
@@ -189,7 +189,7 @@ class AsmMirror(AdaptiveSecondary):
         Raises
         ------
         NotOpen, DeviceError
-            Not connected, or the mirror knows no such parameter.
+            Not connected, or the parameter does not exist.
         """
         return self._parameter(m.GetParam(key))
 
@@ -226,7 +226,7 @@ class AsmMirror(AdaptiveSecondary):
         self._heartbeat_thread.start()
 
     def _apply_welcome(self, welcome: m.Welcome) -> None:
-        """Take over what the mirror says of itself when a connection begins."""
+        """Adopt identity and state of the mirror at the beginning of a connection."""
         disabled = require_compatible(self.name, self._section, welcome)
         self._update_info(welcome)
         if disabled:
@@ -258,12 +258,12 @@ class AsmMirror(AdaptiveSecondary):
 
     # ------------------------------------------------------------------ signs of life
     def _run_heartbeat(self) -> None:
-        """Give a sign of life whenever nothing else was said for a while; get a lost link back."""
+        """Send heartbeats when nothing else was sent for a while; restore a lost link."""
         pause = self._options.heartbeat_s
         while not self._stop.wait(pause / 4):
             if self._link.is_up and time.monotonic() - self._link.last_reply_s < pause:
                 continue
-            # Whoever holds the lock is talking to the mirror, which is a sign of life as well.
+            # A thread that holds the lock is exchanging messages, which also resets the watchdog.
             if self._lock.acquire(blocking=False):
                 try:
                     self._send_heartbeat()
@@ -278,7 +278,7 @@ class AsmMirror(AdaptiveSecondary):
             elif self.is_open and time.monotonic() > self._retry_at_s():
                 self._reconnect()
         except DeviceError as error:
-            # Nobody is there to raise it to; the next call meets it, too.
+            # There is no caller in this thread; the next call raises the error.
             if str(error) != self._last_warning:
                 log.warning("%s", error)
             self._last_warning = str(error)
@@ -286,7 +286,7 @@ class AsmMirror(AdaptiveSecondary):
             self._last_warning = ""
             if self._last_state is not before:
                 log.warning(
-                    "%s: went from %s to %s by itself %s",
+                    "%s: changed from %s to %s without a command %s",
                     self.name,
                     before,
                     self._last_state,
@@ -298,7 +298,7 @@ class AsmMirror(AdaptiveSecondary):
         return max(self._last_attempt_s, self._link.last_reply_s) + self._options.retry_s
 
     def _reconnect(self) -> None:
-        """Get a lost connection back; the mirror stays as it is, nothing is sent again."""
+        """Restore a lost connection; the mirror keeps its state, and nothing is sent again."""
         self._last_attempt_s = time.monotonic()
         welcome = self._link.connect()
         try:
@@ -396,8 +396,9 @@ class AsmMirror(AdaptiveSecondary):
         if ack.result is not m.Result.SKIPPED:
             raise DeviceError(
                 self.name,
-                f"changed a command ({ack.result.name.lower()}, {ack.clipped} actuators): some went out of "
-                "service, or its limits became tighter; open it again, which says what to configure",
+                f"changed a command ({ack.result.name.lower()}, {ack.clipped} actuators): "
+                "some were disabled, "
+                "or its limits became tighter; open it again to see what to configure",
             )
         self._skipped += 1
         self._consecutive_skips += 1

@@ -1,4 +1,4 @@
-"""Watches an adaptive secondary that somebody else controls."""
+"""Observes an adaptive secondary that another client controls."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from escape_hw.errors import FrameTimeout
 
 
 class AsmObserver:
-    """A connection over which the mirror tells its telemetry, health and faults; usable with ``with``.
+    """A connection that receives the mirror's telemetry, health and faults; a context manager.
 
-    Any number may watch. Who does not keep up gets the newest sample, not the oldest.
+    Any number of observers may connect. A slow observer gets the newest sample.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class AsmObserver:
     Attributes
     ----------
     health, fault
-        The last of either that was told, or ``None``.
+        The last report of either kind, or ``None``.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class AsmObserver:
         Raises
         ------
         DeviceError
-            Nobody answers, or the mirror refuses.
+            The host does not answer, or the mirror refuses.
         """
         self._link.connect()
         return self

@@ -1,12 +1,12 @@
-"""What ``[devices.dm.options]`` may say for the driver ``asm``."""
+"""Options of the driver ``asm`` in ``[devices.dm.options]``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: Where ``escape emulate asm`` listens unless told otherwise; ours, as the protocol is.
+#: Default port of ``escape emulate asm``.
 DEFAULT_PORT = 7336
-#: Host that stands for an emulator inside this process, whose actuators are those of the twin.
+#: Host name of an emulator inside this process with the twin's actuators.
 EMULATOR = "emulator"
 
 #: Smallest and largest value of each number.
@@ -28,7 +28,7 @@ class AsmOptions:
     Parameters
     ----------
     host, port
-        Where the mirror's gateway listens; host ``"emulator"``: one inside this process, whose
+        Address of the mirror's gateway; host ``"emulator"``: an emulator inside this process, whose
         actuators are those of the simulated bench.
     lift
         Lead the mirror to ``RUNNING`` when it is opened.

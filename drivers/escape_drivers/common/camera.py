@@ -28,7 +28,7 @@ class FrameCounter:
     ----------
     first, last
         After ``last`` comes ``first`` again (a 32-bit counter: 0 and 2**32 - 1; GigE Vision's short block
-        identifiers: 1 and 65535). A device whose numbers go beyond ``last`` never starts over.
+        identifiers: 1 and 65535). A device whose numbers exceed ``last`` does not wrap.
     """
 
     def __init__(self, first: int, last: int) -> None:
@@ -48,7 +48,7 @@ class CameraClock:
     """Puts a camera's own time stamps on this computer's monotonic clock.
 
     Spacing comes from the camera, which knows when it exposed. The offset is that of the frame that came
-    through quickest so far, counted from ``start``: so no frame is said to be exposed after it arrived.
+    through fastest since ``start``, so that no exposure time is later than the arrival.
     """
 
     def __init__(self) -> None:
@@ -74,15 +74,15 @@ class CameraClock:
 
 log = logging.getLogger(__name__)
 
-#: Longest wait inside a library; ``stop`` and ``close`` come through this soon, whatever the time-out.
+#: Maximum wait inside a library call; ``stop`` and ``close`` wait no longer than this.
 MAX_WAIT_MS = 50
 
 
 class BlockingCamera(Camera):
     """A camera read through a blocking call, which is made in short slices.
 
-    Drivers fill in ``_start_acquisition``, ``_stop_acquisition``, ``_read_frame`` and ``_disconnect`` in place of ``_start``, ``_stop``,
-    ``_next_frame`` and ``_close``; none of them runs while another does.
+    Drivers fill in ``_start_acquisition``, ``_stop_acquisition``, ``_read_frame`` and ``_disconnect`` in
+    place of ``_start``, ``_stop``, ``_next_frame`` and ``_close``; they exclude each other.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class BlockingCamera(Camera):
     section
         Serial number, sensor, region, exposure and rate to begin with.
     kind
-        What kind of camera it is, until it tells.
+        Kind of camera, until the device reports its model.
     counter
         First and last number of its frame counter.
     """
@@ -149,7 +149,7 @@ class BlockingCamera(Camera):
         return CameraInfo(named, section.serial, sensor, section.bit_depth, simulated=stand_in)
 
     def _require_sensor(self, found: tuple[int, int], alternative: str) -> None:
-        """Refuse a camera whose sensor is not the configured one (width, height)."""
+        """Refuse a camera whose sensor size differs from the configured one (width, height)."""
         stated = self._section.sensor_px
         if found != stated:
             raise DeviceError(
@@ -170,13 +170,13 @@ class BlockingCamera(Camera):
     def _check(self, want: CameraSettings) -> CameraSettings:
         answer = self._require_limits().nearest_valid(self.name, want, self._max_exposure_s(want))
         now = self._settings
-        # The camera tells its rates for the region and exposure it has; others are found out by trying.
+        # The camera reports rates for its present region and exposure; others are found by trying.
         if answer.region == now.region and answer.exposure_s >= now.exposure_s:
             self._require_rate(answer)
         return answer
 
     def _require_rate(self, want: CameraSettings) -> None:
-        """Refuse a rate outside the limits that the camera tells at present."""
+        """Refuse a rate outside the camera's present limits."""
         slowest, fastest = self._min_rate_hz, self._max_rate_hz
         if want.frame_rate_hz > fastest * (1 + TOLERANCE):
             raise SettingRejected(
@@ -187,7 +187,7 @@ class BlockingCamera(Camera):
         if want.frame_rate_hz < slowest * (1 - TOLERANCE):
             raise SettingRejected(
                 self.name,
-                f"frame_rate_hz is {want.frame_rate_hz:g}; the camera goes no slower than {slowest:g}",
+                f"frame_rate_hz is {want.frame_rate_hz:g}; the camera's minimum is {slowest:g}",
             )
 
     def _configure(self, settings: CameraSettings) -> None:
@@ -242,7 +242,7 @@ class BlockingCamera(Camera):
             self._acquiring = not self._attempt(self._stop_acquisition)
 
     def _attempt(self, step: Callable[[], None]) -> bool:
-        """Take a step of stopping or closing, which a camera that has gone cannot; false when it failed."""
+        """Run a step of stopping or closing; returns false if it failed, as with a disconnected camera."""
         try:
             step()
         except DeviceError as error:

@@ -53,7 +53,7 @@ class CameraLimits:
     gain: ParameterRange
 
     def nearest_valid(self, device: str, want: CameraSettings, max_exposure_s: float) -> CameraSettings:
-        """The nearest settings, but for the frame rate; exposures are no longer than ``max_exposure_s``.
+        """The nearest settings except the frame rate; exposures are at most ``max_exposure_s``.
 
         Raises
         ------
@@ -66,7 +66,7 @@ class CameraLimits:
         )
 
     def region(self, want: Region) -> Region:
-        """The largest region on the sensor's increments that is within the one asked for, where possible."""
+        """The largest region on the sensor's increments within the requested one, where possible."""
         width, height = round(self.width.round_down(want.width)), round(self.height.round_down(want.height))
         x = min(want.x, round(self.width.high) - width)
         y = min(want.y, round(self.height.high) - height)

@@ -10,7 +10,7 @@ from typing import Any
 
 from escape_hw.errors import DeviceError
 
-#: Exported by the stand-ins of this project and by nothing else.
+#: Symbol that only the stand-ins of this project export.
 _STAND_IN = "escape_stand_in"
 
 
@@ -23,7 +23,7 @@ class VendorLibrary:
     what
         Name for people, such as "ALPAO SDK".
     default
-        File names that the system's loader is asked for, the preferred one first.
+        File names for the system's loader, the preferred one first.
     variable
         Environment variable that may hold a path.
     source
@@ -41,14 +41,14 @@ class VendorLibrary:
         Parameters
         ----------
         device
-            Who needs it, for messages.
+            Device that needs it, for messages.
         path
             File or name; empty: the environment variable decides, and then the default name.
 
         Raises
         ------
         DeviceError
-            There is no such library, or it cannot be loaded.
+            The library is missing or cannot be loaded.
         """
         chosen = path or os.environ.get(self.variable, "")
         failures = []
@@ -94,7 +94,7 @@ def require_symbols(device: str, library: ctypes.CDLL, names: Sequence[str]) -> 
     Raises
     ------
     DeviceError
-        It is another library, or too old a version.
+        It is another library, or its version is too old.
     """
     loaded_as = vars(library).get("_name", "the library")
     missing = [name for name in names if not hasattr(library, name)]
@@ -105,5 +105,5 @@ def require_symbols(device: str, library: ctypes.CDLL, names: Sequence[str]) -> 
 
 
 def is_stand_in(library: ctypes.CDLL) -> bool:
-    """True for a stand-in of this project, which has no metal behind it."""
+    """True for a stand-in of this project, which drives no hardware."""
     return hasattr(library, _STAND_IN)

@@ -1,4 +1,4 @@
-"""Makes a PI stage turn in a circle, looks whether it is one, and makes it rounder."""
+"""Circular motion of a PI stage: wave tables, measurement of the circle, correction."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class CircleGenerator:
         Raises
         ------
         SettingRejected
-            Too fast, or beyond the travel.
+            The frequency is too high, or the radius exceeds the travel.
         """
         turn, servo_s = self._timing(want), self._travel.servo_s
         if turn.servo_periods < self._stage.min_points:
@@ -207,7 +207,7 @@ class CircleGenerator:
         return pi_circle.response_from_row(near[0]) if near else (1 + 0j, 1 + 0j)
 
     def _is_measurable(self, modulation: Modulation) -> bool:
-        """Whether the recorder is to look at this circle."""
+        """Whether the circle is checked with the recorder."""
         is_moving = modulation.radius_rad > 0 and modulation.frequency_hz >= _SLOWEST_HZ
         return self._stage.correction_source == "recorder" and is_moving
 
@@ -217,7 +217,7 @@ class CircleGenerator:
         found, _ = pi_circle.fit_phasors(*self._record(turn))
         if (np.abs(found[2:]) == 0).any():
             raise DeviceError(
-                self._name, "recorded targets that stand still; see DRC? for what its recorder offers"
+                self._name, "recorded targets that do not move; see DRC? for the recorder's options"
             )
         x, y = (complex(place / target) for place, target in zip(found[:2], found[2:], strict=True))
         return x, y
@@ -230,14 +230,14 @@ class CircleGenerator:
         return self._controller.record(points, rate, self._sleep, self._travel.servo_s), samples_per_turn
 
     def read_modulation(self) -> Modulation | None:
-        """A modulation that somebody left in force, by tables and recorder; moves nothing."""
+        """A running modulation found on the controller, from tables and recorder; moves nothing."""
         if not all(self._controller.running()):
             return None
         turn, waves = self._controller.read_waves()
         frequency = turn.frequency_hz(self._travel.servo_s)
         records, samples_per_turn = np.stack(waves, axis=1), float(turn.points)
         if frequency >= _SLOWEST_HZ:
-            # Not what the tables ask for, but what the axes make of it.
+            # The motion of the axes, not the command in the tables.
             records, samples_per_turn = self._record(turn)
         found, means = pi_circle.fit_phasors(records[:, :2], samples_per_turn)
         centre = self._travel.tilts(means)

@@ -26,7 +26,7 @@ _SERVO_PERIOD = 0x0E000200
 _QUERY_RUNNING = 9
 #: Error that every stop leaves.
 _ERROR_STOPPED = 10
-#: How often a stage on its way is asked whether it has arrived, in seconds.
+#: Interval of on-target queries while the stage moves, in seconds.
 _POLL_S = 0.01
 #: Values of a line of points: the other five arguments are table, how, kind, first and number.
 _POINTS_PER_LINE = pi_gcs.MAX_ARGUMENTS - 5
@@ -53,10 +53,10 @@ class E727:
         self.link, self.axes = link, axes
         self._generator_bits: list[int] | None = None
 
-    # ------------------------------------------------------------------ who and what
+    # ------------------------------------------------------------------ identity
     @property
     def model(self) -> str:
-        """Model, as the controller tells it."""
+        """Model, as the controller reports it."""
         return self._identity_field(1)
 
     @property
@@ -65,7 +65,7 @@ class E727:
         return self._identity_field(2)
 
     def _identity_field(self, field: int) -> str:
-        # Maker, model, serial number, firmware; the maker's name may hold commas of its own.
+        # Maker, model, serial number, firmware; the maker's name may contain commas.
         fields = [text.strip() for text in self.link.identity.rsplit(",", 3)]
         return fields[field] if len(fields) == 4 else ""
 
@@ -90,7 +90,7 @@ class E727:
         Raises
         ------
         Garbled
-            A unit that is no angle.
+            The unit is not an angle.
         """
 
         def parse(reply: list[str]) -> float:
@@ -181,7 +181,7 @@ class E727:
         return [text == "1" for text in self._query_axes("ATZ?", pi_gcs.values)]
 
     def clear_error(self) -> None:
-        """Ask away an error that no command of ours has left, lest the next one be blamed for it."""
+        """Read and discard an earlier error, so that it is not attributed to the next command."""
         number = self.link.query(_parse_number, "ERR?")
         if number:
             log.warning("%s", GcsError(self.link.name, number, "something before"))
@@ -199,7 +199,7 @@ class E727:
             raise GcsError(self.link.name, number, cause)
 
     def stop_all(self) -> None:
-        """Stop all motion, auto-zero too; the error that this leaves is expected."""
+        """Stop all motion including auto-zero; the resulting error is expected."""
         try:
             self.link.send_command("STP")
         except GcsError as stopped:
@@ -250,7 +250,7 @@ class E727:
         self._verify_readback("WGO", [0, 0], [float(runs) for runs in self.running()], 0)
 
     def running(self) -> list[bool]:
-        """Which of the axes' generators run: a mask over all axes, asked with a single byte."""
+        """Running wave generators: a mask over all axes, queried with a single byte."""
         if self._generator_bits is None:
             order = self.axis_names()
             if not set(self.axes) <= set(order):
@@ -299,7 +299,7 @@ class E727:
     ) -> NDArray[np.float64]:
         """Positions, then targets of both axes ``(points, 4)``, every ``rate`` servo periods from now on.
 
-        Targets come along because nobody promises at which point of the turn a recording begins.
+        Targets are recorded as well, because a recording may begin at any point of the turn.
 
         Parameters
         ----------

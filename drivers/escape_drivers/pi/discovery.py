@@ -1,4 +1,7 @@
-"""Asks hosts for PI controllers. A controller serves one client: it is left at once."""
+"""Finds PI controllers on given hosts.
+
+A controller serves one client, so the connection is closed at once.
+"""
 
 from __future__ import annotations
 

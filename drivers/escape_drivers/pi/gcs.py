@@ -2,7 +2,10 @@
 
 Formats commands, parses replies, maps error numbers; no input or output.
 
-Rules from the manual of the E-727 (E727T0005): a command is a mnemonic and at most 32 arguments, ended by a line feed. Every line of a reply but the last ends with a blank before the line feed. Values come as ``1=0.000000000e+00``, arrays behind a header of ``# KEY = value`` that ends with ``# END_HEADER``. USB pads with NUL.
+Rules from the manual of the E-727 (E727T0005): a command is a mnemonic and at most 32 arguments, ended by a
+line feed. Every line of a reply but the last ends with a blank before the line feed. Values come as
+``1=0.000000000e+00``, arrays behind a header of ``# KEY = value`` that ends with ``# END_HEADER``. USB pads
+with NUL.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ _ERRORS: dict[int, tuple[str, str]] = {
     8: ("velocity out of range", _DRIVER_DEFECT),
     10: (
         "stopped by a stop command",
-        "see who stopped it (another program, the front panel), then start again",
+        "find what stopped it (another program, the front panel), then start again",
     ),
     15: ("invalid axis", _AXES_HINT),
     17: ("parameter out of range", _DRIVER_DEFECT),
@@ -71,9 +74,7 @@ class GcsError(DeviceError):
     """The controller refused a command; ``number`` is its error."""
 
     def __init__(self, device: str, number: int, command: str) -> None:
-        text, remedy = _ERRORS.get(
-            number, ("an error this driver does not know", "see the controller's manual")
-        )
+        text, remedy = _ERRORS.get(number, ("unknown error number", "see the controller's manual"))
         super().__init__(device, f"refused '{command}': error {number}, {text}; {remedy}")
         self.number = number
 
@@ -95,7 +96,7 @@ MAX_ARGUMENTS, MAX_REPLY = 32, 8 << 20
 
 
 class MalformedReply(Exception):
-    """A reply that is none to what was asked: link and controller no longer speak of the same thing."""
+    """A reply that does not match the question: link and controller are out of step."""
 
 
 def format_command(mnemonic: str, *arguments: str | float) -> bytes:
@@ -133,7 +134,7 @@ class ReplyReader:
 
     @property
     def pending(self) -> int:
-        """Bytes that belong to no complete reply yet, or that nobody took."""
+        """Bytes of an incomplete or unread reply."""
         return len(self._buffer)
 
     def feed(self, data: bytes) -> None:

@@ -16,20 +16,20 @@ from escape_hw.errors import DeviceError, DeviceLost
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 
-#: What every controller of this maker says of itself.
+#: Beginning of every identity of this maker.
 _MANUFACTURER = "Physik Instrumente"
 #: A long reply may take so many times the time-out, as long as some of it comes within each.
 _MAX_REPLY_TIMEOUTS = 10
 
 
 class CommandUnconfirmed(DeviceError):
-    """A command was sent whose confirmation never came; nobody knows whether it was carried out."""
+    """A command was sent but not confirmed; whether it was executed is unknown."""
 
 
 class GcsLink:
     """One controller at the other end of a wire.
 
-    A question whose answer is lost or nonsense is asked once more, after both ends have been brought
+    A question whose answer is lost or invalid is repeated once, after both ends have been brought
     together again: an identity question goes out, and everything up to its answer is thrown away. A
     dead peer is noticed within three times ``timeout_s``; from then on every call fails at once.
 
@@ -54,12 +54,12 @@ class GcsLink:
 
     # ------------------------------------------------------------------ connection
     def open(self) -> None:
-        """Connect, and learn who is there.
+        """Connect and read the identity.
 
         Raises
         ------
         DeviceLost
-            Nobody, or nobody who speaks this language.
+            No device answers, or it does not speak GCS.
         """
         with self._lock:
             self._reader.clear()
@@ -97,7 +97,7 @@ class GcsLink:
         Refused
             The controller does not answer that question.
         DeviceLost
-            The peer is dead or gone.
+            The connection is lost.
         """
         with self._lock:
             return self._query(parse, pi_gcs.format_command(question, *arguments))
@@ -110,7 +110,7 @@ class GcsLink:
             )
 
     def send_command(self, command: str, *arguments: str | float, repeatable: bool = True) -> None:
-        """Give a command and ask how it went.
+        """Send a command and read the error number.
 
         Parameters
         ----------
@@ -122,9 +122,9 @@ class GcsLink:
         Refused
             The controller refused it.
         Unconfirmed
-            Nobody knows.
+            Whether the command was executed is unknown.
         DeviceLost
-            The peer is dead or gone.
+            The connection is lost.
         """
         text = pi_gcs.format_command(command, *arguments)
         with self._lock:
@@ -152,8 +152,8 @@ class GcsLink:
                 if last:
                     raise DeviceError(
                         self.name,
-                        f"'{_format_for_message(text)}' was not answered sensibly, twice ({cause}); see the wiring and "
-                        "whether another program speaks to the controller, then open again",
+                        f"'{_format_for_message(text)}' got two invalid answers ({cause}); see the wiring "
+                        "and whether another program uses the controller, then open it again",
                     ) from cause
         raise AssertionError("not reached")
 
@@ -171,12 +171,10 @@ class GcsLink:
         return parse(reply)
 
     def _discard_stale_input(self) -> None:
-        """What lies there before a question is no answer to it."""
+        """Discard bytes received before a question."""
         stale = self._transport.read(0.0)
         if stale or self._reader.pending:
-            log.warning(
-                "%s: %d bytes that nobody had asked for", self.name, len(stale) + self._reader.pending
-            )
+            log.warning("%s: %d unsolicited bytes discarded", self.name, len(stale) + self._reader.pending)
             self._reader.clear()
 
     def _receive_reply(self) -> list[str] | None:
@@ -191,7 +189,7 @@ class GcsLink:
     def _receive_until(self, deadline: float) -> list[str] | None:
         """The next complete reply; ``None`` when it does not come in time.
 
-        What has arrived by the deadline counts, even if this thread was not let run meanwhile.
+        Bytes received by the deadline count, even if this thread did not run.
         """
         is_last = False
         while True:
@@ -223,7 +221,7 @@ class GcsLink:
             # Twice, for the answer to this question may be the one that gets lost.
             for _ in range(2):
                 self._reader.clear()
-                # The line feed ends whatever half a command may still lie at the other end.
+                # The line feed ends a partial command at the controller.
                 self._transport.write(b"\n*IDN?\n")
                 if self._await_identity(time.monotonic() + self._timeout_s):
                     self._transport.write(b"ERR?\n")
@@ -246,13 +244,13 @@ class GcsLink:
             if self.identity and reply[-1].endswith(self.identity):
                 return True
             if not self.identity and _MANUFACTURER in reply[-1]:
-                # What an unfinished reply of an earlier session left before it does not belong to it.
+                # Bytes of an unfinished reply of an earlier session may precede it.
                 self.identity = reply[-1][max(reply[-1].rfind("(c)"), 0) :].strip()
                 return True
         return False
 
     def _await_number(self, deadline: float) -> int | None:
-        """The answer to ``ERR?`` behind what still comes of the identity; ``None`` if none comes in time."""
+        """The answer to ``ERR?`` after remaining identity replies; ``None`` without one in time."""
         for reply in self._replies(deadline):
             if not reply[-1].endswith(self.identity):
                 return _parse_error_number(reply) if reply[-1].strip().isdigit() else None
@@ -271,13 +269,13 @@ class GcsLink:
     def _unconfirmed_error(self, text: bytes, cause: MalformedReply) -> CommandUnconfirmed:
         return CommandUnconfirmed(
             self.name,
-            f"'{_format_for_message(text)}' was not confirmed ({cause}); the link works again, but whether the "
-            "command was carried out is unknown: park, then start again",
+            f"'{_format_for_message(text)}' was not confirmed ({cause}); the link works again, but "
+            "whether the command was executed is unknown: park, then start again",
         )
 
 
 def _parse_error_number(reply: list[str]) -> int:
-    """The number that ``ERR?`` tells."""
+    """The number returned by ``ERR?``."""
     return pi_gcs.parse_int(pi_gcs.parse_single_line(reply))
 
 

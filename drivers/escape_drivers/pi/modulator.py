@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: How often auto-zero is asked whether it has ended, in seconds.
+#: Interval of queries for the end of auto-zero, in seconds.
 _POLL_S = 0.05
 
 
@@ -87,9 +87,10 @@ def _auto_zero(name: str, controller: E727, stage: StageConfig, sleep: Callable[
             sleep(_POLL_S)
 
 
-#: What becomes of a stage that nobody can reach.
+#: State of a stage after the link is lost.
 _UNREACHABLE_NOTE = (
-    "the stage goes on as it was; opening it again stops and centres it, cutting its power lets it go"
+    "the stage continues its motion; opening it again stops and centres it, switching off its power "
+    "releases it"
 )
 
 
@@ -128,7 +129,7 @@ class PiModulator(TipTiltModulator):
     stopped, centre, servos off, no volts. A turning circle is measured with the controller's recorder
     and made round; both axes start in the same servo cycle.
 
-    When the link is lost the stage goes on as it was, for nobody can reach it: every call says so at
+    When the link is lost the stage continues its motion and cannot be reached: every call raises this at
     once, and opening anew stops and centres it.
 
     Parameters
@@ -159,22 +160,22 @@ class PiModulator(TipTiltModulator):
 
     @property
     def info(self) -> ModulatorInfo:
-        """Identity and reach, as the controller tells them."""
+        """Identity and travel, as the controller reports them."""
         return self._require_connection().info
 
     @property
     def modulation(self) -> Modulation | None:
-        """The modulation in force; the controller is asked whether it still turns."""
+        """The present modulation; the controller is asked whether it still runs."""
         if self._connection is None:
             return None
-        # Nobody knows what a stage does that has been lost.
+        # The state of a stage without a link is unknown.
         self._connection.controller.link.require_connected()
         if self._modulation is None:
             return None
         with self._translate_errors():
             if all(self._connection.controller.running()):
                 return self._modulation
-        log.warning("%s: no longer turns; somebody or something else stopped it", self.name)
+        log.warning("%s: no longer runs; it was not stopped by this driver", self.name)
         self._modulation = None
         return None
 
@@ -220,13 +221,13 @@ class PiModulator(TipTiltModulator):
             connection.controller.link.close()
 
     def _abort_start_up(self, controller: E727) -> None:
-        """Stop whatever a start-up had begun, then switch off."""
+        """Stop an unfinished start-up, then switch off."""
         if controller.link.is_alive:
             controller.stop_all()
         self._switch_off(controller)
 
     def _switch_off(self, controller: E727) -> None:
-        """Servos off and no volts, unless the link has been lost before, which was told then."""
+        """Servos off and zero volts, unless the link was lost before."""
         if controller.link.is_alive:
             shut_down(controller)
 
@@ -244,7 +245,7 @@ class PiModulator(TipTiltModulator):
             lost.add_note(_UNREACHABLE_NOTE)
             raise
         except DeviceError as failure:
-            # A circle that is not the one asked for is worse than none.
+            # A wrong circle is worse than none.
             self._clean_up(self._park, failure)
             raise
         self._modulation = modulation
@@ -313,5 +314,5 @@ class PiModulator(TipTiltModulator):
             yield
         except MalformedReply as error:
             raise DeviceError(
-                self.name, f"said something unexpected: {error}; see the bench checklist"
+                self.name, f"sent an unexpected reply: {error}; see the bench checklist"
             ) from error

@@ -25,7 +25,7 @@ _RECEIVE_BYTES = 65536
 
 
 class TransportLost(Exception):
-    """The wire is gone; the message says what to look at."""
+    """The transport is lost; the message says what to check."""
 
 
 class Transport(Protocol):
@@ -45,7 +45,7 @@ class Transport(Protocol):
         Raises
         ------
         WireLost
-            Nobody is there.
+            No device answers.
         """
         ...
 
@@ -59,7 +59,7 @@ class Transport(Protocol):
         Raises
         ------
         WireLost
-            The wire is gone, or takes nothing any more.
+            The transport is lost or accepts no more bytes.
         """
         ...
 
@@ -69,7 +69,7 @@ class Transport(Protocol):
         Raises
         ------
         WireLost
-            The wire is gone.
+            The transport is lost.
         """
         ...
 
@@ -127,7 +127,7 @@ class TcpTransport:
     def read(self, timeout_s: float) -> bytes:
         """What has arrived."""
         wire = self._require_connected()
-        # Zero means "do not wait at all": the least that the kernel waits is a millisecond.
+        # Zero means "do not wait at all"; the kernel's minimum wait is a millisecond.
         wire.settimeout(timeout_s)
         try:
             data = wire.recv(_RECEIVE_BYTES)
@@ -183,7 +183,7 @@ class SerialTransport:
                 f"cannot open {self.where} ({error}); is the cable plugged in, are you in the group "
                 "'dialout', and does no other program hold it (also ModemManager and brltty)?"
             ) from error
-        # What an earlier owner left in the buffers is no answer to us.
+        # Discard bytes that an earlier program left in the buffers.
         self._serial.reset_input_buffer()
 
     def close(self) -> None:
@@ -210,7 +210,7 @@ class SerialTransport:
             first: bytes = line.read(1)
             return first + bytes(line.read(line.in_waiting)) if first else b""
         except (OSError, TypeError) as error:
-            # pyserial trips over its own closed handle with a TypeError when the line is closed meanwhile.
+            # pyserial raises TypeError when the line is closed during a call.
             raise self._lost_error(error) from error
 
     def _require_open(self) -> Any:
@@ -306,7 +306,7 @@ class UsbTransport:
                 self._detached.append(number)
         except NotImplementedError:
             # pyusb's word for a backend without kernel drivers: there is none to take the controller from.
-            log.debug("%s: this USB backend knows no kernel drivers", self.where)
+            log.debug("%s: this USB backend has no kernel drivers", self.where)
         usb.util.claim_interface(self._device, number)
         for endpoint in interface:
             if usb.util.endpoint_type(endpoint.bmAttributes) != usb.util.ENDPOINT_TYPE_BULK:
@@ -391,7 +391,7 @@ def make_transport(section: ModulatorConfig, config: SystemConfig, shared: dict[
     Raises
     ------
     ConfigError
-        An emulator is asked for and none is installed, or the environment holds no address.
+        An emulator is requested and none is installed, or the environment has no address.
     """
     wire = section.wire
     if address := os.environ.get(ADDRESS_VARIABLE):

@@ -1,4 +1,4 @@
-"""What a PI controller says of the stage at its axes, checked against the configuration."""
+"""Axes and travel of the stage, read from the controller and checked against the configuration."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class AxisTravel:
 
 
 def read_travel(name: str, controller: E727, section: ModulatorConfig) -> AxisTravel:
-    """Make sure that it is the right controller, and ask what its axes can do; moves nothing.
+    """Check the controller's identity and read the limits of its axes; moves nothing.
 
     Raises
     ------

@@ -119,7 +119,7 @@ def fit_phasors(
     Raises
     ------
     ValueError
-        Less than a whole turn, which tells nothing.
+        The data cover less than a whole turn.
     """
     if len(records) < samples_per_turn:
         raise ValueError(f"{len(records)} samples are less than a turn of {samples_per_turn:g}")
@@ -138,6 +138,6 @@ def response_to_row(
 
 
 def response_from_row(row: tuple[float, float, float, float, float]) -> tuple[complex, complex]:
-    """The response that a row of ``stage.corrections`` stands for."""
+    """Response of a row of ``stage.corrections``."""
     _, x, y, lag_x, lag_y = row
     return cmath.rect(x, -math.radians(lag_x)), cmath.rect(y, -math.radians(lag_y))

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig
     from escape_hw.config.system import SystemConfig
 
-#: How long an opening camera watches the stream to learn its rate: frames and seconds, whichever is first.
+#: Frames and seconds, whichever comes first, in which the rate is measured on opening.
 _RATE_FRAMES, _RATE_TIMEOUT_S = 40, 1.0
-#: Fewer frames than these tell no rate.
+#: Minimum number of frames for a rate.
 _MIN_RATE_FRAMES = 5
 _COUNTER_RANGE = (0, 2**63 - 1)
 
@@ -39,7 +39,7 @@ class StreamCameraOptions:
     offset
         Counts added to every pixel, for streams that have had a dark frame subtracted.
     simulated
-        What fills the stream is a simulator; whatever is made of it says so.
+        The stream is filled by a simulator; results are marked as simulated.
     """
 
     stream: str = ""
@@ -53,7 +53,7 @@ def make_pyrtc_camera(name: str, config: SystemConfig, shared: dict[str, object]
     Raises
     ------
     ConfigError
-        No such camera, no stream named, or an option that this driver does not know.
+        The camera or its stream is missing, or an option is unknown.
     """
     return _build(name, config, open_pyrtc, "pyRTC stream")
 
@@ -64,7 +64,7 @@ def make_milk_camera(name: str, config: SystemConfig, shared: dict[str, object])
     Raises
     ------
     ConfigError
-        No such camera, no stream named, or an option that this driver does not know.
+        The camera or its stream is missing, or an option is unknown.
     """
     return _build(name, config, open_milk, "milk image")
 
@@ -76,11 +76,11 @@ def _build(name: str, config: SystemConfig, opener: Opener, kind: str) -> Stream
 
 
 class StreamCamera(BlockingCamera):
-    """A camera whose frames somebody else takes and publishes.
+    """A camera whose frames another program acquires and publishes.
 
     Its numbers are those of the writes, so a write that was overwritten before it was read is a lost frame.
-    Exposure and gain are stated as configured, for nobody can be asked; the rate is measured on opening,
-    while frames come. A region is cut out of the stream.
+    Exposure and gain are reported as configured, because the stream has no metadata; the rate is measured on
+    opening, while frames come. A region is cut out of the stream.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ class StreamCamera(BlockingCamera):
             stream.close()
 
     def _check(self, want: CameraSettings) -> CameraSettings:
-        """Any region; the rest is somebody else's to set."""
+        """Any region; other settings belong to the publishing program."""
         return replace(self._settings, region=want.region)
 
     def _apply_settings(self, want: CameraSettings) -> CameraSettings:
@@ -136,10 +136,10 @@ class StreamCamera(BlockingCamera):
         self._last_count, self._written_ns = self._require_connected().count, 0
 
     def _stop_acquisition(self) -> None:
-        """Nothing to stop: who publishes goes on."""
+        """Nothing to stop: the publishing program continues."""
 
     def _timeout_hint(self) -> str:
-        return f"who writes the stream '{self._options.stream}'"
+        return f"the program that writes the stream '{self._options.stream}'"
 
     def _read_frame(self, wait_ms: int) -> Frame | None:
         try:

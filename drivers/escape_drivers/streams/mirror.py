@@ -30,7 +30,7 @@ class StreamMirrorOptions:
     scale
         What the stream holds for a command of 1, full stroke.
     simulated
-        What reads the stream is a simulator; whatever is made with it says so.
+        The stream is read by a simulator; results are marked as simulated.
     """
 
     stream: str = ""
@@ -44,7 +44,7 @@ def make_pyrtc_mirror(name: str, config: SystemConfig, shared: dict[str, object]
     Raises
     ------
     ConfigError
-        No stream named, or an option that this driver does not know.
+        The stream is missing, or an option is unknown.
     """
     return _build(name, config, open_pyrtc, "pyRTC stream")
 
@@ -55,7 +55,7 @@ def make_milk_mirror(name: str, config: SystemConfig, shared: dict[str, object])
     Raises
     ------
     ConfigError
-        No stream named, or an option that this driver does not know.
+        The stream is missing, or an option is unknown.
     """
     return _build(name, config, open_milk, "milk image")
 
@@ -68,10 +68,10 @@ def _build(name: str, config: SystemConfig, opener: Opener, kind: str) -> Stream
 
 
 class StreamMirror(DeformableMirror):
-    """A mirror whose commands somebody else reads and sends.
+    """A mirror whose commands another program reads and sends.
 
-    The stream holds a number for each actuator, or a map of the layout with the actuators where they stand.
-    Nobody acknowledges: a command counts as sent once it is published.
+    The stream holds one number per actuator, or a map of the actuator layout.
+    There is no acknowledgement: a command counts as sent when it is published.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Where a stream that stands for a device comes from."""
+"""Configuration of a stream that replaces a device."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def open_stream(device: str, opener: Opener, name: str, *, write: bool) -> Strea
     Raises
     ------
     DeviceError
-        It cannot be opened, or does not hold numbers.
+        The stream cannot be opened or does not contain numbers.
     """
     try:
         stream = opener(name, write)
@@ -50,7 +50,7 @@ def open_stream(device: str, opener: Opener, name: str, *, write: bool) -> Strea
 
 
 def with_stream_serial(device: str, section: S, stream: str) -> S:
-    """A device section whose serial number, if it has none, says which stream stands for the device.
+    """A device section; without a serial number, the stream's name is used.
 
     Raises
     ------

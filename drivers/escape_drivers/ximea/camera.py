@@ -33,7 +33,7 @@ _RANGES = {
     "downsampling": (1, 16), "queue": (2, 1000), "gpi": (1, 16), "trigger_margin": (0, 0.5),
     "bandwidth_mbit": (0, 100_000),
 }  # fmt: skip
-#: Never a frame number; stays where the library is too old to fill the field.
+#: Not a frame number; remains when the library is too old to fill the field.
 _NO_FRAME_NUMBER = 2**32 - 1
 
 
@@ -50,7 +50,7 @@ class XimeaOptions:
     format
         Both carry more than 8 bits right-aligned in 16.
     newest
-        Skip to the newest frame when late, as a loop wants; false: queue them.
+        Skip to the newest frame when late, as a loop needs; false: queue frames.
     queue
         Frames that the library buffers.
     trigger, gpi
@@ -61,9 +61,9 @@ class XimeaOptions:
     exposure_output
         Whether output 1 is high while the camera exposes.
     zero_rot
-        The sensor's readout without row overhead; ``""`` leaves it as it is.
+        The sensor's readout without row overhead; ``""``: unchanged.
     bandwidth_mbit
-        Limit of the data rate in megabits per second; 0 leaves it as it is.
+        Limit of the data rate in megabits per second; 0: unchanged.
     """
 
     library: str = ""
@@ -115,7 +115,7 @@ def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> X
     Raises
     ------
     ConfigError
-        No such camera, no serial number, or an option that this driver does not know.
+        The camera or its serial number is missing, or an option is unknown.
     """
     section = camera_section(name, config)
     require_serial(name, section)
@@ -170,7 +170,7 @@ class XimeaCamera(BlockingCamera):
         Raises
         ------
         NotOpen, DeviceError
-            The camera is not connected, or does not tell.
+            The camera is not connected, or does not report it.
         """
         self.require_open()
         with self._read_lock:
@@ -265,7 +265,7 @@ class XimeaCamera(BlockingCamera):
         return self._make_frame(view, number, image.tsSec * 1_000_000_000 + image.tsUSec * 1000)
 
     def _frame_view(self, image: XiImage) -> NDArray[np.uint16]:
-        """A look at one of the library's buffers, checked and made once; rows may be padded."""
+        """A view of one of the library's buffers, checked and created once; rows may be padded."""
         width, height = self._expected_shape
         pitch = 2 * width + image.padding_x
         # A library that fills no size (it may not in every policy) leaves 0.
@@ -274,7 +274,7 @@ class XimeaCamera(BlockingCamera):
             raise DeviceError(
                 self.name,
                 f"delivered {image.width} x {image.height} pixels in {image.bp_size} bytes for a region of "
-                f"{width} x {height}; is the library's version one that this driver knows "
+                f"{width} x {height}; does this driver support the library's version "
                 "(4.x, XI_IMG of 288 bytes)?",
             )
         bytes_ = (ctypes.c_ubyte * (pitch * height)).from_address(image.bp)
@@ -295,7 +295,7 @@ def _reset_offset(library: XimeaLibrary) -> None:
 
 
 def _read_limits(library: XimeaLibrary) -> CameraLimits:
-    """Ask the camera; its region must begin at the sensor's corner, or it would shrink the limits."""
+    """Read the limits from the camera; its region must begin at the sensor's corner, which affects them."""
     width, height = (
         ParameterRange(*(library.get_int(f"{name}:{part}") for part in ("min", "max", "inc")))
         for name in ("width", "height")
@@ -314,4 +314,4 @@ def _read_limits(library: XimeaLibrary) -> CameraLimits:
 
 def _raise_not_connected(*arguments: Any) -> int:
     """Take the place of ``xiGetImage`` while there is none."""
-    raise RuntimeError("a frame was asked of a camera that is not connected")
+    raise RuntimeError("a frame was requested from a camera that is not connected")

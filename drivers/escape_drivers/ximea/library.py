@@ -29,7 +29,7 @@ ERRORS: dict[int, tuple[str, str]] = {
     41: ("acquisition runs already", ""),
     45: ("acquisition is stopped", ""),
     49: ("not ready", ""),
-    55: ("the camera was reset", "its settings are gone; open it again"),
+    55: ("the camera was reset", "its settings are lost; open it again"),
     56: ("no such camera", "check serial number, cable, permissions (udev) and usbfs memory"),
     57: ("the camera is locked", _IN_USE_HINT),
     58: ("the buffer is too small", ""),
@@ -46,7 +46,7 @@ ERRORS: dict[int, tuple[str, str]] = {
     119: ("not available in this context", ""),
 }
 NO_IMAGE, TIMEOUT, STOPPED = 9, 10, 45
-#: The camera has gone, or has forgotten everything; only opening it again helps.
+#: Errors after which the camera must be opened again.
 LOST_CODES = frozenset({1, 55, 56})
 
 
