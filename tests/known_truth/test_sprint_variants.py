@@ -111,6 +111,17 @@ def test_a_descent_of_small_steps_that_was_cut_has_not_converged(bench):
     assert sprint(matrix, bench[0]).converged
 
 
+def test_a_capability_under_its_former_name_is_not_ignored_silently(bench):
+    class Former(type(bench[0])):
+        slope_trust = np.ones(2)
+
+    model = bench[0]
+    former = object.__new__(Former)
+    former.__dict__.update(getattr(model, "__dict__", {}))
+    with pytest.warns(DeprecationWarning, match="slope_trust of the model 'fast' is not used"):
+        sprint(measured(bench, noise=0.05), former, solver="registration-only")
+
+
 @pytest.mark.parametrize("option", ["solver", "modes_choice", "loss", "actuator_model"])
 def test_what_is_not_known_is_refused(bench, option):
     with pytest.raises(ValueError, match=rf"{option} is 'best'; it is one of"):

@@ -47,7 +47,7 @@ from escape_hw.config.system import (
     ModesChoice,
     Solver,
 )
-from escape_hw.deprecation import renamed_keywords
+from escape_hw.deprecation import renamed_keywords, warn_renamed
 from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 
 T = TypeVar("T")
@@ -56,6 +56,11 @@ T = TypeVar("T")
 _PARAMETER_NAMES = ("gain", *PARAMETERS, "width", "pedestal")
 #: Remaining step, relative to the stated errors, below which the descent counts as converged.
 _NEGLIGIBLE_STEP = 0.05
+#: Optional attributes of a model in version 0.1.0 -> present names.
+_RENAMED_CAPABILITIES = {
+    "registration_doubt": "registration_systematic_error",
+    "slope_trust": "slope_weights",
+}
 #: Signal-to-noise ratio of the best mode below which a matrix is refused.
 _MIN_SNR = 0.1
 
@@ -339,6 +344,9 @@ def _require_fittable(matrix: InteractionMatrix, model: SyntheticModel, columns:
         raise IncompatibleProduct(
             f"the matrix has {matrix.n_slopes} slopes, the model {rows}; build the model on the matrix's grid"
         )
+    for old, new in _RENAMED_CAPABILITIES.items():
+        if hasattr(model, old) and not hasattr(model, new):
+            warn_renamed(f"{old} of the model '{model.name}' is not used; since version 0.2.0 it is {new}")
     data, sigma = matrix.data[:, columns], matrix.sigma[:, columns]
     if not np.isfinite(data).all():
         raise CalibrationError("the interaction matrix is not finite; measure it again")
