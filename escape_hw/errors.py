@@ -90,7 +90,7 @@ class Aborted(EscapeError):
 
 
 class LeaseHeld(EscapeError):
-    """The write lease is held by another client, or was not requested."""
+    """The client does not have control of the server."""
 
 
 class ServerGone(EscapeError):

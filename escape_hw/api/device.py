@@ -123,11 +123,11 @@ class Device(abc.ABC):
     def _close(self) -> None:
         """Disconnect; must not raise when the device is already disconnected."""
 
-    def _release_after_failed_open(self) -> None:
+    def _release_after_failed_open(self) -> None:  # noqa: B027 - an optional hook
         """Release resources that a failed ``_open`` has acquired."""
 
-    def _after_open(self) -> None:
+    def _after_open(self) -> None:  # noqa: B027 - an optional hook
         """Hook for the base class of a kind of device, called after ``_open``."""
 
-    def _before_close(self) -> None:
+    def _before_close(self) -> None:  # noqa: B027 - an optional hook
         """Hook for the base class of a kind of device, called before ``_close``: flattens a mirror."""

@@ -40,7 +40,7 @@ class EmulatorRequest:
 class Emulator(abc.ABC):
     """An emulated device behind its real interface; usable as a context manager.
 
-    ``complaints`` lists violations of the protocol that real hardware may tolerate: commands in the wrong
+    ``violations`` lists violations of the protocol that real hardware may tolerate: commands in the wrong
     order, unread errors, values out of range, a second client.
     """
 
@@ -65,7 +65,7 @@ class Emulator(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def complaints(self) -> tuple[str, ...]:
+    def violations(self) -> tuple[str, ...]:
         """Protocol violations of clients, in order."""
 
     @abc.abstractmethod

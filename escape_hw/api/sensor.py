@@ -14,7 +14,7 @@ from escape_hw.deprecation import renamed_members
 from escape_hw.errors import IncompatibleProduct
 
 #: Ratio of the rms spot motion and blur to the rms of the centres of gravity, which the window, the
-#: threshold and the turbulence within a lenslet reduce. Measured on a twin with known optics (docs/decisions).
+#: threshold and the turbulence within a lenslet reduce. Measured on a twin with known optics.
 SPOT_MOTION_FACTOR = 1.2
 
 

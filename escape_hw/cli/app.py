@@ -1,4 +1,4 @@
-"""The application: names, help and options; the work is imported when a command runs."""
+"""The application with its commands; numerical libraries are imported when a command runs."""
 
 from __future__ import annotations
 
@@ -8,52 +8,15 @@ from typing import Annotated
 
 import typer
 
-from escape_hw.cli.calibration import calibrate, gains, loop, reproduce, sprint, sweep, track
+from escape_hw.cli.calibration import calibrate, reproduce, sweep
+from escape_hw.cli.calibration.procedure_command import procedure_command
 from escape_hw.cli.devices import asm, camera, discover, dm, emulate, modulator, with_stand_ins
 from escape_hw.cli.products import inspection as products
 from escape_hw.cli.products import interchange
 from escape_hw.cli.system import configuration as systems
 from escape_hw.cli.system import doctor, gui, keys, perf, serve, streams, udev
-
-app = typer.Typer(
-    name="escape",
-    help="Calibrates adaptive-optics systems without a calibration source.",
-    epilog="Exit codes: 0 done · 1 finished but failed its own criterion · 2 bad usage or configuration, "
-    "nothing opened · 3 device or safety fault, mirror made safe · 130 aborted, partial data saved.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-)
-app.command("systems")(systems.systems)
-app.add_typer(systems.config_app, name="config")
-app.command("calibrate")(calibrate.calibrate)
-app.command("sprint")(sprint.sprint)
-app.command("gains")(gains.gains)
-app.command("loop")(loop.loop)
-app.command("track")(track.track)
-app.command("sweep")(sweep.sweep)
-app.command("serve")(serve.serve)
-app.add_typer(keys.app, name="keys")
-app.add_typer(reproduce.app, name="reproduce")
-app.add_typer(interchange.export_app, name="export")
-app.add_typer(interchange.import_app, name="import")
-app.command("show")(products.show)
-app.command("compare")(products.compare)
-app.command("report")(products.report)
-app.command("perf")(perf.perf)
-app.add_typer(dm.app, name="dm")
-app.add_typer(camera.app, name="camera")
-app.add_typer(modulator.app, name="modulator")
-app.add_typer(asm.app, name="asm")
-app.command("gui")(gui.gui)
-app.command("replay")(gui.replay)
-app.command("doctor")(doctor.doctor)
-app.command("discover")(discover.discover)
-app.add_typer(udev.app, name="udev")
-app.command("emulate")(emulate.emulate)
-app.command("rehearse")(with_stand_ins.with_stand_ins)
-app.command("streams")(streams.streams)
+from escape_hw.runtime.procedures.calibration import CALIBRATIONS
+from escape_hw.runtime.procedures.registry import PROCEDURES
 
 
 def _version(requested: bool) -> None:
@@ -64,13 +27,59 @@ def _version(requested: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _common(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
     ] = False,
 ) -> None:
     """Options of the program itself."""
+
+
+def build_app() -> typer.Typer:
+    """The application with a command for every procedure."""
+    app = typer.Typer(
+        name="escape",
+        help="Calibrates adaptive-optics systems without a calibration source.",
+        epilog="Exit codes: 0 done · 1 finished but failed its own criterion · 2 bad usage or configuration, "
+        "nothing opened · 3 device or safety fault, mirror made safe · 130 aborted, partial data saved.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="rich",
+    )
+    app.callback()(_common)
+    app.command("systems")(systems.systems)
+    app.add_typer(systems.config_app, name="config")
+    app.command("calibrate")(calibrate.calibrate)
+    for procedure in PROCEDURES:
+        if procedure.name not in CALIBRATIONS:
+            app.command(procedure.name)(procedure_command(procedure))
+    app.command("sweep")(sweep.sweep)
+    app.command("serve")(serve.serve)
+    app.add_typer(keys.app, name="keys")
+    app.add_typer(reproduce.app, name="reproduce")
+    app.add_typer(interchange.export_app, name="export")
+    app.add_typer(interchange.import_app, name="import")
+    app.command("show")(products.show)
+    app.command("compare")(products.compare)
+    app.command("report")(products.report)
+    app.command("perf")(perf.perf)
+    app.add_typer(dm.app, name="dm")
+    app.add_typer(camera.app, name="camera")
+    app.add_typer(modulator.app, name="modulator")
+    app.add_typer(asm.app, name="asm")
+    app.command("gui")(gui.gui)
+    app.command("replay")(gui.replay)
+    app.command("doctor")(doctor.doctor)
+    app.command("discover")(discover.discover)
+    app.add_typer(udev.app, name="udev")
+    app.command("emulate")(emulate.emulate)
+    app.command("rehearse")(with_stand_ins.with_stand_ins)
+    app.command("streams")(streams.streams)
+    return app
+
+
+app = build_app()
 
 
 def run(arguments: Sequence[str] | None = None) -> None:

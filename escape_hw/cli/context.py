@@ -1,4 +1,4 @@
-"""Execution of one command: consoles, Ctrl-C, system, run folder, JSON document, exit code."""
+"""Execution of a command: consoles, Ctrl-C, system, run folder, JSON document, exit code."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from rich.console import Console, RenderableType
 from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError
+from escape_hw.runtime.procedures.declaration import ComputedProcedure
 
 if TYPE_CHECKING:
     from escape_hw.api.procedure import Procedure
+    from escape_hw.cli.calibration.display import Display
     from escape_hw.cli.options import SystemSelection
     from escape_hw.config.system import SystemConfig
     from escape_hw.io.run_folder import RunFolder
-    from escape_hw.runtime.procedures.task import Task
-    from escape_hw.runtime.session.record import BenchRecord
+    from escape_hw.runtime.procedures.declaration import ProcedureSpec
     from escape_hw.runtime.session.system import System
 
 
 class InterruptHandler:
-    """Turns SIGINT and SIGTERM into an orderly stop.
+    """Turns SIGINT and SIGTERM into an orderly stop; does nothing outside the main thread.
 
-    While a procedure runs, the first one sets ``abort``, the second breaks in at once. While the
-    devices are being closed, or an aborted run is saved, they change nothing: the mirror gets its
-    flat shape and the data their file. At any other time they break in at once. Does nothing outside
-    the main thread.
+    While a procedure runs, the first signal sets ``abort`` and the second raises ``KeyboardInterrupt``.
+    While the devices are being closed or an aborted run is saved, signals are ignored, so that the mirror
+    is flattened and the data are written. At any other time a signal raises ``KeyboardInterrupt``.
 
     Parameters
     ----------
-    tell
-        Called with a line for the operator, out of a signal handler.
+    notify
+        Called with a line for the operator, from the signal handler.
     """
 
     def __init__(self, notify: Callable[[str], None]) -> None:
@@ -65,14 +65,14 @@ class InterruptHandler:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Put the former handlers back."""
+        """Restore the previous handlers."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous.clear()
 
     @contextmanager
     def procedure(self) -> Iterator[SignalSafeFlag]:
-        """While a procedure runs: yields the flag that aborts it."""
+        """Context of a running procedure; yields the flag that aborts it."""
         self._in_procedure = True
         try:
             yield self.abort
@@ -80,17 +80,17 @@ class InterruptHandler:
             self._in_procedure = False
 
     def begin_closing(self) -> None:
-        """From here to :meth:`end_closing` nothing breaks in."""
+        """Ignore signals until :meth:`end_closing`."""
         self._protected_activity = "the mirror is being flattened and the devices closed"
 
     def end_closing(self) -> None:
-        """The devices are closed."""
+        """Handle signals again."""
         self._protected_activity = ""
 
     @contextmanager
     def protect_saving(self) -> Iterator[None]:
-        """While what an aborted run measured is saved, which takes a moment, nothing breaks in."""
-        self._protected_activity = "what was measured is being saved"
+        """Ignore signals while the result of an aborted run is saved."""
+        self._protected_activity = "the data are being saved"
         try:
             yield
         finally:
@@ -101,7 +101,7 @@ class InterruptHandler:
             self._notify(f"already stopping: {self._protected_activity}")
         elif self._in_procedure and not self.abort.is_set():
             self.abort.set()
-            self._notify("stopping: the mirror is flattened and what was measured is saved")
+            self._notify("stopping: the mirror is flattened and the data are saved")
         else:
             raise KeyboardInterrupt
 
@@ -115,13 +115,13 @@ DONE, FAILED, USAGE, FAULT, ABORTED = 0, 1, 2, 3, 130
 
 
 class CommandContext:
-    """What a command needs: consoles, the runner, a bench, a run folder, one JSON document."""
+    """Consoles, procedure runner, bench, run folder and JSON document of a command."""
 
     def __init__(self, command: str, json: bool, quiet: bool) -> None:
         self.command, self.json, self.quiet = command, json, quiet
         self._stdout = sys.stdout
         self.errors = Console(stderr=True)
-        # In a pipe or a log nobody's terminal limits the width.
+        # Output to a pipe or a file has no terminal width.
         self.tables = Console(file=self._stdout, width=None if self._stdout.isatty() else _PIPE_WIDTH)
         self.interrupts = InterruptHandler(self._notify_from_signal_handler)
         self.folder: RunFolder | None = None
@@ -133,46 +133,46 @@ class CommandContext:
 
     @property
     def wall_seconds(self) -> float:
-        """Seconds since the command began."""
+        """Seconds since the command started."""
         return time.monotonic() - self._began
 
     def notify(self, line: str) -> None:
-        """A line for the operator, on standard error."""
+        """Print a line for the operator on standard error."""
         self.errors.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _notify_from_signal_handler(self, line: str) -> None:
-        """As :meth:`notify`, out of a signal handler: a stream refuses a handler that interrupted its write."""
+        """Print without the stream, which refuses a write from a handler that interrupted another write."""
         try:
             descriptor = sys.stderr.fileno()
         except (OSError, ValueError):
             self.notify(line)
             return
         with contextlib.suppress(OSError):
-            # When nobody reads standard error any more, stopping is what counts.
+            # A closed standard error must not prevent the stop.
             os.write(descriptor, f"{line}\n".encode())
 
     def show(self, *what: RenderableType) -> None:
-        """Results for people, on standard output; silent with ``--json``."""
+        """Print results on standard output, except with ``--json``."""
         for item in () if self.json else what:
             self.tables.print(item, highlight=False, markup=False, soft_wrap=isinstance(item, str))
 
     def result(self, document: Mapping[str, Any], met: bool = True) -> None:
-        """The command's document, printed at its end with ``--json``; ``met`` false: exit code 1."""
+        """Set the document that ``--json`` prints at the end; if ``met`` is false the exit code is 1."""
         self._document = document
         self.code = self.code or (DONE if met else FAILED)
 
     def load_config(self, selection: SystemSelection) -> SystemConfig:
-        """The configuration of the chosen system, whose name, mode and seed an error tells, too.
+        """The configuration of the selected system; its name, mode and seed then appear in error documents.
 
         Raises
         ------
         ConfigError
-            It is wrong.
+            The configuration is wrong.
         """
         from escape_hw.config.bundled import bundled_systems
         from escape_hw.config.loader import load_system
 
-        # Even a configuration that is refused may concern a system that is known.
+        # The error document of a refused configuration names a bundled system.
         self.set_subject(
             selection.system if selection.system in bundled_systems() else None, None, selection.seed
         )
@@ -183,16 +183,16 @@ class CommandContext:
         return config
 
     def set_subject(self, system: str | None, simulated: bool | None, seed: int | None) -> None:
-        """Remember what the command is about, as far as it is known, for the document of an error."""
+        """Set system, mode and seed for error documents, as far as they are known."""
         self._subject = {"system": system, "simulated": simulated, "seed": seed}
 
     def run(self, procedure: Procedure[T]) -> T:
-        """Run a procedure with progress; Ctrl-C aborts it.
+        """Run a procedure and show its progress; Ctrl-C aborts it.
 
         Raises
         ------
         Aborted
-            With the partial result.
+            The procedure was aborted; carries the partial result.
         """
         from escape_hw.api.procedure import run
         from escape_hw.runtime.display.progress import ProgressView
@@ -201,12 +201,12 @@ class CommandContext:
             return run(procedure, observers=(view,), abort=abort)
 
     def run_keeping_partial(self, procedure: Procedure[T]) -> tuple[T, Aborted | None]:
-        """Run a procedure; an abort is returned beside what was measured, so that it can be saved.
+        """Run a procedure; after an abort, return the partial result and the exception.
 
         Raises
         ------
         Aborted
-            Nothing was measured yet.
+            There is no partial result.
         """
         try:
             return self.run(procedure), None
@@ -217,66 +217,82 @@ class CommandContext:
             return partial, stop
 
     def protect_saving(self, stop: Aborted | None) -> AbstractContextManager[None]:
-        """While a result is saved: after an abort, no further Ctrl-C keeps it from its file."""
+        """Context for saving a result: after an abort, further signals are ignored."""
         return contextlib.nullcontext() if stop is None else self.interrupts.protect_saving()
 
-    def run_task(
+    def run_procedure(
         self,
-        task: Task[T],
+        procedure: ProcedureSpec[T],
         selection: SystemSelection,
         out: Path | None,
-        show: Callable[[T, BenchRecord, dict[str, Any]], object],
+        display: Display,
         resumed_run: Path | None = None,
     ) -> None:
-        """Do a task on the chosen system, keep its result, and show it.
+        """Run a procedure on the selected system, save its result and print it.
 
-        Who goes on with a run is told where the products of this one lie.
+        Parameters
+        ----------
+        procedure
+            The request.
+        selection
+            The system.
+        out
+            Run folder; a dated one by default.
+        display
+            Prints the result.
+        resumed_run
+            Folder of the run that is continued.
 
         Raises
         ------
         Aborted
-            The result is partial; it was kept and shown.
+            The result is partial; it was saved and printed.
         """
-        selection = selection.with_overrides(*task.overrides)
+        selection = selection.with_overrides(*procedure.overrides)
         config = self.load_config(selection)
-        task.load(config)
-        with self.run_folder(config, task.kind, out) as folder:
+        procedure.load(config)
+        with self.run_folder(config, procedure.kind, out) as folder:
             if resumed_run is not None:
-                self.notify(
-                    f"going on with {resumed_run}, which stays as it is; products go to {folder.path}"
-                )
+                self.notify(f"resuming {resumed_run}, which is not changed; products go to {folder.path}")
+            if isinstance(procedure, ComputedProcedure):
+                result = self.run(procedure.compute())
+                saved = procedure.save_computed(folder, result, self.wall_seconds)
+                self.result(saved.document, met=saved.met)
+                display(self, result, config.simulated, saved.document)
+                return
             with self.bench(selection) as bench:
                 from escape_hw.runtime.session.record import BenchRecord
 
                 record = BenchRecord.from_bench(bench)
-                result, stop = self.run_keeping_partial(task.procedure(bench, folder))
+                result, stop = self.run_keeping_partial(procedure.procedure(bench, folder))
             with self.protect_saving(stop):
-                saved = task.save(folder, record, result, self.wall_seconds)
+                saved = procedure.save(folder, record, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
-                show(result, record, saved.document)
+                display(self, result, record.simulated, saved.document)
             if stop is not None:
                 raise stop
-            task.finish()
+            procedure.finish()
 
     @contextmanager
     def run_folder(self, config: SystemConfig, kind: str, out: Path | None) -> Iterator[RunFolder]:
-        """The run's folder with its log and ``config.toml``, made before anything is opened."""
-        # What saves the result, too, is loaded before anything moves: who stops a run does not want
-        # to wait for a library, and would lose the data if one failed to load.
+        """The run folder with log and ``config.toml``, created before any device is opened."""
+        # Libraries for saving are imported before anything moves, so that an aborted run is saved at once
+        # and a failing import loses no data.
         from escape_hw.io.run_folder import RunFolder
 
         with RunFolder(config.system.name, kind, out) as folder:
             self.folder = folder
             if folder.requested_path is not None:
                 self.notify(
-                    f"{folder.requested_path} holds files already and is left alone; this run goes to {folder.path}"
+                    f"{folder.requested_path} holds files already and is left alone; "
+                    f"this run goes to {folder.path}"
                 )
             folder.write_config(config.to_toml())
             yield folder
 
     @contextmanager
     def bench(self, selection: SystemSelection) -> Iterator[System]:
-        """The system, open; closed at the end whatever happens, the mirror flat."""
+        """The open system; finally the mirror is flattened and the devices are closed."""
         from escape_hw.runtime.session.system import open_system
 
         self._require_not_served(selection)
@@ -294,12 +310,12 @@ class CommandContext:
             self.interrupts.end_closing()
 
     def _require_not_served(self, selection: SystemSelection) -> None:
-        """Raise when a server holds the hardware that is to be opened.
+        """Refuse to open hardware that a server has opened.
 
         Raises
         ------
         ConfigError
-            Says which, and the ways out.
+            A server has opened the system; the message names its process and the alternatives.
         """
         from escape_hw.remote.address import find_server
 
@@ -315,7 +331,7 @@ class CommandContext:
             )
 
     def fail(self, error: BaseException) -> int:
-        """Tell what went wrong; returns the exit code."""
+        """Report an error on standard error and in the document; returns the exit code."""
         code, kind, message = self._classify_error(error)
         self.notify(f"{'aborted' if code == ABORTED else 'error'}: {message}")
         for note in getattr(error, "__notes__", ()):
@@ -326,7 +342,7 @@ class CommandContext:
         return code
 
     def _error_document(self) -> dict[str, Any]:
-        """What a document says when there is no result."""
+        """Document of a command without a result."""
         from escape_hw.io.documents import header_fields
 
         known = header_fields(self.command, **self._subject)
@@ -341,14 +357,14 @@ class CommandContext:
             return error.exit_code, type(error).__name__, str(error)
         message = f"{type(error).__name__}: {error} (this is a defect of ESCAPE)"
         if self.folder is not None and self.folder.path.is_dir():
-            # The folder has logged the traceback on its way out.
+            # The run folder has logged the traceback.
             message += f"; the traceback is in {self.folder.path / 'run.log'}"
         else:
             self.notify("".join(traceback.format_exception(error)).rstrip())
         return (FAULT if self.devices_opened else FAILED), type(error).__name__, message
 
     def print_document(self) -> None:
-        """Print the document on the real standard output, once; a command that serves does so early."""
+        """Print the document on standard output, once."""
         from escape_hw.io.documents import dumps
 
         if self.json and self._document is not None:
@@ -378,9 +394,9 @@ def _deprecations_as_lines(notify: Callable[[str], None]) -> Iterator[None]:
 
 @contextmanager
 def command_context(command: str, *, json: bool = False, quiet: bool = False) -> Iterator[CommandContext]:
-    """A command's body; turns every ending into an exit code and at most one document.
+    """Context of a command; converts errors to exit codes and prints at most one document.
 
-    Whatever libraries print on standard output goes to standard error meanwhile.
+    Output of libraries to standard output is redirected to standard error.
     """
     context = CommandContext(command, json, quiet)
     with context.interrupts, _deprecations_as_lines(context.notify):

@@ -1,4 +1,4 @@
-"""Results on the terminal."""
+"""Formatting of results for the terminal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from escape_hw.report.tables import Table
 
 
 def status_line(simulated: bool, partial: bool) -> Text:
-    """The line that says whether a result is simulated and whether it was aborted."""
+    """A line with the origin of a result (simulation or hardware) and whether it was aborted."""
     text = (
         Text("SIMULATED", style="bold black on yellow") if simulated else Text("HARDWARE", style="bold green")
     )
@@ -25,12 +25,12 @@ def status_line(simulated: bool, partial: bool) -> Text:
 
 
 def rich_table(content: Table, title: str | None = None) -> RichTable:
-    """A table of text for the terminal."""
-    # No rules between columns: all of it fits a terminal of 80 columns.
+    """A table for the terminal."""
+    # Without rules between columns the table fits a terminal of 80 columns.
     table = RichTable(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for number, heading in enumerate(content.headings):
         numbers = content.numeric and number > 0
-        # On a narrow terminal headings and words may wrap, values with their errors may not.
+        # Headings and words may wrap on a narrow terminal; values with standard errors may not.
         widest = max((len(row[number]) for row in content.rows if "±" in row[number]), default=None)
         justify: JustifyMethod = "right" if numbers else "left"
         table.add_column(heading, justify=justify, min_width=widest, overflow="fold")
@@ -46,7 +46,7 @@ def format_calibration(result: CalibrationResult) -> list[str]:
     lines = [
         f"{matrix.method}: {matrix.n_modes} modes, {result.grid.n_valid} {result.grid.elements}, "
         f"{result.frames} frames ({result.sky_seconds:.3g} s), {result.lost_frames} lost",
-        f"signal-to-noise ratio per mode: least {snr.min():.3g}, median {sorted(snr)[len(snr) // 2]:.3g}",
+        f"signal-to-noise ratio per mode: minimum {snr.min():.3g}, median {sorted(snr)[len(snr) // 2]:.3g}",
     ]
     if result.response is not None:
         lines.append(f"delay: {result.response.delay:.2f} frames")
@@ -62,5 +62,5 @@ def format_criteria(checks: Iterable[Mapping[str, Any]]) -> list[Text]:
 
 
 def format_products(products: Mapping[str, Any]) -> list[str]:
-    """Where the products lie."""
+    """Paths of the products."""
     return [f"{name}: {path}" for name, path in products.items()]

@@ -1,8 +1,7 @@
-"""The standard streams of the command line, which may end before the command does.
+"""Standard streams of the command line that survive a closed pipe or a full disk.
 
-Python keeps what is written to a pipe or a file, and writes it when the interpreter ends: too late for
-an exit code of ours. So one place owns both streams while a command runs, and empties them before the
-exit code is decided.
+Python writes buffered output when the interpreter exits, too late to change the exit code. The streams are
+therefore flushed before the exit code is decided.
 """
 
 from __future__ import annotations
@@ -16,73 +15,72 @@ from types import TracebackType
 from typing import Any, Self, TextIO, TypeVar, cast
 
 T = TypeVar("T")
-#: Exit code of a command whose results nobody got.
+#: Exit code of a command whose results could not be written.
 _FAILED = 1
 
 
-class Stream:
-    """A text stream that takes everything; what cannot be written is dropped, and the first time told.
+class FaultTolerantStream:
+    """A text stream that never raises; output that cannot be written is discarded.
 
     Parameters
     ----------
     inner
-        The stream itself; ``None`` where the process was started without.
+        The stream itself; ``None`` if the process was started without it.
     descriptor
-        Its file descriptor, in a process of its own.
-    lost
-        Called once, with the reason why it takes no more.
+        File descriptor of the stream.
+    on_failure
+        Called once, with the error of the first failed write.
     """
 
-    def __init__(self, inner: TextIO | None, descriptor: int, lost: Callable[[OSError], None]) -> None:
-        self._lost, self._takes = lost, True
+    def __init__(self, inner: TextIO | None, descriptor: int, on_failure: Callable[[OSError], None]) -> None:
+        self._on_failure, self._works = on_failure, True
         self._absent = inner is None
         if inner is None:
-            _occupy(descriptor)
-            inner = open(os.devnull, "w", encoding="utf-8")
+            _reserve_descriptor(descriptor)
+            inner = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
         self.inner = inner
 
     def write(self, text: str) -> int:
-        """Write as far as it can be written."""
+        """Write, or discard if the stream has failed."""
         self._attempt(lambda: self.inner.write(text))
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
-        """Write several."""
+        """Write several lines."""
         for line in lines:
             self.write(line)
 
     def flush(self) -> None:
-        """Empty the buffer as far as it can be written."""
+        """Flush the buffer, unless the stream has failed."""
         self._attempt(self.inner.flush, writes=False)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.inner, name)
 
     def _attempt(self, action: Callable[[], object], writes: bool = True) -> None:
-        if not self._takes:
+        if not self._works:
             return
         try:
             if self._absent and writes:
                 raise OSError(errno.EBADF, os.strerror(errno.EBADF))
             action()
         except OSError as error:
-            self._takes = False
+            self._works = False
             with contextlib.suppress(OSError, ValueError):
-                # Or Python would write what is in the buffer at its end, and fail again.
-                _to_nowhere(self.inner.fileno())
-            self._lost(error)
+                # Otherwise Python writes the buffer on exit and fails again.
+                _redirect_to_null(self.inner.fileno())
+            self._on_failure(error)
 
 
-class Output:
-    """Both standard streams while a command runs.
+class OutputStreams:
+    """Replaces both standard streams while a command runs.
 
-    What standard output does not take is a failure of the command. What standard error does not take is
-    not: whoever stops reading the progress still wants the result.
+    A failure of standard output fails the command; a failure of standard error does not.
 
     Parameters
     ----------
     document
-        Standard output is one document. A table may be cut off, as ``| head`` does, without a word; a
+        Standard output is one document. A table may be cut off without a message, as by ``| head``; a
         document may not.
     """
 
@@ -90,47 +88,47 @@ class Output:
         self._document, self._failed = document, False
 
     def __enter__(self) -> Self:
-        """Take the streams over."""
+        """Replace the streams."""
         self._before = sys.stdout, sys.stderr
-        self._errors = Stream(sys.stderr, 2, lambda error: None)
-        self._results = Stream(sys.stdout, 1, self._lost)
+        self._errors = FaultTolerantStream(sys.stderr, 2, lambda error: None)
+        self._results = FaultTolerantStream(sys.stdout, 1, self._on_failure)
         sys.stdout, sys.stderr = cast(TextIO, self._results), cast(TextIO, self._errors)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Empty them and give them back."""
-        self._empty()
+        """Flush and restore the streams."""
+        self._flush()
         sys.stdout, sys.stderr = self._before
 
-    def verdict(self, code: T) -> T | int:
-        """The exit code, once everything is written: no success if standard output took no more."""
-        self._empty()
+    def exit_code(self, code: T) -> T | int:
+        """The exit code after flushing: ``code``, or 1 instead of success if standard output has failed."""
+        self._flush()
         return _FAILED if self._failed and not code else code
 
-    def _empty(self) -> None:
+    def _flush(self) -> None:
         self._results.flush()
         self._errors.flush()
 
-    def _lost(self, error: OSError) -> None:
+    def _on_failure(self, error: OSError) -> None:
         self._failed = True
         if self._document or not isinstance(error, BrokenPipeError):
             self._errors.write(f"error: standard output cannot be written ({error.strerror or error})\n")
 
 
-def _occupy(descriptor: int) -> None:
-    """Keep a standard descriptor that is closed from becoming that of the next file to be opened."""
+def _reserve_descriptor(descriptor: int) -> None:
+    """Keep a closed standard descriptor from being reused for the next file that is opened."""
     try:
         os.fstat(descriptor)
     except OSError:
-        _to_nowhere(descriptor)
+        _redirect_to_null(descriptor)
 
 
-def _to_nowhere(descriptor: int) -> None:
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    if nowhere != descriptor:
-        os.dup2(nowhere, descriptor)
-        os.close(nowhere)
+def _redirect_to_null(descriptor: int) -> None:
+    null = os.open(os.devnull, os.O_WRONLY)
+    if null != descriptor:
+        os.dup2(null, descriptor)
+        os.close(null)
     else:
         os.set_inheritable(descriptor, True)

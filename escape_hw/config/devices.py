@@ -85,9 +85,7 @@ class StageConfig(Section):
     )
     auto_zero_s: float = Field(180.0, gt=0, le=3600, description="longest wait for auto-zero, seconds")
     settle_s: float = Field(5.0, gt=0, le=600, description="longest wait for an axis on target, seconds")
-    min_points: int = Field(
-        20, ge=4, le=1000, description="smallest number of points per turn, 50 us each"
-    )
+    min_points: int = Field(20, ge=4, le=1000, description="smallest number of points per turn, 50 us each")
     max_points: int = Field(4096, ge=64, le=262144, description="largest number of points of a wave table")
     correction_source: Literal["recorder", "table", "none"] = Field(
         "recorder",
@@ -103,8 +101,12 @@ class StageConfig(Section):
         0.02, gt=0, le=0.5, description="largest relative error of radius and roundness after correction"
     )
     trigger_line: int = Field(1, ge=0, le=3, description="output that triggers the camera; 0: none")
-    trigger_mode: int = Field(4, ge=0, le=99, description="number of the controller's mode 'generator trigger'")
-    trigger_point: int = Field(1, ge=1, le=262144, description="point of the turn at the rising edge of the pulse")
+    trigger_mode: int = Field(
+        4, ge=0, le=99, description="number of the controller's mode 'generator trigger'"
+    )
+    trigger_point: int = Field(
+        1, ge=1, le=262144, description="point of the turn at the rising edge of the pulse"
+    )
 
     @model_validator(mode="after")
     def _rules(self) -> Self:
@@ -115,9 +117,8 @@ class StageConfig(Section):
             text = "the magnitude must be at least 0.1"
             violations.append(RuleViolation("axis_gain", list(self.axis_gain), text))
         if self.min_points > self.max_points:
-            violations.append(
-                RuleViolation("min_points", self.min_points, f"max_points is {self.max_points}")
-            )
+            text = f"max_points is {self.max_points}"
+            violations.append(RuleViolation("min_points", self.min_points, text))
         if self.correction_source == "table" and not self.corrections:
             text = "needs stage.corrections; 'recorder' measures them"
             violations.append(RuleViolation("correction_source", self.correction_source, text))
@@ -137,9 +138,7 @@ class DeviceConfig(Section):
         "", description="driver of the real device (entry point in escape.devices); empty: none"
     )
     sim_driver: str = Field("", description="twin of the device (entry point in escape.devices)")
-    mode: Mode | None = Field(
-        None, description="'sim' or 'hardware' for this device; absent: as system.mode"
-    )
+    mode: Mode | None = Field(None, description="'sim' or 'hardware' for this device; absent: as system.mode")
     serial: str = Field("", description="serial number; a device with another one is not opened")
     options: dict[str, str | int | float | bool] = Field(
         default_factory=dict, description="settings specific to the driver"
@@ -189,7 +188,9 @@ class MirrorConfig(DeviceConfig):
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
     )
     coupling: float = Field(
-        ge=0.01, le=0.9, description="nominal influence function at the adjacent actuator, fraction of its peak"
+        ge=0.01,
+        le=0.9,
+        description="nominal influence function at the adjacent actuator, fraction of its peak",
     )
     stroke_m: float = Field(gt=0, le=1e-3, description="metres of surface at the actuator for a command of 1")
     limits: LimitsConfig = Field(default_factory=LimitsConfig, description="limits of every command")
@@ -223,7 +224,13 @@ class MirrorConfig(DeviceConfig):
         """
         positions_m = self.positions() * self.pitch_m
         return DMInfo(
-            model, serial or self.serial, self.n_act, self.actuator_map(), positions_m, self.stroke_m, simulated
+            model,
+            serial or self.serial,
+            self.n_act,
+            self.actuator_map(),
+            positions_m,
+            self.stroke_m,
+            simulated,
         )
 
     @model_validator(mode="after")
@@ -261,19 +268,11 @@ class CameraConfig(DeviceConfig):
         columns, rows = self.sensor_px
         violations = []
         if x + width > columns or y + height > rows:
-            violations.append(
-                RuleViolation(
-                    "region", list(self.region), f"does not lie on the sensor of {columns} x {rows} pixels"
-                )
-            )
+            text = f"does not lie on the sensor of {columns} x {rows} pixels"
+            violations.append(RuleViolation("region", list(self.region), text))
         if self.exposure_s * self.frame_rate_hz > 1:
-            violations.append(
-                RuleViolation(
-                    "exposure_s",
-                    self.exposure_s,
-                    f"longer than a frame ({1 / self.frame_rate_hz:.4g} s at {self.frame_rate_hz:g} Hz)",
-                )
-            )
+            text = f"longer than a frame ({1 / self.frame_rate_hz:.4g} s at {self.frame_rate_hz:g} Hz)"
+            violations.append(RuleViolation("exposure_s", self.exposure_s, text))
         raise_violations(violations)
         return self
 
@@ -284,8 +283,8 @@ class ScienceConfig(CameraConfig):
     psf_px: float = Field(ge=0.5, le=100, description="lambda/D in camera pixels")
     model_psf: Literal["measured", "design"] = Field(
         "measured",
-        description="reference of Strehl ratios: an image 'measured' without turbulence, or computed from the "
-        "'design' where the turbulence cannot be removed",
+        description="reference of Strehl ratios: an image 'measured' without turbulence, or computed from "
+        "the 'design' where the turbulence cannot be removed",
     )
 
 
@@ -327,9 +326,8 @@ class ScreenConfig(DeviceConfig):
     def _rules(self) -> Self:
         n = len(self.screens_r0_m)
         if self.screen >= n:
-            raise_violations(
-                [RuleViolation("screen", self.screen, f"the {n} screens are numbered 0 to {n - 1}")]
-            )
+            text = f"the {n} screens are numbered 0 to {n - 1}"
+            raise_violations([RuleViolation("screen", self.screen, text)])
         return self
 
 

@@ -1,4 +1,4 @@
-"""Complete configuration of a system: sections [system], [telescope], [basis], [loop], [calibration], [tracking], [server] and rules between sections."""
+"""Complete configuration of a system, its general sections, and rules between sections."""
 
 from __future__ import annotations
 
@@ -7,6 +7,15 @@ from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import Field, model_validator
 
+from escape_hw.config.choices import (
+    ActuatorModel,
+    Estimator,
+    ExtraParameter,
+    Loss,
+    ModesChoice,
+    PokePattern,
+    Solver,
+)
 from escape_hw.config.devices import DeviceConfig, DevicesConfig, Mode, derive_tilt_scale
 from escape_hw.config.section import RuleViolation, Section, TomlArray, raise_violations
 from escape_hw.config.sensor import AnySensor, PyramidSection, SensorSection
@@ -103,21 +112,6 @@ S = TypeVar("S", bound=SensorSection)
 
 #: Largest gain of the loop. An integrator with a higher gain is unstable at any delay.
 MAX_GAIN = 2.0
-
-
-Estimator = Literal["auto", "matrix", "telemetry"]
-ESTIMATORS: tuple[str, ...] = get_args(Estimator)
-PokePattern = Literal["white", "anticorrelated", "equal-snr"]
-POKE_PATTERNS: tuple[str, ...] = get_args(PokePattern)
-Solver = Literal["mixed-effects", "registration-only", "frozen-derivatives", "batches", "diagonal"]
-SOLVERS: tuple[str, ...] = get_args(Solver)
-ModesChoice = Literal["snr", "first", "d-optimal", "a-optimal"]
-MODES_CHOICES: tuple[str, ...] = get_args(ModesChoice)
-ExtraParameter = Literal["anamorphosis", "pupil_shift"]
-Loss = Literal["squares", "huber"]
-LOSSES: tuple[str, ...] = get_args(Loss)
-ActuatorModel = Literal["fitted", "nominal"]
-ACTUATOR_MODELS: tuple[str, ...] = get_args(ActuatorModel)
 
 
 class SystemSection(Section):
@@ -302,13 +296,8 @@ class SystemConfig(Section):
         if n_modes > n_act:
             violations.append(RuleViolation("basis.n_modes", n_modes, f"the mirror has {n_act} actuators"))
         if self.loop.dropped_modes >= n_modes:
-            violations.append(
-                RuleViolation(
-                    "loop.dropped_modes",
-                    self.loop.dropped_modes,
-                    f"leaves none of the {n_modes} modes; lower it",
-                )
-            )
+            text = f"leaves none of the {n_modes} modes; lower it"
+            violations.append(RuleViolation("loop.dropped_modes", self.loop.dropped_modes, text))
         raise_violations([*violations, *self._sensor_rules()])
         return self
 

@@ -36,7 +36,7 @@ class TwinDriftSwing(Section):
 
 
 class TwinDrift(Section):
-    """Flexure: drift of the registration from ``twin.registration``, ``rate t + swing sin(2 pi t / period)``."""
+    """Flexure: drift of ``twin.registration`` by ``rate t + swing sin(2 pi t / period)``."""
 
     rate: TwinDriftRate = Field(default_factory=TwinDriftRate, description="linear drift")
     swing: TwinDriftSwing = Field(default_factory=TwinDriftSwing, description="amplitude of the sinusoid")
@@ -54,7 +54,7 @@ class TwinDrift(Section):
 
 
 class TwinSeeing(Section):
-    """Fried parameter of all turbulence relative to the start: ``1 + rate t + swing sin(2 pi t / period)``."""
+    """Fried parameter relative to the start: ``1 + rate t + swing sin(2 pi t / period)``."""
 
     rate: float = Field(0.0, ge=-1, le=1, description="linear change of r0 per second, fraction")
     swing: float = Field(0.0, ge=-0.95, le=0.95, description="amplitude of the sinusoid of r0, fraction")
@@ -151,9 +151,7 @@ class TwinContamination(Section):
     depth: float = Field(
         0.15, gt=0, le=1, description="radial extent of the contamination, fraction of the pupil radius"
     )
-    transmission: float = Field(
-        1.0, ge=0, le=1, description="transmission of the contaminated part"
-    )
+    transmission: float = Field(1.0, ge=0, le=1, description="transmission of the contaminated part")
     unevenness: float = Field(
         0.0, ge=0, le=0.5, description="smooth variation of the illumination over the pupil, rms fraction"
     )
@@ -174,7 +172,10 @@ class TwinRegistration(Section):
     radial_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along x, % of the diameter")
     tangential_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along y, % of the diameter")
     anamorphosis_angle: float = Field(
-        0.0, ge=-180, le=180, description="rotation of the axes of the two scalings from +y towards +x, degrees"
+        0.0,
+        ge=-180,
+        le=180,
+        description="rotation of the axes of the two scalings from +y towards +x, degrees",
     )
 
     def to_registration(self) -> Registration:
@@ -185,9 +186,7 @@ class TwinRegistration(Section):
 class TwinMirror(Section):
     """Deviations of the mirror from its data sheet."""
 
-    gain_scatter: float = Field(
-        0.0, ge=0, le=0.5, description="scatter of the actuator gains, rms fraction"
-    )
+    gain_scatter: float = Field(0.0, ge=0, le=0.5, description="scatter of the actuator gains, rms fraction")
     coupling: float | None = Field(
         None, ge=0.01, le=0.9, description="true coupling, fraction; absent: as devices.dm.coupling"
     )
@@ -204,7 +203,10 @@ class TwinMirror(Section):
         "", description="FITS file of measured influence functions (n_act, n, n); empty: Gaussians"
     )
     influence_pixel_m: float | None = Field(
-        None, gt=0, le=10, description="pixel size of influence_file on the pupil, metres; required with a file"
+        None,
+        gt=0,
+        le=10,
+        description="pixel size of influence_file on the pupil, metres; required with a file",
     )
     settling_s: float = Field(
         0.0, ge=0, le=1, description="time constant of the response to a command, seconds"
@@ -215,9 +217,7 @@ class TwinMirror(Section):
     @model_validator(mode="after")
     def _rules(self) -> Self:
         if self.influence_file and self.influence_pixel_m is None:
-            raise_violations(
-                [RuleViolation("influence_pixel_m", "", "is required with influence_file")]
-            )
+            raise_violations([RuleViolation("influence_pixel_m", "", "is required with influence_file")])
         return self
 
 
@@ -233,9 +233,7 @@ class TwinCamera(Section):
     excess_noise: float = Field(
         1.0, ge=1, le=1.4143, description="excess noise factor of a multiplying detector; 1: none"
     )
-    background: float = Field(
-        0.0, ge=0, le=1e5, description="constant offset, e- per pixel and frame"
-    )
+    background: float = Field(0.0, ge=0, le=1e5, description="constant offset, e- per pixel and frame")
     fixed_pattern: float = Field(
         0.0, ge=0, le=0.5, description="scatter of the pixel sensitivities, rms fraction"
     )
@@ -246,7 +244,9 @@ class TwinSensor(TwinCamera):
 
     grid_offset_px: TomlArray[
         tuple[Annotated[float, Field(ge=-100, le=100)], Annotated[float, Field(ge=-100, le=100)]]
-    ] = Field((0.0, 0.0), description="offset of the lenslet grid from the centre of the region, (x, y) in pixels")
+    ] = Field(
+        (0.0, 0.0), description="offset of the lenslet grid from the centre of the region, (x, y) in pixels"
+    )
     pitch_px: float | None = Field(
         None, ge=2, le=1000, description="true lenslet pitch, pixels; absent: as sensor.pitch_px"
     )
@@ -266,10 +266,16 @@ class TwinPyramid(Section):
         0.0, ge=0, le=5, description="length of the roof edge at the tip of the pyramid, lambda/D"
     )
     ellipse: float = Field(
-        0.0, ge=-0.5, le=0.5, description="relative difference of the modulation radii along x and y, fraction"
+        0.0,
+        ge=-0.5,
+        le=0.5,
+        description="relative difference of the modulation radii along x and y, fraction",
     )
     phase: float = Field(
-        0.0, ge=-60, le=60, description="deviation of the phase between the modulation axes from 90 degrees, degrees"
+        0.0,
+        ge=-60,
+        le=60,
+        description="deviation of the phase between the modulation axes from 90 degrees, degrees",
     )
     drift: float = Field(
         0.0, ge=0, le=5, description="amplitude of the slow drift of the modulation centre, lambda/D"
@@ -292,15 +298,8 @@ class TwinVibration(Section):
     def _rules(self) -> Self:
         n, m = len(self.amplitude_rad), len(self.frequency_hz)
         if n != m:
-            raise_violations(
-                [
-                    RuleViolation(
-                        "frequency_hz",
-                        list(self.frequency_hz),
-                        f"needs one frequency for each of the {n} amplitudes, has {m}",
-                    )
-                ]
-            )
+            text = f"needs one frequency for each of the {n} amplitudes, has {m}"
+            raise_violations([RuleViolation("frequency_hz", list(self.frequency_hz), text)])
         return self
 
 
@@ -324,14 +323,14 @@ class TwinConfig(Section):
     )
     paced: bool = Field(False, description="true: run in real time; false: as fast as possible")
     loss_probability: float = Field(0.0, ge=0, le=0.5, description="probability that a frame is lost")
-    latency_s: float = Field(0.0, ge=0, le=1, description="time from sending a command to the start of the motion, seconds")
+    latency_s: float = Field(
+        0.0, ge=0, le=1, description="time from sending a command to the start of the motion, seconds"
+    )
     latency_jitter_s: float = Field(0.0, ge=0, le=1, description="scatter of the latency, seconds rms")
     readout_s: float = Field(
         0.0, ge=0, le=60, description="time from the end of an exposure to the arrival of its frame, seconds"
     )
-    registration: TwinRegistration = Field(
-        default_factory=TwinRegistration, description="true registration"
-    )
+    registration: TwinRegistration = Field(default_factory=TwinRegistration, description="true registration")
     drift: TwinDrift = Field(default_factory=TwinDrift, description="flexure: drift of the registration")
     seeing: TwinSeeing = Field(default_factory=TwinSeeing, description="change of the turbulence strength")
     mirror: TwinMirror = Field(default_factory=TwinMirror, description="imperfections of the mirror")

@@ -15,7 +15,11 @@ from escape_hw.api.representation import short_repr
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.bench import Bench
 from escape_hw.errors import Aborted, CalibrationError
-from escape_hw.runtime.procedures.calibration import calibrate_with_method, model_psf
+from escape_hw.runtime.procedures.calibration import (
+    calibrate_with_method,
+    measured_calibration,
+    model_psf,
+)
 
 #: The paper's two runs: 20 seconds and 3 minutes at 500 Hz.
 SHORT_FRAMES, LONG_FRAMES = 10_000, 100_000
@@ -208,13 +212,6 @@ def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -
     except Aborted:
         result.partial = True
     return result
-
-
-def measured_calibration(result: CalibrationResult) -> CalibrationResult | None:
-    """The DO-CRIME matrix behind an ESCAPE matrix as a calibration of its own."""
-    if result.measured is None:
-        return None
-    return replace(result, matrix=result.measured, measured=None, registration=None, notes=())
 
 
 #: What is added to a matrix's label when it is scaled by its optical gains.

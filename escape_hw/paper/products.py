@@ -7,8 +7,9 @@ from typing import Any
 
 from escape_hw.io import documents
 from escape_hw.io.run_folder import RunFolder
-from escape_hw.paper.experiments import WITH_GAINS, CalibrationComparison, Table1Result, measured_calibration
+from escape_hw.paper.experiments import WITH_GAINS, CalibrationComparison, Table1Result
 from escape_hw.runtime.procedures import criteria
+from escape_hw.runtime.procedures.calibration import measured_calibration
 from escape_hw.runtime.procedures.products import (
     add_calibration,
     add_gains,

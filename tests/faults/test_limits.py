@@ -86,7 +86,7 @@ def test_disabled_actuators(disabled):
 def test_more_modes_than_working_actuators_make():
     disabled = list(range(7))
     with small(f"devices.dm.limits.disabled={disabled}") as bench:
-        with pytest.raises(CalibrationError, match="30 modes asked for; this mirror of 30 actuators"):
+        with pytest.raises(CalibrationError, match="30 modes requested; this mirror of 30 actuators"):
             bench.run(docrime_run(bench, frames=400))
         assert bench.dm.sent_count == 0
 

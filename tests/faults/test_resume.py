@@ -115,7 +115,7 @@ def test_what_does_not_fit_is_refused_before_anything_moves(kept, tmp_path, more
 def test_another_method_or_loop_is_refused(good, kept, tmp_path):
     closed_loop = good.run.result
     with small(*OFTEN) as bench:
-        for options in ({"method": "push-pull-fast"}, {"method": "docrime", "closing": closed_loop}):
+        for options in ({"method": "push-pull-fast"}, {"method": "docrime", "closed_loop": closed_loop}):
             checkpoint = Checkpoint(tmp_path / "new.state", kept)
             with pytest.raises(IncompatibleProduct, match="its method is 'docrime'"):
                 run_procedure(calibrate_with_method(bench, frames=3000, checkpoint=checkpoint, **options))

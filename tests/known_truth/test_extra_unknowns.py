@@ -18,7 +18,7 @@ from escape_hw.calibration.sprint.synthetic_matrix import (
 )
 from escape_hw.errors import ConfigError
 from escape_hw.runtime.session.system import System
-from escape_sim.models.shack_hartmann import make_model
+from escape_sim.models.factory import make_fast_model
 
 SEEDS = range(6)
 SHEAR = 1.5
@@ -27,7 +27,7 @@ SYSTEMS = {"lenslets": small_lenslets, "pyramid": small_pyramid}
 
 @pytest.fixture(scope="module", params=SYSTEMS)
 def model(request):
-    return make_model(SYSTEMS[request.param](), None)
+    return make_fast_model(SYSTEMS[request.param](), None)
 
 
 def realisation(seed: int) -> Registration:
@@ -127,7 +127,7 @@ def test_a_shear_stays_with_a_mirror_that_moves_on(model):
 
 def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
     config = small_pyramid()
-    model = make_model(config, None)
+    model = make_fast_model(config, None)
     pulls = []
     for seed in SEEDS:
         truth, moved = realisation(seed), np.random.default_rng(seed).uniform(-15, 15, 2)
@@ -158,7 +158,7 @@ def test_on_the_twin_a_injected_shear_is_found_and_told():
 
 
 def test_what_a_model_or_solver_does_not_know_is_refused():
-    model = make_model(small_lenslets(), None)
+    model = make_fast_model(small_lenslets(), None)
     matrix = noisy(model.zonal_matrix(Registration()), model, 0)
     with pytest.raises(ConfigError, match="has no shift of the pupil"):
         sprint(matrix, model, extra_parameters=("pupil_shift",))

@@ -62,7 +62,7 @@ def test_devices_open_with_the_modulator_parked_and_close_parked() -> None:
     assert one.modulator.modulation is None
 
 
-def test_camera_exposes_whole_turns_and_counts_on() -> None:
+def test_camera_exposes_whole_cycles_and_continues_its_count() -> None:
     with small("twin.loss_probability=0") as one:
         assert one.modulator is not None
         assert one.wfs.settings.frame_rate_hz == 300.0
@@ -193,7 +193,7 @@ def test_product_of_an_unknown_kind_is_refused(
 ) -> None:
     from escape_hw.io.fits import extensions as fits_geometry
 
-    monkeypatch.setitem(fits_geometry._KINDS, "curvature", fits_geometry._KINDS["pyramid"])
+    monkeypatch.setitem(fits_geometry._CONVERTERS, "curvature", fits_geometry._CONVERTERS["pyramid"])
     monkeypatch.setattr(PyramidPupils, "kind", "curvature")
     path = save_matrix(tmp_path / "im.fits", measured)
     monkeypatch.undo()

@@ -13,8 +13,8 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.config.choices import Solver
 from escape_hw.config.loader import load_system
-from escape_hw.config.system import Solver
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
 
 #: Noise of an element, relative to the rms of the matrix.

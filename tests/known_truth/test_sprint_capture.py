@@ -13,7 +13,8 @@ from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.config.loader import load_system
-from escape_sim.models.shack_hartmann import ShackHartmannModel, make_model, nominal_grid
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import ShackHartmannModel, nominal_grid
 
 #: Noise of the matrix elements, relative to their rms.
 NOISE = 0.03
@@ -25,7 +26,7 @@ PAPER = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
 
 @pytest.fixture(scope="module")
 def model() -> ShackHartmannModel:
-    return make_model(load_system("razor-shwfs"), None)
+    return make_fast_model(load_system("razor-shwfs"), None)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.calibration.sprint.fit import fit_registration, sprint
 from escape_hw.calibration.sprint.mode_choice import choose_modes
 from escape_hw.config.loader import load_system
-from escape_sim.models.shack_hartmann import make_model, nominal_grid
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import nominal_grid
 
 SMALL = (
     "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
@@ -25,7 +26,7 @@ INJECTED = Registration(-16.0, 31.0, -0.77, 2.9, 0.5)
 @pytest.fixture(scope="module")
 def bench():
     config = load_system("razor-shwfs", overrides=SMALL)
-    model = make_model(config, None)
+    model = make_fast_model(config, None)
     m2c = karhunen_loeve(*model.influence_functions(), 25, 4 * config.system.pupil_m)
     return model, nominal_grid(config).valid, m2c
 

@@ -112,7 +112,7 @@ def test_ctrl_c_tells_the_command_that_goes_on(start, system, tmp_path):
     ended = start(*words[1:], "--frames", taken + 1000, "--out", second).stop()
     assert ended.code == 0, ended.lines
     assert ended.document["frames"] == taken + 1000
-    (told,) = [line for line in ended.lines if line.startswith("going on with ")]
+    (told,) = [line for line in ended.lines if line.startswith("resuming ")]
     assert str(first) in told
     assert told.endswith(f"products go to {second}")
     assert not any("go on with: " in line for line in ended.lines)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-import types
+import importlib
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -131,6 +130,9 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         "acquisition.model_psf": ("measure_model_psf",),
         "sprint.synthetic_matrix": ("simulated", "synthesise_from_measurement"),
     }
+    # All of them are imported first: a module that is imported later would keep a replaced function.
+    for module in places:
+        importlib.import_module(f"escape_hw.calibration.{module}")
     for module, names in places.items():
         for name in names:
             monkeypatch.setattr(f"escape_hw.calibration.{module}.{name}", getattr(made, name))

@@ -77,7 +77,7 @@ def test_calibrate_document_has_every_promised_field(document, bench, tmp_path):
 
 def test_calibrate_hands_its_options_on(escape, bench, tmp_path):
     code, _, err = escape(
-        "calibrate", "razor-shwfs", "--method", "docrime", "--frames", 500, "--poke", 0.01, "--plain",
+        "calibrate", "razor-shwfs", "--method", "docrime", "--frames", 500, "--poke", 0.01, "--no-whiten",
         "--modes", 50, "--set", "loop.gain=0.3", "--out", tmp_path / "run",
     )  # fmt: skip
     assert code == 0, err
@@ -144,7 +144,7 @@ def test_loop_document_has_every_promised_field(document, bench, im, tmp_path):
 
 def test_loop_settings_become_configuration(escape, bench, im, tmp_path):
     words = ("loop", "razor-shwfs", "--im", im, "--no-strehl", "--out", tmp_path / "run")
-    assert escape(*words, "--gain", 0.2, "--leak", 0.01, "--drop", 3)[0] == 0
+    assert escape(*words, "--gain", 0.2, "--leak", 0.01, "--dropped-modes", 3)[0] == 0
     loop = bench.benches[0].config.loop
     assert (loop.gain, loop.leak, loop.dropped_modes) == (0.2, 0.01, 3)
     assert escape(*words, "--best-gain")[0] == 0

@@ -61,7 +61,7 @@ def test_start_status_stop_on_the_wire(document, escape, stage):
     assert "this moves the modulator: centre, servos off" in err
     assert (found["modulation"], found["left"]) == (None, "parked")
     assert emulator.controller.state.describe() == "at rest"
-    assert emulator.complaints == ()
+    assert emulator.violations == ()
 
 
 def test_for_some_seconds_and_then_parked(document, stage):

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.tracking import TrackResult
-from escape_hw.cli.calibration.track import _show
+from escape_hw.cli.calibration.display import show_track
 from escape_hw.config.loader import load_system
 from escape_hw.io.documents import track_document
 from escape_hw.runtime.procedures.track import INJECTED_UNKNOWN, injected_registration
@@ -28,7 +28,7 @@ def shown(result: TrackResult, planted: dict[str, float] | None, note: str = "")
     console = Console(file=io.StringIO(), width=120)
     document = {**track_document(result), "planted_end": planted, "planted_note": note, "products": {}}
     one = SimpleNamespace(show=lambda *what: [console.print(item) for item in what])
-    _show(one, result, SimpleNamespace(simulated=planted is not None), document)  # type: ignore[arg-type]
+    show_track(one, result, planted is not None, document)  # type: ignore[arg-type]
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 

@@ -64,7 +64,9 @@ def fitted(sigma, rng=None, gains=GAINS):
     for gain in gains:
         value = strehl_at(gain) + (0.0 if rng is None else sigma * rng.standard_normal())
         ratio = Estimate(float(value), sigma)
-        runs.append(replace(fake_results.loop(), gain=float(gain), strehl=StrehlEstimate(ratio, ratio, ratio)))
+        runs.append(
+            replace(fake_results.loop(), gain=float(gain), strehl=StrehlEstimate(ratio, ratio, ratio))
+        )
     return gain_search._fit_peak(runs)
 
 

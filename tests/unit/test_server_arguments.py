@@ -8,17 +8,17 @@ from small_system import configuration
 from escape_hw import errors
 from escape_hw.errors import ConfigError, DeviceLost, EscapeError
 from escape_hw.remote.requests import error_from_document, error_to_document
-from escape_hw.remote.state import ProcedureParameter
 from escape_hw.runtime.procedures.calibration import METHODS
-from escape_hw.server.engine.procedures import ProcedureRegistry, check_arguments
+from escape_hw.runtime.procedures.declaration import Parameter, check_arguments
+from escape_hw.server.engine.procedures import ProcedureRegistry
 from escape_hw.server.engine.product_store import ProductStore
 
 PARAMETERS = (
-    ProcedureParameter(name="frames", kind="int", default=10, low=1, high=100, unit="frame"),
-    ProcedureParameter(name="poke", kind="float", default=None, low=0),
-    ProcedureParameter(name="fast", kind="bool", default=False),
-    ProcedureParameter(name="solver", kind="choice", default="a", choices=("a", "b")),
-    ProcedureParameter(name="im", kind="matrix"),
+    Parameter(name="frames", kind="int", default=10, low=1, high=100, unit="frame"),
+    Parameter(name="poke", kind="float", default=None, low=0),
+    Parameter(name="fast", kind="bool", default=False),
+    Parameter(name="solver", kind="choice", default="a", choices=("a", "b")),
+    Parameter(name="im", kind="matrix"),
 )
 
 

@@ -10,7 +10,7 @@ import pytest
 from escape_hw.api.camera import Frame
 from escape_hw.errors import ProductError
 from escape_hw.io.fits.telemetry import LoopTelemetry, load_telemetry, save_telemetry
-from escape_hw.runtime.procedures.loop import LoopTelemetryRecorder
+from escape_hw.runtime.procedures.loop_telemetry import LoopTelemetryRecorder
 
 
 def play(tape: LoopTelemetryRecorder, index: int, answer: float | None) -> None:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from escape_hw.api.registration import Registration
 from escape_hw.bench import Bench
 from escape_hw.calibration.modes.derivatives import modal_matrix
+from escape_hw.config.choices import PokePattern
 from escape_hw.config.renamed import present_value
-from escape_hw.config.system import PokePattern
 from escape_hw.errors import ConfigError
 
 #: Correlation, with opposite sign, of an anticorrelated poke with the one before. Beyond this the Fisher

@@ -75,11 +75,7 @@ class EstimatorThread:
         self._stop_thread()
 
     def __call__(
-        self,
-        index: int,
-        slopes: NDArray[np.float32],
-        command: NDArray[np.float64],
-        poke: NDArray[np.float64],
+        self, index: int, slopes: NDArray[np.float32], command: NDArray[np.float64], poke: NDArray[np.float64]
     ) -> None:
         """Add one frame, as an observer of the loop; raises an exception of the estimator's thread."""
         k, n, m = self._n_filled, self._n_slopes, self._n_modes

@@ -55,9 +55,7 @@ class InstrumentalEquations:
     poke_products: NDArray[Any]
 
     @staticmethod
-    def from_rows(
-        slopes: NDArray[Any], commands: NDArray[Any], pokes: NDArray[Any]
-    ) -> InstrumentalEquations:
+    def from_rows(slopes: NDArray[Any], commands: NDArray[Any], pokes: NDArray[Any]) -> InstrumentalEquations:
         """Sums of rows ``(n, n_slopes)``, ``(n, n_modes)`` and ``(n, n_modes)``."""
         return InstrumentalEquations(slopes.T @ pokes, commands.T @ pokes, pokes.T @ pokes)
 

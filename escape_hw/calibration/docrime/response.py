@@ -16,11 +16,7 @@ from scipy.linalg import toeplitz
 
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
-from escape_hw.calibration.docrime.regression import (
-    N_SAMPLED_SLOPES,
-    InstrumentalEquations,
-    sampling_step,
-)
+from escape_hw.calibration.docrime.regression import N_SAMPLED_SLOPES, InstrumentalEquations, sampling_step
 from escape_hw.calibration.docrime.whitening import apply_filter
 from escape_hw.errors import CalibrationError
 

@@ -31,7 +31,8 @@ from escape_hw.calibration.sprint.fit import fit_registration, sprint_options_fr
 from escape_hw.calibration.sprint.solvers import MATRIX_ONLY_SOLVERS
 from escape_hw.calibration.sprint.synthetic_matrix import synthesise_calibration
 from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
-from escape_hw.config.system import ESTIMATORS, CalibrationSection
+from escape_hw.config.choices import ESTIMATORS
+from escape_hw.config.system import CalibrationSection
 from escape_hw.deprecation import renamed_keywords
 from escape_hw.errors import Aborted, ConfigError
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import Estimate
 from escape_hw.api.synthetic_model import HasPupilShift, SyntheticModel
-from escape_hw.config.system import ExtraParameter
+from escape_hw.config.choices import ExtraParameter
 from escape_hw.errors import ConfigError
 
 #: Prior standard deviations: shear in % of the diameter, shift of the images in % of a sub-aperture.

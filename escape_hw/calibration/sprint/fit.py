@@ -34,19 +34,19 @@ from escape_hw.calibration.sprint.weighted_matrix import (
     apply_model_weights,
     huber_weights,
 )
-from escape_hw.config.renamed import present_value
-from escape_hw.config.system import (
+from escape_hw.config.choices import (
     ACTUATOR_MODELS,
     LOSSES,
     MODES_CHOICES,
     SOLVERS,
     ActuatorModel,
-    CalibrationSection,
     ExtraParameter,
     Loss,
     ModesChoice,
     Solver,
 )
+from escape_hw.config.renamed import present_value
+from escape_hw.config.system import CalibrationSection
 from escape_hw.deprecation import renamed_keywords, warn_renamed
 from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 

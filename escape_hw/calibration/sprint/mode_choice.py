@@ -10,7 +10,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.sprint.least_squares import MAX_STEP, LeastSquaresProblem
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
-from escape_hw.config.system import ModesChoice
+from escape_hw.config.choices import ModesChoice
 
 #: Initial information on every parameter, relative to that of all modes: a single mode does not determine
 #: all parameters.

@@ -31,7 +31,7 @@ from escape_hw.calibration.sprint.least_squares import (
 from escape_hw.calibration.sprint.mixed_effects import MixedEffectsProblem, MixedEffectsState, PriorEstimate
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
-from escape_hw.config.system import Solver
+from escape_hw.config.choices import Solver
 
 T = TypeVar("T")
 

@@ -228,7 +228,7 @@ def _sweep_variants(
 ) -> list[MatrixVariant]:
     from escape_hw.errors import ConfigError
     from escape_hw.io.fits.gains import load_gains
-    from escape_hw.runtime.procedures.task import load_fitting_matrix, require_hardware_matrix
+    from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
     from escape_hw.runtime.sweep.matrices import measure_variants, read_variants, save_variants
 
     if request.im:

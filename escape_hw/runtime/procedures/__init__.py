@@ -1,4 +1,6 @@
-"""One module per procedure, from the request to the saved result, and the task protocol that they share.
+"""One module per procedure, from the declared parameters to the saved result, and what the modules share.
 
-The algorithms are in ``escape_hw.calibration``.
+``declaration`` defines how a procedure is declared, ``registry`` lists all of them, ``python_method`` derives
+methods, ``criteria`` and ``products`` assess and save results. The algorithms are in
+``escape_hw.calibration``.
 """

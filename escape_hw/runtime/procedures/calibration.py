@@ -1,29 +1,27 @@
-"""Calibration by any method: choice of the procedure, request, resuming, saving."""
+"""Calibration by any method: the procedures, their request and its saved state, and the result."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
-from escape_hw.api.procedure import Procedure
-from escape_hw.api.results import CalibrationResult
-from escape_hw.api.sensor import SensorGeometry
-from escape_hw.bench import Bench
+from escape_hw.config.choices import ESTIMATORS, POKE_PATTERNS
+from escape_hw.config.renamed import update_document
 from escape_hw.errors import ConfigError, ProductError
-from escape_hw.runtime.procedures.task import (
-    SavedRun,
-    load_fitting_matrix,
-    require_hardware_matrix,
-    set_overrides,
-)
-from escape_hw.runtime.session.record import without_turbulence
+from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun, parameter, present_names
+from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
+from escape_hw.runtime.procedures.sprint import SprintParameters
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from escape_hw.api.procedure import Procedure
+    from escape_hw.api.results import CalibrationResult
+    from escape_hw.api.sensor import SensorGeometry
     from escape_hw.bench import Bench
     from escape_hw.calibration.acquisition.checkpoint import Checkpoint
     from escape_hw.calibration.acquisition.stopping import Target
@@ -33,10 +31,366 @@ if TYPE_CHECKING:
     from escape_hw.runtime.session.record import BenchRecord
 
 
-#: The calibration methods, by the names that the command line knows as well.
-METHODS = ("push-pull", "push-pull-fast", "modulated", "docrime", "escape")
-#: Those that work in closed loop as well.
-CLOSED_LOOP = ("push-pull-fast", "docrime", "escape")
+#: Frames of the settling test before a push-pull, and frames discarded after each push and pull.
+_SETTLING_TEST_FRAMES, _SETTLING_FRAMES = 50, 2
+
+
+def _frames(config_key: str, help: str = "Frames to measure with.") -> Any:
+    return parameter(default=None, help=help, unit="frame", low=1, high=1e8, config_key=config_key)
+
+
+def _poke(config_key: str) -> Any:
+    return parameter(
+        default=None, help="Poke of each mode, rms surface as fraction of full stroke.",
+        unit="of full stroke", low=1e-6, high=1, config_key=config_key,
+    )  # fmt: skip
+
+
+class CalibrationProcedure(ProcedureSpec["CalibrationResult"]):
+    """Base class of the calibrations; ``name`` is the method."""
+
+    frames: int | None = _frames("calibration.frames")
+    poke: float | None = _poke("calibration.poke")
+    snr: float | None = parameter(
+        default=None, help="Stop when every mode has this signal-to-noise ratio.", label="SNR goal", low=0.01
+    )
+    resume: Path | None = parameter(
+        default=None, help="Continue an incomplete run, given by its folder.", label="Resume run", kind="run",
+        last=True,
+    )  # fmt: skip
+    force: bool = parameter(
+        default=False, help="Allow a simulated matrix on hardware.", on_server=False, last=True
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._checkpoint: Checkpoint | None = None
+        self._control_matrix: MatrixProduct | None = None
+
+    @classmethod
+    def from_arguments(cls, arguments: Mapping[str, Any], label: Callable[[str], str] = str) -> Self:
+        """A request from arguments; those of the run to resume count where none are given.
+
+        Raises
+        ------
+        ConfigError
+            An argument is wrong.
+        ProductError
+            The run cannot be resumed.
+        """
+        resume = arguments.get("resume")
+        if resume is None:
+            return super().from_arguments(arguments, label)
+        given = {
+            name: value
+            for name, value in present_names(cls.parameters(), arguments, label).items()
+            if value is not None
+        }
+        known = {one.name for one in cls.parameters()}
+        saved = {name: value for name, value in saved_request(Path(resume)).items() if name in known}
+        return super().from_arguments({**saved, **given}, label)
+
+    @classmethod
+    def settings_of_run(cls, folder: Path) -> dict[str, Any]:
+        """Values, in the configuration of an earlier run, of the parameters that set configuration keys.
+
+        Raises
+        ------
+        ProductError
+            The folder holds no readable configuration.
+        """
+        path = folder / "config.toml"
+        try:
+            config = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise ProductError(
+                f"{path}: cannot be read ({error}); is {folder} the folder of a run?"
+            ) from error
+        update_document(config)
+        found = {}
+        for one in cls.parameters():
+            if one.sets_config:
+                section, _, key = one.config_key.partition(".")
+                value = config.get(section, {}).get(key)
+                found[one.name] = ",".join(value) if isinstance(value, list) else value
+        return found
+
+    @property
+    def kind(self) -> str:
+        """Part of the run folder's name."""
+        return f"calibrate-{self.name}"
+
+    @property
+    def target(self) -> tuple[float | None, float | None]:
+        """Signal-to-noise ratio and accuracy at which the run stops."""
+        return self.snr, None
+
+    def request(self) -> dict[str, Any]:
+        """Method and arguments as plain values, saved with the state of the run for ``resume``."""
+        left_out = ("resume", "force")
+        values = {
+            one.name: getattr(self, one.name)
+            for one in self.parameters()
+            if not one.sets_config and one.name not in left_out
+        }
+        plain = {
+            name: str(value.absolute()) if isinstance(value, Path) else value
+            for name, value in values.items()
+        }
+        return {"method": self.name, **plain}
+
+    def method_options(self) -> dict[str, Any]:
+        """Arguments of :func:`calibrate_with_method` that not all methods have."""
+        return {}
+
+    def _is_short_run(self, bench: Bench) -> bool:
+        """Whether the run is too short for a measured matrix, so that it cannot be resumed."""
+        return False
+
+    def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[CalibrationResult]:
+        """Calibrate; the state is saved in the folder meanwhile, so that the run can be resumed."""
+        from escape_hw.calibration.acquisition.checkpoint import Checkpoint
+        from escape_hw.calibration.acquisition.stopping import Target
+        from escape_hw.io.fits.run_state import STATE_FILE
+
+        if self._control_matrix is not None:
+            require_hardware_matrix(self._control_matrix, bench, self.force)
+        if folder is not None:
+            source = None if self.resume is None else self.resume / STATE_FILE
+            # A short run cannot be resumed; escape() refuses to resume one.
+            if source is not None or not self._is_short_run(bench):
+                self._checkpoint = Checkpoint(folder.file(STATE_FILE), source, request=self.request())
+        return calibrate_with_method(
+            bench, self.name, frames=self.frames, poke=self.poke, **self.method_options(),
+            closed_loop=None if self._control_matrix is None else self._control_matrix.result,
+            until=None if self.target == (None, None) else Target(*self.target), checkpoint=self._checkpoint,
+        )  # fmt: skip
+
+    def save(
+        self, folder: RunFolder, record: BenchRecord, result: CalibrationResult, wall_seconds: float
+    ) -> SavedRun:
+        """Save the matrix, the measured matrix behind a pseudo-synthetic one, and the report."""
+        from escape_hw.io.documents import calibration_document
+        from escape_hw.runtime.procedures.products import add_calibration, write_run_result
+
+        measured = measured_calibration(result)
+        labels: dict[str, Any] = {"im": {"measured": "DO-CRIME", "column": ""}}
+        parents = {} if self._control_matrix is None else {"closing": self._control_matrix.path}
+        if measured is not None:
+            parents = {"docrime": add_calibration(folder, record, "docrime", measured, parents)}
+            labels["docrime"] = {"label": "DO-CRIME"}
+        add_calibration(folder, record, "im", result, parents)
+        checks = self._criteria(result)
+        document = write_run_result(
+            folder,
+            {
+                **record.header_fields("calibrate"),
+                "title": f"Calibration of {record.system}",
+                **calibration_document(result),
+                "criteria": checks,
+                "labels": labels,
+                **record.footer_fields(wall_seconds),
+            },
+        )
+        return SavedRun(document, all(entry["met"] for entry in checks))
+
+    def _criteria(self, result: CalibrationResult) -> list[dict[str, Any]]:
+        from escape_hw.runtime.procedures import criteria
+
+        checks, (snr, accuracy) = [], self.target
+        if result.matrix.method == "escape" and not result.partial:
+            checks.append(criteria.sprint_converged("ESCAPE", result.registration))
+        if accuracy is not None and result.registration is not None:
+            worst = float(result.registration.sigma[:2].max())
+            text = f"standard error of the shifts: {worst:.3g} (target {accuracy:g}) % of a sub-aperture"
+            checks.append(criteria.criterion(text, worst <= accuracy))
+        if snr is not None:
+            least = float((result.measured or result.matrix).snr().min())
+            text = f"signal-to-noise ratio of the weakest mode: {least:.3g} (target {snr:g})"
+            checks.append(criteria.criterion(text, least >= snr))
+        return checks
+
+    def finish(self) -> None:
+        """Remove the saved state."""
+        if self._checkpoint is not None:
+            self._checkpoint.remove()
+
+
+class ClosedLoopCalibration(CalibrationProcedure):
+    """Base class of the calibrations that also work in closed loop."""
+
+    closed_loop: Path | None = parameter(
+        default=None, help="Measure in closed loop, with this control matrix.",
+        label="Control matrix (closed loop)", kind="matrix", deprecated=("closing",),
+    )  # fmt: skip
+
+    def load(self, config: SystemConfig, simulated: bool = False) -> None:
+        """Read the control matrix."""
+        if self.closed_loop is not None:
+            self._control_matrix = load_fitting_matrix(self.closed_loop, config, self.force or simulated)
+
+
+class DocrimeProcedure(ClosedLoopCalibration):
+    """DO-CRIME: random pokes of all modes at once."""
+
+    name = "docrime"
+    title = "DO-CRIME"
+    help = "Measure an interaction matrix with random pokes of all modes at once, with or without turbulence."
+    random_pokes = True
+
+    pokes: str | None = parameter(
+        default=None, help="Poke sequence of DO-CRIME.", choices=POKE_PATTERNS,
+        config_key="calibration.pokes", sets_config=True,
+    )  # fmt: skip
+    whiten: bool = parameter(
+        default=True, help="Whiten the turbulence; otherwise the paper's estimator, in open loop only.",
+        label="Whiten turbulence", deprecated_inverse=("plain",),
+    )  # fmt: skip
+
+    def validate(self) -> None:
+        """Refuse the paper's estimator in closed loop."""
+        if not self.whiten and self.closed_loop is not None:
+            raise ConfigError("whiten = false (--no-whiten) works in open loop only; leave out closed_loop")
+
+    def method_options(self) -> dict[str, Any]:
+        """Whether the turbulence is whitened."""
+        return {"whiten": self.whiten}
+
+
+class EscapeProcedure(DocrimeProcedure, SprintParameters["CalibrationResult"]):
+    """ESCAPE: DO-CRIME, SPRINT, and the pseudo-synthetic matrix."""
+
+    name = "escape"
+    title = "ESCAPE"
+    help = (
+        "Measure with DO-CRIME, estimate the registration with SPRINT, compute the pseudo-synthetic matrix."
+    )
+
+    accuracy: float | None = parameter(
+        default=None, help="Stop when the standard errors of the shifts are this small.",
+        label="Accuracy goal", unit="% of a sub-aperture", low=1e-6,
+    )  # fmt: skip
+    estimator: str | None = parameter(
+        default=None, help="Data that SPRINT fits; telemetry needs the fewest frames.", choices=ESTIMATORS,
+        config_key="calibration.estimator",
+    )  # fmt: skip
+
+    @property
+    def target(self) -> tuple[float | None, float | None]:
+        """Signal-to-noise ratio and accuracy at which the run stops."""
+        return self.snr, self.accuracy
+
+    def method_options(self) -> dict[str, Any]:
+        """Whether the turbulence is whitened, and the data that are fitted."""
+        return {"whiten": self.whiten, "estimator": self.estimator}
+
+    def _is_short_run(self, bench: Bench) -> bool:
+        from escape_hw.calibration.escape.method import is_short_run
+
+        c, closed_loop = bench.config, self._control_matrix
+        n_modes = c.basis.n_modes if closed_loop is None else closed_loop.matrix.n_modes
+        return is_short_run(c.calibration, n_modes, frames=self.frames, **self.method_options())
+
+
+class PushPullProcedure(CalibrationProcedure):
+    """Push-pull: one mode after the other, averaged over frames."""
+
+    name = "push-pull"
+    title = "Push-pull"
+    help = "Measure an interaction matrix mode by mode; needs a source without turbulence."
+
+    frames: int | None = _frames("calibration.push_pull_frames", "Frames per push and per pull.")
+    poke: float | None = _poke("calibration.push_pull_poke")
+
+    @classmethod
+    def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Frames of set-up, settling test, and a push and a pull per mode."""
+        from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
+
+        per_mode = 2 * (int(arguments.get("frames") or 0) + _SETTLING_FRAMES)
+        return SETUP_FRAMES + _SETTLING_TEST_FRAMES + bench.config.basis.n_modes * per_mode
+
+
+class FastPushPullProcedure(ClosedLoopCalibration):
+    """Fast push-pull: one mode after the other, a push and a pull within two frames."""
+
+    name = "push-pull-fast"
+    title = "Fast push-pull"
+    help = "Measure an interaction matrix mode by mode, with a push and a pull within two frames."
+
+    poke: float | None = _poke("calibration.push_pull_poke")
+
+
+class ModulatedProcedure(CalibrationProcedure):
+    """Modulation-demodulation: several modes at once, on distinct frequencies."""
+
+    name = "modulated"
+    title = "Modulation"
+    help = "Measure an interaction matrix with several modes at once, each at its own frequency."
+
+    frames: int | None = _frames("calibration.modulated_frames", "Frames per batch of modes.")
+
+    @classmethod
+    def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Frames of the set-up and of all batches."""
+        from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
+        from escape_hw.calibration.push_pull.demodulation import choose_line_frequencies
+        from escape_hw.calibration.push_pull.modulation import BAND
+        from escape_hw.errors import TooFewFrames
+
+        frames, n_modes = int(arguments.get("frames") or 0), bench.config.basis.n_modes
+        try:
+            at_once = choose_line_frequencies(n_modes, frames, BAND).size
+        except TooFewFrames:
+            return SETUP_FRAMES + frames
+        return SETUP_FRAMES + -(-n_modes // at_once) * frames
+
+
+#: The calibrations by method.
+CALIBRATIONS: dict[str, type[CalibrationProcedure]] = {
+    procedure.name: procedure
+    for procedure in (
+        PushPullProcedure, FastPushPullProcedure, ModulatedProcedure, DocrimeProcedure, EscapeProcedure,
+    )
+}  # fmt: skip
+METHODS = tuple(CALIBRATIONS)
+#: Methods that also work in closed loop.
+CLOSED_LOOP = tuple(name for name, each in CALIBRATIONS.items() if issubclass(each, ClosedLoopCalibration))
+
+
+def saved_request(folder: Path) -> dict[str, Any]:
+    """Method and arguments of an incomplete run, under their present names.
+
+    Raises
+    ------
+    ProductError
+        The folder holds no state to resume from.
+    """
+    from escape_hw.io.fits.run_state import STATE_FILE, load_state
+
+    path = folder / STATE_FILE
+    if not path.is_file() and (folder / "report.html").is_file():
+        raise ProductError(
+            f"{folder} is complete, there is nothing to resume; its report is {folder / 'report.html'}, "
+            f"and 'escape show {folder}' prints its result"
+        )
+    if not path.is_file():
+        raise ProductError(
+            f"{path}: does not exist; {folder} is not the folder of a run, or the run was stopped in its "
+            "first seconds, or it is complete"
+        )
+    request = {name: value for name, value in load_state(path).values["request"].items() if value is not None}
+    if "plain" in request:
+        # Name in version 0.1.0.
+        request["whiten"] = not request.pop("plain")
+    return request
+
+
+def measured_calibration(result: CalibrationResult) -> CalibrationResult | None:
+    """The measured matrix behind a pseudo-synthetic one as a calibration of its own; ``None`` without one."""
+    if result.measured is None:
+        return None
+    return replace(result, matrix=result.measured, measured=None, registration=None, notes=())
 
 
 def calibrate_with_method(
@@ -52,10 +406,9 @@ def calibrate_with_method(
     until: Target | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
-    """A calibration by the name of its method.
+    """Calibrate with the method of that name.
 
-    Slow push-pull needs a source: the phase screen, where the bench moves one, is out of the beam
-    meanwhile. The others take the light as it is.
+    During push-pull the phase screen, if the bench can move it, is out of the beam.
 
     Parameters
     ----------
@@ -63,38 +416,34 @@ def calibrate_with_method(
         An open bench.
     method
         One of :data:`METHODS`.
-    frames
-        Frames to measure with (push-pull: per push and per pull); as configured by default.
-    poke
-        Rms surface as fraction of full stroke; as configured by default.
+    frames, poke, whiten, estimator
+        See the parameters of the procedure, for example :class:`EscapeProcedure`.
     grid
-        The sensor's grid, when it is known already.
-    whiten
-        False: the paper's plain estimator of ``docrime`` and ``escape``.
-    estimator
-        What ``escape`` fits: ``"matrix"``, ``"telemetry"`` or ``"auto"``; as configured by default.
-    closing
-        Measure in closed loop, with this calibration's matrix; the methods of :data:`CLOSED_LOOP`.
+        Geometry of the sensor; found on frames by default.
+    closed_loop
+        Calibration whose matrix closes the loop during the measurement; methods of :data:`CLOSED_LOOP`.
     until
-        Stop when this is reached.
-    keep
-        Where the state is kept meanwhile, and what to go on with.
+        Stop when this target is reached.
+    checkpoint
+        File for the state of the run, and the state to resume from.
 
     Raises
     ------
     ConfigError
-        No such method, or options that do not go together; nothing moved.
+        The method is unknown, or the options exclude each other; nothing has moved.
     TooFewFrames, CalibrationError, Aborted
         See :func:`~escape_hw.calibration.push_pull.procedure.push_pull`,
-        :func:`~escape_hw.calibration.docrime.open_loop.docrime`, :func:`~escape_hw.calibration.escape.method.escape`.
+        :func:`~escape_hw.calibration.docrime.open_loop.docrime`,
+        :func:`~escape_hw.calibration.escape.method.escape`.
     """
-    # Imported when used: these bring compilers along, and a bench opens without them.
+    from escape_hw.runtime.session.record import without_turbulence
+
     if method not in METHODS:
         raise ConfigError(f"calibration method '{method}' is unknown; it is one of {', '.join(METHODS)}")
     if closed_loop is not None and method not in CLOSED_LOOP:
-        raise ConfigError(f"'{method}' is for open loop; in closed loop: {', '.join(CLOSED_LOOP)}")
+        raise ConfigError(f"'{method}' works in open loop only; in closed loop: {', '.join(CLOSED_LOOP)}")
     if closed_loop is not None and not whiten:
-        raise ConfigError("the plain estimator is for open loop; in closed loop turbulence is whitened")
+        raise ConfigError("whiten = False works in open loop only; in closed loop the turbulence is whitened")
     common: dict[str, Any] = {"frames": frames, "poke": poke, "until": until, "checkpoint": checkpoint}
     if method == "push-pull":
         from escape_hw.calibration.push_pull.procedure import push_pull
@@ -128,7 +477,7 @@ def calibrate_with_method(
 
 
 def model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32]]:
-    """The PSF to measure Strehl ratios against, with the turbulence out of the beam meanwhile.
+    """Measure the model PSF, the reference of Strehl ratios, with the phase screen out of the beam.
 
     Parameters
     ----------
@@ -143,214 +492,7 @@ def model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32
         The system has no science camera.
     """
     from escape_hw.calibration.acquisition.model_psf import measure_model_psf
+    from escape_hw.runtime.session.record import without_turbulence
 
     with without_turbulence(bench):
         return (yield from measure_model_psf(bench, frames=frames))
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationRequest:
-    """How a calibration is asked for; kept with its state, so that it can be resumed without asking again."""
-
-    method: str = "escape"
-    frames: int | None = None
-    poke: float | None = None
-    accuracy: float | None = None
-    snr: float | None = None
-    plain: bool = False
-    estimator: str | None = None
-    closed_loop: str | None = None
-
-    def validate(self) -> CalibrationRequest:
-        """The request, if its parts go together.
-
-        Raises
-        ------
-        ConfigError
-            They do not; nothing was opened.
-        """
-        from escape_hw.config.system import ESTIMATORS
-
-        if self.method not in METHODS:
-            raise ConfigError(f"--method {self.method}: unknown; it is one of {', '.join(METHODS)}")
-        if self.poke is not None and not 0 < self.poke <= 1:
-            raise ConfigError(f"--poke {self.poke:g}: it must lie in (0, 1], a fraction of full stroke")
-        if self.accuracy is not None and (self.method != "escape" or not self.accuracy > 0):
-            raise ConfigError("--accuracy: it goes with --method escape and must be positive")
-        if self.snr is not None and not self.snr > 0:
-            raise ConfigError(f"--snr {self.snr:g}: it must be positive")
-        if self.plain and (self.method != "docrime" or self.closed_loop is not None):
-            raise ConfigError("--plain: it goes with --method docrime in open loop")
-        if self.closed_loop is not None and self.method not in CLOSED_LOOP:
-            raise ConfigError(f"--closed-loop: it goes with --method {', '.join(CLOSED_LOOP)}")
-        if self.estimator is not None and (self.method != "escape" or self.estimator not in ESTIMATORS):
-            raise ConfigError(
-                f"--estimator {self.estimator}: it goes with --method escape and is one of "
-                f"{', '.join(ESTIMATORS)}"
-            )
-        return self
-
-    @classmethod
-    def from_options(cls, asked: Mapping[str, Any], resume: Path | None = None) -> CalibrationRequest:
-        """What is asked for, with what the run to resume was asked for where nothing (``None``) is said.
-
-        Raises
-        ------
-        ConfigError
-            Its parts do not go together.
-        ProductError
-            There is nothing to resume.
-        """
-        options = {key: value for key, value in asked.items() if value is not None}
-        if resume is None:
-            return cls(**options).validate()
-        from escape_hw.io.fits.run_state import STATE_FILE, load_state
-
-        path = resume / STATE_FILE
-        if not path.is_file() and (resume / "report.html").is_file():
-            raise ProductError(
-                f"{resume} came to its end, there is nothing to go on with; its report is "
-                f"{resume / 'report.html'}, and 'escape show {resume}' tells what it found"
-            )
-        if not path.is_file():
-            raise ProductError(
-                f"{path}: not there; {resume} is no run, it was broken off in its first seconds, or it came "
-                "to its end"
-            )
-        return cls(**{**load_state(path).values["request"], **options}).validate()
-
-
-class CalibrationTask:
-    """A calibration by any method; see :class:`~escape_hw.runtime.procedures.task.Task`.
-
-    Parameters
-    ----------
-    request
-        What is asked for.
-    resume
-        Folder of a run to go on with.
-    force
-        Allow a simulated matrix on hardware.
-    settings
-        Keys of the configuration's section ``calibration`` to change; ``None``: as configured.
-    """
-
-    def __init__(
-        self,
-        request: CalibrationRequest,
-        *,
-        resume: Path | None = None,
-        force: bool = False,
-        settings: dict[str, object] | None = None,
-    ) -> None:
-        self.request = request
-        self.kind = f"calibrate-{self.request.method}"
-        self.overrides = set_overrides(
-            {f"calibration.{key}": value for key, value in (settings or {}).items()}
-        )
-        self._resume, self._force = resume, force
-        self._control_matrix: MatrixProduct | None = None
-        self._checkpoint: Checkpoint | None = None
-
-    def load(self, config: SystemConfig, simulated: bool = False) -> None:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.load`."""
-        if self.request.closed_loop is not None:
-            closed_loop = Path(self.request.closed_loop)
-            self._control_matrix = load_fitting_matrix(closed_loop, config, self._force or simulated)
-
-    def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[CalibrationResult]:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.procedure`."""
-        from escape_hw.calibration.acquisition.checkpoint import Checkpoint
-        from escape_hw.calibration.acquisition.stopping import Target
-        from escape_hw.io.fits.run_state import STATE_FILE
-
-        if self._control_matrix is not None:
-            require_hardware_matrix(self._control_matrix, bench, self._force)
-        source = None if self._resume is None else self._resume / STATE_FILE
-        one = self.request
-        # A short run cannot be resumed; escape() refuses to resume one.
-        if source is not None or not self._is_short_run(bench):
-            self._checkpoint = Checkpoint(folder.file(STATE_FILE), source, request=asdict(one))
-        return calibrate_with_method(
-            bench, one.method, frames=one.frames, poke=one.poke, whiten=not one.plain,
-            estimator=one.estimator, closed_loop=None if self._control_matrix is None else self._control_matrix.result,
-            checkpoint=self._checkpoint,
-            until=None if one.snr is None and one.accuracy is None else Target(one.snr, one.accuracy),
-        )  # fmt: skip
-
-    def _is_short_run(self, bench: Bench) -> bool:
-        """Whether the request is for an ESCAPE run of too few frames for a measured matrix."""
-        if self.request.method != "escape":
-            return False
-        from escape_hw.calibration.escape.method import is_short_run
-
-        c, closed_loop = bench.config, self._control_matrix
-        n_modes = c.basis.n_modes if closed_loop is None else closed_loop.matrix.n_modes
-        return is_short_run(
-            c.calibration, n_modes, frames=self.request.frames, estimator=self.request.estimator
-        )
-
-    def save(
-        self, folder: RunFolder, record: BenchRecord, result: CalibrationResult, wall_seconds: float
-    ) -> SavedRun:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.save`."""
-        from escape_hw.io.documents import calibration_document
-        from escape_hw.paper.experiments import measured_calibration
-        from escape_hw.runtime.procedures.products import add_calibration, write_run_result
-
-        measured = measured_calibration(result)
-        labels: dict[str, Any] = {"im": {"measured": "DO-CRIME", "column": ""}}
-        parents = {} if self._control_matrix is None else {"closing": self._control_matrix.path}
-        if measured is not None:
-            parents = {"docrime": add_calibration(folder, record, "docrime", measured, parents)}
-            labels["docrime"] = {"label": "DO-CRIME"}
-        add_calibration(folder, record, "im", result, parents)
-        checks = self._criteria(result)
-        document = write_run_result(
-            folder,
-            {
-                **record.header_fields("calibrate"),
-                "title": f"Calibration of {record.system}",
-                **calibration_document(result),
-                "criteria": checks,
-                "labels": labels,
-                **record.footer_fields(wall_seconds),
-            },
-        )
-        return SavedRun(document, all(entry["met"] for entry in checks))
-
-    def _criteria(self, result: CalibrationResult) -> list[dict[str, Any]]:
-        from escape_hw.runtime.procedures import criteria
-
-        checks, one = [], self.request
-        if result.matrix.method == "escape" and not result.partial:
-            checks.append(criteria.sprint_converged("ESCAPE", result.registration))
-        if one.accuracy is not None and result.registration is not None:
-            worst = float(result.registration.sigma[:2].max())
-            text = f"standard error of the shifts: {worst:.3g} (wanted {one.accuracy:g}) % of a sub-aperture"
-            checks.append(criteria.criterion(text, worst <= one.accuracy))
-        if one.snr is not None:
-            least = float((result.measured or result.matrix).snr().min())
-            text = f"signal-to-noise ratio of the weakest mode: {least:.3g} (wanted {one.snr:g})"
-            checks.append(criteria.criterion(text, least >= one.snr))
-        return checks
-
-    def finish(self) -> None:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.finish`."""
-        if self._checkpoint is not None:
-            self._checkpoint.remove()
-
-
-def mode_count_overrides(config: SystemConfig, modes: int) -> tuple[tuple[str, ...], int]:
-    """Overrides for another number of modes; the loop goes on dropping the same share of them.
-
-    Returns
-    -------
-    overrides : tuple of str
-    dropped : int
-        Modes that the loop then drops.
-    """
-    configured_dropped, n = config.loop.dropped_modes, config.basis.n_modes
-    dropped = min(configured_dropped, modes * configured_dropped // n)
-    change = () if dropped == configured_dropped else (f"loop.dropped_modes={dropped}",)
-    return (f"basis.n_modes={modes}", *change), dropped

@@ -1,21 +1,22 @@
-"""The bootstrap of optical gains, from the request to the kept gains."""
+"""Optical gains measured in closed loop, with a matrix of unknown scale."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from escape_hw.api.procedure import Procedure
-from escape_hw.runtime.procedures.task import (
-    SavedRun,
-    TaskWithMatrix,
+from escape_hw.runtime.procedures.declaration import SavedRun, parameter
+from escape_hw.runtime.procedures.matrix_input import (
+    MatrixProcedure,
     load_fitting_matrix,
+    psf_frames,
     require_hardware_matrix,
 )
 
 if TYPE_CHECKING:
     from escape_hw.api.interaction_matrix import InteractionMatrix
+    from escape_hw.api.procedure import Procedure
     from escape_hw.bench import Bench
     from escape_hw.calibration.optical_gain.bootstrap import GainsRun
     from escape_hw.config.system import SystemConfig
@@ -23,64 +24,77 @@ if TYPE_CHECKING:
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
 
+#: Typical number of rounds, for the planned duration.
+_TYPICAL_ROUNDS = 3
 
-class GainsTask(TaskWithMatrix):
-    """A bootstrap of optical gains; see :class:`~escape_hw.runtime.procedures.task.Task`.
 
-    Parameters
-    ----------
-    im
-        File of the matrix to scale.
-    beside
-        Files of other matrices whose gains are wanted.
-    strehl
-        Measure the model PSF and the Strehl ratios.
-    force
-        Allow a simulated matrix on hardware.
-    options
-        ``poke``, ``accuracy``, ``budget``, ``frames`` and ``gain`` of
-        :func:`~escape_hw.calibration.optical_gain.bootstrap.bootstrap_gains`.
-    """
+class GainsProcedure(MatrixProcedure["GainsRun"]):
+    """Optical gains of a matrix of unknown scale, and the matrix rescaled with them."""
 
-    kind = "gains"
+    name = "gains"
+    title = "Optical gains"
+    help = "Close the loop on a matrix of unknown scale and scale it to the turbulence, mode by mode."
+    random_pokes = True
 
-    def __init__(
-        self,
-        im: Path,
-        *,
-        beside: Sequence[Path] = (),
-        strehl: bool = True,
-        force: bool = False,
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
-        super().__init__(im, force=force)
-        self._paths, self._strehl, self._options = tuple(beside), strehl, dict(options or {})
-        self._other_matrices: dict[str, MatrixProduct] = {}
+    poke: float = parameter(
+        default=0.002,
+        help="Last poke of each mode, rms surface as fraction of full stroke; lowered to the allowed "
+        "Strehl loss.",
+        unit="of full stroke", low=1e-6, high=1,
+    )  # fmt: skip
+    accuracy: float = parameter(
+        default=0.01, help="Relative standard error of the gains at which the rounds end.", low=1e-5, high=1
+    )
+    allowed_strehl_loss: float = parameter(
+        default=0.01, help="Share of the Strehl ratio that the last pokes may cost.", low=1e-5, high=1,
+        deprecated=("budget",),
+    )  # fmt: skip
+    frames: int = parameter(
+        default=20000, help="Largest number of frames per round.", unit="frame", low=1, high=1e8
+    )
+    gain: float | None = parameter(
+        default=None, help="Gain of the loop, multiplied by the optical gain.", low=0.001, high=2,
+        config_key="loop.gain",
+    )  # fmt: skip
+    other_matrices: tuple[Path, ...] = parameter(
+        default=(), help="Another matrix whose gains are measured too; repeatable.", kind="matrices",
+        on_server=False, deprecated=("beside",),
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._other_products: dict[str, MatrixProduct] = {}
+
+    @classmethod
+    def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Sensor frames of the model PSF and of a typical number of rounds."""
+        return psf_frames(bench, arguments) + _TYPICAL_ROUNDS * int(arguments.get("frames") or 0)
 
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.load`."""
+        """Read all matrices."""
         super().load(config, simulated)
-        any_mode = self._force or simulated
-        self._other_matrices = {
-            path.stem: load_fitting_matrix(path, config, any_mode) for path in self._paths
+        any_mode = self.force or simulated
+        self._other_products = {
+            path.stem: load_fitting_matrix(path, config, any_mode) for path in self.other_matrices
         }
 
-    def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[GainsRun]:
-        """Model PSF where the bench can take one, then the bootstrap."""
+    def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[GainsRun]:
+        """Measure the model PSF, then the gains in closed loop."""
         from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
         from escape_hw.calibration.sprint.synthetic_matrix import static_light_matrix
-        from escape_hw.runtime.procedures.calibration import model_psf
 
-        for each in (self.product, *self._other_matrices.values()):
-            require_hardware_matrix(each, bench, self._force)
-        model = None
-        if self._strehl and bench.science is not None:
-            model = yield from model_psf(bench)
+        for each in (self.product, *self._other_products.values()):
+            require_hardware_matrix(each, bench, self.force)
+        model = yield from self.take_model_psf(bench)
         return (
             yield from bootstrap_gains(
                 bench,
                 self.product.result,
-                **self._options,
+                poke=self.poke,
+                accuracy=self.accuracy,
+                budget=self.allowed_strehl_loss,
+                frames=self.frames,
+                gain=self.gain,
                 comparisons=self._comparison_matrices(),
                 closed_loop_matrix=static_light_matrix(bench, self.product.result),
                 model_psf=model,
@@ -88,13 +102,13 @@ class GainsTask(TaskWithMatrix):
         )
 
     def _comparison_matrices(self) -> dict[str, InteractionMatrix]:
-        """The other matrices, and the measured one that a pseudo-synthetic one was computed from."""
+        """The other matrices and, for a pseudo-synthetic matrix, the measured one behind it."""
         measured = self.product.result.measured
         known = {} if measured is None else {"DO-CRIME": measured}
-        return {**known, **{name: each.matrix for name, each in self._other_matrices.items()}}
+        return {**known, **{name: each.matrix for name, each in self._other_products.items()}}
 
     def save(self, folder: RunFolder, record: BenchRecord, result: GainsRun, wall_seconds: float) -> SavedRun:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.save`."""
+        """Save gains, rescaled matrix and report."""
         from escape_hw.io.documents import gains_document
         from escape_hw.runtime.procedures import criteria
         from escape_hw.runtime.procedures.products import add_calibration, add_gains, write_run_result
@@ -102,7 +116,7 @@ class GainsTask(TaskWithMatrix):
         found = result.result
         parents = {
             "im": self.product.path,
-            **{name: each.path for name, each in self._other_matrices.items()},
+            **{name: each.path for name, each in self._other_products.items()},
         }
         add_gains(folder, record, "gains", found, parents)
         if found.rounds:

@@ -3,157 +3,86 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
-from escape_hw.api.callbacks import Callbacks
-from escape_hw.api.camera import Frame
-from escape_hw.api.procedure import Procedure
-from escape_hw.api.results import LoopResult
 from escape_hw.errors import ConfigError
-from escape_hw.io.fits.telemetry import LoopTelemetry
-from escape_hw.runtime.procedures.task import SavedRun, TaskWithMatrix, require_hardware_matrix, set_overrides
+from escape_hw.runtime.procedures.declaration import SavedRun, parameter
+from escape_hw.runtime.procedures.matrix_input import MatrixProcedure, require_hardware_matrix
 
 if TYPE_CHECKING:
+    from escape_hw.api.procedure import Procedure
+    from escape_hw.api.results import LoopResult
     from escape_hw.bench import Bench
     from escape_hw.io.run_folder import RunFolder
+    from escape_hw.runtime.procedures.loop_telemetry import LoopTelemetryRecorder
     from escape_hw.runtime.session.record import BenchRecord
 
 
-class LoopTelemetryRecorder:
-    """Keeps slopes and commands of the newest frames; one that was not answered keeps the command before.
+class LoopProcedure(MatrixProcedure["LoopResult"]):
+    """A closed loop for a number of frames, with its performance and, if wanted, its telemetry."""
 
-    Parameters
-    ----------
-    frames
-        How many.
-    n_slopes, n_act
-        Sizes.
-    """
+    name = "loop"
+    title = "Closed loop"
+    help = "Close the loop with an interaction matrix for a number of frames and measure its performance."
 
-    def __init__(self, frames: int, n_slopes: int, n_act: int) -> None:
-        self._index = np.zeros(frames, np.int64)
-        self._exposed_ns = np.zeros(frames, np.int64)
-        self._slopes = np.zeros((frames, n_slopes), np.float32)
-        self._commands = np.zeros((frames, n_act))
-        self._rows, self._n_recorded, self._newest_ns = frames, 0, 0
-        self._command_pending = False
+    frames: int = parameter(default=5000, help="Frames to run.", unit="frame", low=1, high=1e8)
+    gain: float | None = parameter(
+        default=None, help="Gain of the integrator.", low=0.001, high=2, config_key="loop.gain",
+        sets_config=True,
+    )  # fmt: skip
+    leak: float | None = parameter(
+        default=None, help="Leak of the integrator per frame.", low=0, high=1, config_key="loop.leak",
+        sets_config=True,
+    )  # fmt: skip
+    dropped_modes: int | None = parameter(
+        default=None, help="Weakest eigenmodes left out of the reconstructor.", low=0, high=10000,
+        config_key="loop.dropped_modes", sets_config=True, deprecated=("drop",),
+    )  # fmt: skip
+    best_gain: bool = parameter(
+        default=False, help="Search for the gain with the best performance first.", label="Optimise gain",
+        deprecated=("best",),
+    )  # fmt: skip
+    record: int = parameter(
+        default=0, help="Save slopes and commands of the last frames, this many.", unit="frame", low=0,
+        on_server=False,
+    )  # fmt: skip
 
-    @property
-    def callbacks(self) -> Callbacks:
-        """What to set as the bench's taps before anything runs."""
-        return Callbacks(frame=self._frame, slopes=self._frame_slopes, command=self._command)
-
-    def _frame(self, frame: Frame) -> None:
-        self._newest_ns = frame.exposed_ns
-
-    def _frame_slopes(self, index: int, slopes: NDArray[np.float32]) -> None:
-        if slopes.size != self._slopes.shape[1]:
-            # A look at the sensor with another geometry is no part of the loop.
-            return
-        row, before = self._n_recorded % self._rows, (self._n_recorded - 1) % self._rows
-        self._index[row], self._exposed_ns[row], self._slopes[row] = index, self._newest_ns, slopes
-        self._commands[row] = self._commands[before]
-        self._n_recorded += 1
-        self._command_pending = True
-
-    def _command(self, command: NDArray[np.float64]) -> None:
-        # Only the first answers the frame: what comes without a frame between flattens the mirror.
-        if self._command_pending:
-            self._commands[(self._n_recorded - 1) % self._rows] = command
-            self._command_pending = False
-
-    def to_telemetry(self) -> LoopTelemetry:
-        """A copy of what was recorded, oldest first, from the last start of the camera's numbers on."""
-        n = min(self._n_recorded, self._rows)
-        order = (np.arange(self._n_recorded - n, self._n_recorded)) % self._rows
-        restarts = np.flatnonzero(np.diff(self._index[order]) <= 0)
-        order = order[restarts[-1] + 1 :] if restarts.size else order
-        exposed = self._exposed_ns[order]
-        return LoopTelemetry(
-            self._index[order],
-            np.asarray((exposed - exposed[:1]) * 1e-9, np.float64),
-            self._slopes[order],
-            self._commands[order],
-        )
-
-
-class LoopTask(TaskWithMatrix):
-    """A closed-loop run; see :class:`~escape_hw.runtime.procedures.task.Task`.
-
-    Parameters
-    ----------
-    im
-        File of the matrix.
-    frames
-        How long.
-    gain, leak, dropped_modes
-        Loop parameters; as configured by default.
-    best
-        Look for the best gain first.
-    strehl
-        Measure the model PSF and the Strehl ratios.
-    record
-        Keep slopes and commands of the newest so many frames.
-    force
-        Allow a simulated matrix on hardware.
-    """
-
-    kind = "loop"
-
-    def __init__(
-        self,
-        im: Path,
-        *,
-        frames: int = 5000,
-        gain: float | None = None,
-        leak: float | None = None,
-        dropped_modes: int | None = None,
-        best: bool = False,
-        strehl: bool = True,
-        record: int = 0,
-        force: bool = False,
-    ) -> None:
-        super().__init__(im, force=force)
-        if best and gain is not None:
-            raise ConfigError("--gain and --best-gain exclude each other")
-        self.overrides = set_overrides(
-            {"loop.gain": gain, "loop.leak": leak, "loop.dropped_modes": dropped_modes}
-        )
-        self._frames, self._search_gain, self._strehl, self._record = frames, best, strehl, record
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self._recorder: LoopTelemetryRecorder | None = None
 
-    def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[LoopResult]:
-        """Model PSF where the bench can take one, best gain when asked, then the loop itself."""
+    def validate(self) -> None:
+        """Refuse a gain together with a search for it."""
+        if self.best_gain and self.gain is not None:
+            raise ConfigError("gain and best_gain exclude each other (options --gain and --best-gain)")
+
+    def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[LoopResult]:
+        """Measure the model PSF, search for the best gain if wanted, then close the loop."""
         from escape_hw.calibration.loop.gain_search import find_best_gain
         from escape_hw.calibration.loop.performance import close_loop
-        from escape_hw.runtime.procedures.calibration import model_psf
 
-        require_hardware_matrix(self.product, bench, self._force)
+        require_hardware_matrix(self.product, bench, self.force)
         matrix, grid = self.product.matrix, self.product.grid
-        if self._record:
-            self._recorder = LoopTelemetryRecorder(self._record, grid.n_slopes, bench.dm.info.n_act)
+        if self.record:
+            from escape_hw.runtime.procedures.loop_telemetry import LoopTelemetryRecorder
+
+            self._recorder = LoopTelemetryRecorder(self.record, grid.n_slopes, bench.dm.info.n_act)
             bench.callbacks = self._recorder.callbacks
-        model = gain = None
-        gain_sigma = None
-        if self._strehl and bench.science is not None:
-            model = yield from model_psf(bench)
-        if self._search_gain:
+        model = yield from self.take_model_psf(bench)
+        gain = gain_sigma = None
+        if self.best_gain:
             search = yield from find_best_gain(bench, matrix, grid, model_psf=model)
             gain, gain_sigma = search.gain, search.sigma
             stopped = [run for run in search.runs if run.partial]
             if stopped:
                 return stopped[-1]
-        result = yield from close_loop(bench, matrix, grid, gain=gain, frames=self._frames, model_psf=model)
+        result = yield from close_loop(bench, matrix, grid, gain=gain, frames=self.frames, model_psf=model)
         return replace(result, gain_sigma=gain_sigma)
 
     def save(
         self, folder: RunFolder, record: BenchRecord, result: LoopResult, wall_seconds: float
     ) -> SavedRun:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.save`."""
+        """Save performance, telemetry and report."""
         from escape_hw.io.documents import loop_document
         from escape_hw.report.tables import METHOD_LABELS
         from escape_hw.runtime.procedures import criteria

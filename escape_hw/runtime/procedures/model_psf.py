@@ -1,19 +1,19 @@
-"""Measuring the model PSF, so that a loop's Strehl ratio can be followed."""
+"""Measurement of the model PSF, the reference of Strehl ratios."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
-from escape_hw.api.procedure import Procedure
-from escape_hw.runtime.procedures.task import SavedRun
+from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun, parameter
+from escape_hw.runtime.procedures.matrix_input import MODEL_PSF_FRAMES
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from escape_hw.api.procedure import Procedure
     from escape_hw.bench import Bench
-    from escape_hw.config.system import SystemConfig
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
 
@@ -25,44 +25,28 @@ class ModelPsf:
     model_psf: NDArray[np.float32]
 
 
-class ModelPsfTask:
-    """The model PSF, turbulence out of the beam meanwhile; see :class:`~escape_hw.runtime.procedures.task.Task`.
+class ModelPsfProcedure(ProcedureSpec[ModelPsf]):
+    """The PSF of the flat mirror without turbulence; needs a science camera."""
 
-    Parameters
-    ----------
-    frames
-        Science frames to average.
-    """
+    name = "model-psf"
+    title = "Model PSF"
+    help = "Measure the PSF of the flat mirror without turbulence, the reference of Strehl ratios."
 
-    kind = "model-psf"
-    overrides: tuple[str, ...] = ()
+    frames: int = parameter(
+        default=MODEL_PSF_FRAMES, help="Science frames to average.", unit="frame", low=1, high=1e8
+    )
 
-    def __init__(self, frames: int) -> None:
-        self._frames = frames
-
-    def load(self, config: SystemConfig, simulated: bool = False) -> None:
-        """It needs nothing."""
-
-    def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[ModelPsf]:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.procedure`."""
+    def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[ModelPsf]:
+        """Average science frames, the phase screen out of the beam."""
         from escape_hw.runtime.procedures.calibration import model_psf
 
-        return ModelPsf((yield from model_psf(bench, frames=self._frames)))
+        return ModelPsf((yield from model_psf(bench, frames=self.frames)))
 
     def save(self, folder: RunFolder, record: BenchRecord, result: ModelPsf, wall_seconds: float) -> SavedRun:
-        """Write down what was found; the image itself lies in the results of the loops judged by it."""
-        image = result.model_psf
-        document = {
-            **record.header_fields("model-psf"),
-            "title": f"Model PSF of {record.system}",
-            "peak": float(image.max()),
-            "total": float(image.sum(dtype=float)),
-            "partial": False,
-            "products": {},
-            **record.footer_fields(wall_seconds),
-        }
-        folder.write_result(document)
-        return SavedRun({**document, **folder.location_fields()})
+        """Save peak and total; the image itself is saved with each loop that is compared with it."""
+        from escape_hw.runtime.procedures.products import save_values
 
-    def finish(self) -> None:
-        """Nothing was kept to go on with."""
+        image = result.model_psf
+        values = {"peak": float(image.max()), "total": float(image.sum(dtype=float))}
+        title = f"Model PSF of {record.system}"
+        return save_values(folder, record, self.name, title, values, wall_seconds)

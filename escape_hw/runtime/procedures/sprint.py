@@ -1,64 +1,91 @@
-"""SPRINT on a matrix that was kept, from the request to the kept registration; nothing moves."""
+"""SPRINT on a saved interaction matrix; no device moves."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from escape_hw.api.procedure import Procedure, Reporter
-from escape_hw.runtime.procedures.task import SavedRun, TaskWithMatrix, set_overrides
+from escape_hw.config.choices import EXTRA_PARAMETERS, LOSSES, MODES_CHOICES, SOLVERS
+from escape_hw.runtime.procedures.declaration import ComputedProcedure, ProcedureSpec, SavedRun, parameter
 
 if TYPE_CHECKING:
+    from escape_hw.api.procedure import Procedure
     from escape_hw.api.results import CalibrationResult
     from escape_hw.api.synthetic_model import SyntheticModel
-    from escape_hw.bench import Bench
     from escape_hw.config.system import SystemConfig
     from escape_hw.io.fits.matrix import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
-    from escape_hw.runtime.session.record import BenchRecord
+
+ResultT = TypeVar("ResultT")
 
 
-class SprintTask(TaskWithMatrix):
-    """The registration behind a measured matrix; see :class:`~escape_hw.runtime.procedures.task.Task`.
+class SprintParameters(ProcedureSpec[ResultT]):
+    """Parameters of the procedures that run SPRINT."""
 
-    Parameters
-    ----------
-    im
-        File of the matrix; where it is a pseudo-synthetic one, the measured one behind it counts.
-    settings
-        Keys of the configuration's section ``calibration`` to change; ``None``: as configured.
-    """
+    solver: str | None = parameter(
+        default=None, help="Solver of SPRINT.", choices=SOLVERS, config_key="calibration.solver",
+        sets_config=True, last=True,
+    )  # fmt: skip
+    modes_choice: str | None = parameter(
+        default=None, help="Criterion by which SPRINT chooses its modes.", choices=MODES_CHOICES,
+        config_key="calibration.modes_choice", sets_config=True, last=True,
+    )  # fmt: skip
+    loss: str | None = parameter(
+        default=None, help="Loss function of SPRINT; huber tolerates bad sub-apertures.", choices=LOSSES,
+        config_key="calibration.loss", sets_config=True, last=True,
+    )  # fmt: skip
+    extra_parameters: str | None = parameter(
+        default=None,
+        help="What SPRINT fits beside the registration, separated by commas.",
+        config_key="calibration.extra_parameters", kind="choices", choices=EXTRA_PARAMETERS, sets_config=True, last=True,
+        deprecated=("also",),
+    )  # fmt: skip
 
-    kind = "sprint"
 
-    def __init__(self, im: Path, settings: dict[str, object] | None = None) -> None:
-        super().__init__(im)
+class SprintProcedure(ComputedProcedure["CalibrationResult"], SprintParameters["CalibrationResult"]):
+    """The registration behind a measured matrix, and the matrix of the model there."""
+
+    name = "sprint"
+    title = "SPRINT"
+    help = "Estimate the registration behind a measured matrix, and compute the synthetic matrix for it."
+
+    im: Path = parameter(
+        help="Measured interaction matrix, or a pseudo-synthetic one with the measured matrix behind it.",
+        label="Matrix", kind="matrix",
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._config: SystemConfig | None = None
+        self._product: MatrixProduct | None = None
         self._model: SyntheticModel | None = None
-        self.overrides = set_overrides(
-            {f"calibration.{key}": value for key, value in (settings or {}).items()}
-        )
 
-    def _load_matrix(self, config: SystemConfig, simulated: bool) -> MatrixProduct:
-        # Nothing moves: a matrix of other modes than the configured ones is as good.
+    @property
+    def _inputs(self) -> tuple[SystemConfig, MatrixProduct]:
+        if self._config is None or self._product is None:
+            raise RuntimeError("load() has not been called")
+        return self._config, self._product
+
+    def load(self, config: SystemConfig, simulated: bool = False) -> None:
+        """Read the matrix; number of modes, basis and mode may differ from the configuration."""
         from escape_hw.io.fits.matrix import load_matrix
 
-        return load_matrix(
-            self._im,
+        self._config = config
+        self._product = load_matrix(
+            self.im,
             expect_system=config.system.name,
             expect_sensor=config.sensor.kind,
             expect_actuators=config.devices.dm.n_act,
         )
 
-    def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[CalibrationResult]:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.procedure`; the bench is not touched."""
-        return self.fit()
-
-    def fit(self) -> Procedure[CalibrationResult]:
-        """Find the registration; the result's matrix is the measured one."""
+    def compute(self) -> Procedure[CalibrationResult]:
+        """Estimate the registration; the matrix of the result is the measured one."""
+        from escape_hw.api.procedure import Reporter
         from escape_hw.calibration.sprint.fit import estimate_registration, sprint_options_from_config
 
-        settings, product = self.config.calibration, self.product
+        config, product = self._inputs
+        settings = config.calibration
         measured = product.result.measured or product.matrix
         yield Reporter("synthetic model", 1, "model")(0)
         estimate = yield from estimate_registration(
@@ -70,27 +97,16 @@ class SprintTask(TaskWithMatrix):
         return replace(product.result, matrix=measured, measured=None, registration=estimate)
 
     def _synthetic_model(self) -> SyntheticModel:
-        """The model that is inverted; a pyramid's takes seconds to make."""
+        """The synthetic model; building that of a pyramid takes seconds."""
         from escape_hw.config.registry import model_factory
 
         if self._model is None:
-            self._model = model_factory(self.config.calibration.model)(self.config, self.product.grid)
+            config, product = self._inputs
+            self._model = model_factory(config.calibration.model)(config, product.grid)
         return self._model
 
-    def save(
-        self, folder: RunFolder, record: BenchRecord, result: CalibrationResult, wall_seconds: float
-    ) -> SavedRun:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.save`; the bench of the day has nothing to do with it."""
-        return self.save_fit(folder, result, wall_seconds)
-
-    def save_fit(self, folder: RunFolder, result: CalibrationResult, wall_seconds: float) -> SavedRun:
-        """Save the matrix with its registration, and the matrix of the model there.
-
-        Raises
-        ------
-        StorageError
-            They cannot be written.
-        """
+    def save_computed(self, folder: RunFolder, result: CalibrationResult, wall_seconds: float) -> SavedRun:
+        """Save the measured matrix with its registration, the synthetic matrix, and the report."""
         from escape_hw.calibration.sprint.synthetic_matrix import synthesise_from_measurement
         from escape_hw.io import documents
         from escape_hw.io.fits.matrix import save_matrix
@@ -99,19 +115,18 @@ class SprintTask(TaskWithMatrix):
         from escape_hw.runtime.procedures.products import write_run_result
         from escape_hw.runtime.session.record import config_provenance
 
-        estimate, measured, name = result.registration, result.matrix, self.product.path.name
+        config, product = self._inputs
+        estimate, measured, name = result.registration, result.matrix, product.path.name
         if estimate is None:
             raise RuntimeError("a fit without a registration")
-        origin = replace(config_provenance(self.config), parents={name: self.product.sha256})
+        origin = replace(config_provenance(config), parents={name: product.sha256})
         folder.add_product("im", save_matrix(folder.file("im.fits"), result, origin))
         synthetic = synthesise_from_measurement(result, self._synthetic_model(), estimate)
         folder.add_product("escape", save_matrix(folder.file("escape.fits"), synthetic, origin))
         document = write_run_result(
             folder,
             {
-                **documents.header_fields(
-                    "sprint", measured.system, measured.simulated, self.config.system.seed
-                ),
+                **documents.header_fields("sprint", measured.system, measured.simulated, config.system.seed),
                 "title": f"Registration of {measured.system}",
                 **documents.calibration_document(result),
                 "criteria": [criteria.sprint_converged(name, estimate)],

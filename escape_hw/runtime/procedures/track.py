@@ -1,92 +1,88 @@
-"""Following a drifting system, from the request to the kept track."""
+"""Tracking of a drifting system in closed loop."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from escape_hw.api.procedure import Procedure
-from escape_hw.api.registration import PARAMETERS, Registration
-from escape_hw.api.tracking import TrackResult
-from escape_hw.bench import resolve_mode
-from escape_hw.runtime.procedures.task import SavedRun, TaskWithMatrix, require_hardware_matrix, set_overrides
+from escape_hw.runtime.procedures.declaration import SavedRun, parameter
+from escape_hw.runtime.procedures.matrix_input import MatrixProcedure, psf_frames, require_hardware_matrix
 
 if TYPE_CHECKING:
+    from escape_hw.api.procedure import Procedure
+    from escape_hw.api.registration import Registration
+    from escape_hw.api.tracking import TrackResult
     from escape_hw.bench import Bench
     from escape_hw.config.system import SystemConfig
     from escape_hw.config.twin import TwinDrift
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
 
-#: Why a drifting twin's course stands nowhere.
+#: Reason why a report does not show the injected registration of a drifting twin.
 INJECTED_UNKNOWN = (
-    "the twin behind these drivers drifts by a clock of its own, so where its mirror sat is not known here"
+    "the twin behind these drivers drifts with a clock of its own, so the injected registration is not known"
 )
 
 
-class TrackTask(TaskWithMatrix):
-    """The tracker; see :class:`~escape_hw.runtime.procedures.task.Task`.
+class TrackProcedure(MatrixProcedure["TrackResult"]):
+    """The tracker: a closed loop with small pokes, from which drifts are estimated."""
 
-    Parameters
-    ----------
-    im
-        File of the matrix to begin with.
-    seconds
-        How long.
-    poke, memory, gain
-        Pokes, seconds in which old frames fade, gain of the loop; as configured by default.
-    exchange
-        False: only propose new matrices.
-    strehl
-        Measure the model PSF and follow the Strehl ratio.
-    force
-        Allow a simulated matrix on hardware.
-    """
+    name = "track"
+    title = "Tracker"
+    help = "Close the loop and follow drifts of registration, optical gains and interaction matrix."
+    random_pokes = True
 
-    kind = "track"
+    seconds: float = parameter(default=60.0, help="Duration.", unit="s", low=1, high=1e6)
+    poke: float | None = parameter(
+        default=None, help="Pokes of each mode, rms surface as fraction of full stroke.",
+        unit="of full stroke", low=1e-6, high=1, config_key="tracking.poke", sets_config=True,
+    )  # fmt: skip
+    forgetting_time_s: float | None = parameter(
+        default=None, help="Time in which the weight of a frame falls to 1/e.", unit="s", low=1, high=1e5,
+        config_key="tracking.memory_s", sets_config=True, deprecated=("memory", "memory_s"),
+        label="Forgetting time",
+    )  # fmt: skip
+    gain: float | None = parameter(
+        default=None, help="Gain of the integrator.", low=0.001, high=2, config_key="loop.gain",
+        sets_config=True,
+    )  # fmt: skip
+    exchange: bool = parameter(
+        default=True, help="Exchange the matrix in use for a better one; otherwise only propose new ones.",
+        label="Exchange matrix", deprecated_inverse=("propose",),
+    )  # fmt: skip
 
-    def __init__(
-        self,
-        im: Path,
-        *,
-        seconds: float = 60.0,
-        poke: float | None = None,
-        memory: float | None = None,
-        gain: float | None = None,
-        exchange: bool = True,
-        strehl: bool = True,
-        force: bool = False,
-    ) -> None:
-        super().__init__(im, force=force)
-        self.overrides = set_overrides(
-            {"tracking.poke": poke, "tracking.memory_s": memory, "loop.gain": gain}
-        )
-        self._seconds, self._exchange, self._strehl = seconds, exchange, strehl
+    @classmethod
+    def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Sensor frames of the model PSF and of the given duration."""
+        duration = math.ceil(float(arguments.get("seconds") or 0.0) * bench.wfs.settings.frame_rate_hz)
+        return psf_frames(bench, arguments) + duration
 
-    def procedure(self, bench: Bench, folder: RunFolder) -> Procedure[TrackResult]:
-        """Model PSF where the bench can take one, then the tracker."""
+    def load(self, config: SystemConfig, simulated: bool = False) -> None:
+        """Read the matrix."""
+        super().load(config, simulated)
+        self._config = config
+
+    def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[TrackResult]:
+        """Measure the model PSF, then close the loop and track."""
         from escape_hw.calibration.tracking.tracker import track as track_procedure
-        from escape_hw.runtime.procedures.calibration import model_psf
 
         product = self.product
-        require_hardware_matrix(product, bench, self._force)
-        psf = (yield from model_psf(bench)) if self._strehl and bench.science is not None else None
+        require_hardware_matrix(product, bench, self.force)
+        psf = yield from self.take_model_psf(bench)
         return (
             yield from track_procedure(
-                bench, product.matrix, product.grid, seconds=self._seconds,
+                bench, product.matrix, product.grid, seconds=self.seconds,
                 registration=product.registration, response=product.result.response,
-                exchange=self._exchange, model_psf=psf,
+                exchange=self.exchange, model_psf=psf,
             )
         )  # fmt: skip
 
     def save(
         self, folder: RunFolder, record: BenchRecord, result: TrackResult, wall_seconds: float
     ) -> SavedRun:
-        """See :meth:`~escape_hw.runtime.procedures.task.Task.save`."""
+        """Save the time series, the last matrix and the report."""
         from escape_hw.io.documents import track_document
         from escape_hw.runtime.procedures.products import add_calibration, write_run_result
 
@@ -94,7 +90,7 @@ class TrackTask(TaskWithMatrix):
         if result.latest is not None:
             add_calibration(folder, record, "im", result.latest, {"im": self.product.path})
         track = track_document(result)
-        injected = injected_registration(self.config) if record.simulated else None
+        injected = injected_registration(self._config) if record.simulated else None
         began, end = result.start_ns * 1e-9, result.rows["seconds"][-1:]
         document = write_run_result(
             folder,
@@ -105,7 +101,7 @@ class TrackTask(TaskWithMatrix):
                 "planted_course": None
                 if injected is None
                 else injected.trajectory(began, track["track"]["seconds"]),
-                # The truth where the track ends, beside its registration there.
+                # Injected registration at the time of the last estimate.
                 "planted_end": None if injected is None or not end else injected.at(began + end[0]).to_dict(),
                 "planted_note": INJECTED_UNKNOWN if record.simulated and injected is None else "",
                 "im": self.product.path.absolute(),
@@ -121,26 +117,32 @@ class TrackTask(TaskWithMatrix):
 
 @dataclass(frozen=True, slots=True)
 class InjectedRegistration:
-    """Where a twin's mirror really sits; for reports only.
+    """Injected registration of a twin over time; for reports only.
 
     Parameters
     ----------
     start
-        At time zero of the twin's clock.
+        Registration at time zero of the twin's clock.
     drift
-        How it moves on.
+        Change with time.
     """
 
     start: Registration
     drift: TwinDrift
 
     def at(self, seconds: float) -> Registration:
-        """At a time of the twin's clock."""
+        """Registration at a time of the twin's clock."""
+        from escape_hw.api.registration import Registration
+
         moved = Registration.from_array(self.start.to_array() + self.drift.offsets_at(seconds))
         return replace(moved, anamorphosis_angle=self.start.anamorphosis_angle)
 
     def trajectory(self, began: float, seconds: Sequence[float]) -> dict[str, list[float]]:
-        """Every parameter, scalings along x and y, some seconds after a time of the twin's clock."""
+        """Parameters by name, scalings along x and y, ``seconds`` after ``began`` on the twin's clock."""
+        import numpy as np
+
+        from escape_hw.api.registration import PARAMETERS
+
         moved = np.array([self.at(began + t).axis_scalings_and_shear[0].to_array() for t in seconds])
         return {
             name: column.tolist() for name, column in zip(PARAMETERS, moved.reshape(-1, 5).T, strict=True)
@@ -148,11 +150,13 @@ class InjectedRegistration:
 
 
 def injected_registration(config: SystemConfig) -> InjectedRegistration | None:
-    """Where the mirror of a simulated system sits; ``None`` where that cannot be known.
+    """Injected registration of a simulated system; ``None`` if it is not known.
 
-    Behind real drivers the twin runs on a clock that no driver tells: frames have the computer's time.
-    Where nothing moves, no clock is needed.
+    It is not known for a drifting twin behind real drivers: frames then carry the computer's time, and no
+    driver reports the clock of the twin.
     """
+    from escape_hw.bench import resolve_mode
+
     drift = config.twin.drift
     if drift.is_drifting and resolve_mode(config.devices.wfs, config) != "sim":
         return None

@@ -1,1 +1,1 @@
-"""The open system as scripts and notebooks use it, and the record of the bench that every product carries."""
+"""The open system for scripts and notebooks, and the record of the bench that every product carries."""

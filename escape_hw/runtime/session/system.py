@@ -18,6 +18,14 @@ from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.api.tracking import TrackResult
 from escape_hw.bench import Bench
 from escape_hw.config.loader import load_system
+from escape_hw.runtime.procedures.calibration import DocrimeProcedure, EscapeProcedure
+from escape_hw.runtime.procedures.declaration import ProcedureSpec
+from escape_hw.runtime.procedures.gains import GainsProcedure
+from escape_hw.runtime.procedures.loop import LoopProcedure
+from escape_hw.runtime.procedures.model_psf import ModelPsfProcedure
+from escape_hw.runtime.procedures.python_method import procedure_method
+from escape_hw.runtime.procedures.sensor import SensorProcedure
+from escape_hw.runtime.procedures.track import TrackProcedure
 
 if TYPE_CHECKING:
     from escape_hw.calibration.acquisition.checkpoint import Checkpoint
@@ -32,18 +40,18 @@ if TYPE_CHECKING:
 #: What ``calibrate`` or ``load_matrix`` returns.
 CalibrationLike: TypeAlias = Union[CalibrationResult, "MatrixProduct"]
 
-_EXPECTED = "what calibrate() or escape_hw.load_matrix() returns is needed"
-#: Results with a calibration in them, which their reader has to choose.
+_EXPECTED = "a calibration as returned by calibrate() or escape_hw.load_matrix() is needed"
+#: Attributes of other results that hold a calibration.
 _CONTAINERS = ("rescaled", "latest")
 
 
 def as_calibration(value: object) -> CalibrationResult:
-    """A calibration, be it one or a product that holds one.
+    """The calibration itself, or that of a loaded product.
 
     Raises
     ------
     TypeError
-        It is something else; says which, and the way out.
+        The value is something else; the message names its type and the remedy.
     """
     if isinstance(value, CalibrationResult):
         return value
@@ -56,18 +64,18 @@ def as_calibration(value: object) -> CalibrationResult:
 def as_matrix_and_grid(
     value: InteractionMatrix | CalibrationLike, grid: SensorGeometry | None
 ) -> tuple[InteractionMatrix, SensorGeometry]:
-    """A matrix and the geometry that it belongs to; a grid that is given goes before a calibration's own.
+    """A matrix and its sensor geometry; a given ``grid`` takes precedence over that of a calibration.
 
     Raises
     ------
     TypeError
-        A matrix without its geometry, or neither a matrix nor a calibration; says the way out.
+        A matrix without a grid, or neither a matrix nor a calibration.
     """
     if not isinstance(value, InteractionMatrix):
         found = as_calibration(value)
         return found.matrix, found.grid if grid is None else grid
     if grid is None:
-        raise TypeError(f"a matrix alone does not tell its geometry: give the grid as well, or {_EXPECTED}")
+        raise TypeError(f"a matrix alone has no sensor geometry: give the grid as well, or {_EXPECTED}")
     return value, grid
 
 
@@ -75,7 +83,7 @@ def _suggestion(value: object) -> str:
     if isinstance(value, str | os.PathLike):
         return f"; read it: escape_hw.load_matrix({os.fspath(value)!r})"
     if isinstance(value, InteractionMatrix):
-        return "; a matrix alone does not tell its geometry"
+        return "; a matrix alone has no sensor geometry"
     for name in _CONTAINERS:
         if hasattr(value, name):
             return f"; take its .{name}"
@@ -86,33 +94,34 @@ ResultT = TypeVar("ResultT")
 
 
 class System(Bench):
-    """A bench with everything that can be done on it.
+    """An open bench with methods for calibration, closed loop and tracking.
 
-    While it is open, linear algebra runs on one thread: the products of a loop are small.
+    While it is open, linear algebra runs on one thread, because the matrix products of a loop are small.
 
-    The methods that take a while run a procedure to its end; ``progress=True`` shows a bar with the
-    time left on standard error. Ctrl-C stops any of them: the mirror is flattened and
-    :class:`~escape_hw.errors.Aborted` carries what was measured so far as ``partial``.
+    The measuring methods run a procedure to its end; ``progress=True`` shows a bar with the time left on
+    standard error. Ctrl-C stops a procedure: the mirror is flattened, and
+    :class:`~escape_hw.errors.Aborted` is raised with the partial result as ``partial``.
     """
 
     def run(
         self,
-        procedure: Procedure[ResultT],
+        procedure: Procedure[ResultT] | ProcedureSpec[ResultT],
         *,
         observers: tuple[Observer, ...] = (),
         abort: StopSignal | None = None,
         progress: bool = False,
     ) -> ResultT:
-        """Drive a procedure to its end and return its result.
+        """Run a procedure to its end and return its result; nothing is saved.
 
         Parameters
         ----------
         procedure
-            A generator made from this bench, such as one's own.
+            A generator that uses this bench, or a declared procedure such as
+            :class:`~escape_hw.runtime.procedures.loop.LoopProcedure` with its parameters.
         observers
             Called with every progress report.
         abort
-            Set it from any thread to stop the procedure.
+            Stops the procedure when it is set, from any thread.
         progress
             Show a bar with the time left on standard error.
 
@@ -121,6 +130,8 @@ class System(Bench):
         Aborted
             Stopped by ``abort`` or Ctrl-C.
         """
+        if isinstance(procedure, ProcedureSpec):
+            procedure = procedure.on_bench(self)
         if not progress:
             return run_procedure(procedure, observers=observers, abort=abort)
         from rich.console import Console
@@ -130,15 +141,9 @@ class System(Bench):
         with ProgressView(Console(stderr=True)) as view:
             return run_procedure(procedure, observers=(*observers, view), abort=abort)
 
+    @procedure_method(ModelPsfProcedure)
     def take_model_psf(self, *, frames: int = 20, progress: bool = False) -> NDArray[np.float32]:
-        """The PSF of the flat mirror without turbulence, which Strehl ratios are measured against.
-
-        Parameters
-        ----------
-        frames
-            Science frames to average.
-        progress
-            Show a bar with the time left.
+        """Measure the PSF of the flat mirror without turbulence, the reference of Strehl ratios.
 
         Returns
         -------
@@ -154,6 +159,7 @@ class System(Bench):
 
         return self.run(model_psf(self, frames=frames), progress=progress)
 
+    @procedure_method(LoopProcedure)
     def close_loop(
         self,
         matrix: InteractionMatrix | CalibrationLike,
@@ -166,26 +172,19 @@ class System(Bench):
         model_psf: NDArray[np.float32] | None = None,
         progress: bool = False,
     ) -> LoopResult:
-        """Close the loop for a number of frames and open it again; the mirror ends flat.
+        """Close the loop for a number of frames, then open it and flatten the mirror.
 
         Parameters
         ----------
         matrix, grid
-            A calibration, as :meth:`calibrate` or ``escape_hw.load_matrix`` returns it; or its matrix and its
-            grid.
-        gain, leak, dropped_modes
-            Loop parameters; as configured by default.
-        frames
-            How long.
+            A calibration from :meth:`calibrate` or ``escape_hw.load_matrix``; or a matrix and its grid.
         model_psf
-            From :meth:`take_model_psf`; with it the Strehl ratios are measured.
-        progress
-            Show a bar with the time left.
+            From :meth:`take_model_psf`; needed for the Strehl ratios.
 
         Returns
         -------
         LoopResult
-            ``stable`` is false when the loop was opened because it diverged.
+            ``stable`` is false if the loop was opened because it diverged.
 
         Raises
         ------
@@ -218,14 +217,13 @@ class System(Bench):
         Parameters
         ----------
         matrix, grid
-            A calibration, as :meth:`calibrate` or ``escape_hw.load_matrix`` returns it; or its matrix and its
-            grid.
+            A calibration from :meth:`calibrate` or ``escape_hw.load_matrix``; or a matrix and its grid.
         gains
-            Gains to try; by default shares of the largest stable one.
+            Gains to try; fractions of the largest stable gain by default.
         frames
             Frames per gain.
         model_psf
-            From :meth:`take_model_psf`; with it gains are judged by the Strehl ratio.
+            From :meth:`take_model_psf`; gains are then compared by the Strehl ratio.
         progress
             Show a bar with the time left.
 
@@ -237,7 +235,7 @@ class System(Bench):
         Raises
         ------
         CalibrationError
-            No gain gives a stable loop.
+            The loop is not stable with any of the gains.
         Aborted
             Stopped by Ctrl-C.
         """
@@ -247,33 +245,27 @@ class System(Bench):
         procedure = find_best_gain(self, matrix, grid, gains=gains, frames=frames, model_psf=model_psf)
         return self.run(procedure, progress=progress)
 
+    @procedure_method(GainsProcedure)
     def find_optical_gains(
         self,
         calibration: CalibrationLike,
         *,
         poke: float = 0.002,
         accuracy: float = 0.01,
+        allowed_strehl_loss: float = 0.01,
         frames: int = 20000,
+        gain: float | None = None,
         model_psf: NDArray[np.float32] | None = None,
         progress: bool = False,
     ) -> GainsRun:
-        """Close the loop on a matrix of unknown scale and scale it, mode by mode, to the turbulence there.
+        """Close the loop on a matrix of unknown scale and scale it to the turbulence, mode by mode.
 
         Parameters
         ----------
         calibration
-            From :meth:`calibrate`, best with ``"escape"``, or ``escape_hw.load_matrix``.
-        poke
-            Last poke of each mode, rms surface as fraction of full stroke; lowered to a cost of 1 % of the
-            Strehl ratio.
-        accuracy
-            Relative standard error of the gains to go on for.
-        frames
-            Frames per round at most.
+            From :meth:`calibrate`, preferably with ``"escape"``, or ``escape_hw.load_matrix``.
         model_psf
-            From :meth:`take_model_psf`; with it every round tells its Strehl ratio.
-        progress
-            Show a bar with the time left.
+            From :meth:`take_model_psf`; every round then measures the Strehl ratio.
 
         Returns
         -------
@@ -283,7 +275,7 @@ class System(Bench):
         Raises
         ------
         CalibrationError
-            The loop does not close, or does not stay closed; says why.
+            The loop cannot be closed, or diverges; the message says why.
         Aborted
             Stopped by Ctrl-C.
         """
@@ -292,8 +284,8 @@ class System(Bench):
 
         calibration = as_calibration(calibration)
         procedure = bootstrap_gains(
-            self, calibration, poke=poke, accuracy=accuracy, frames=frames,
-            closed_loop_matrix=static_light_matrix(self, calibration), model_psf=model_psf,
+            self, calibration, poke=poke, accuracy=accuracy, budget=allowed_strehl_loss, frames=frames,
+            gain=gain, closed_loop_matrix=static_light_matrix(self, calibration), model_psf=model_psf,
         )  # fmt: skip
         return self.run(procedure, progress=progress)
 
@@ -312,20 +304,20 @@ class System(Bench):
         storage: str | None = None,
         progress: bool = False,
     ) -> SweepResult:
-        """Compare matrices, each at its own best parameters, on the same air.
+        """Compare matrices, each at its best loop parameters, in the same turbulence.
 
-        On twins every loop has a twin of its own, in parallel processes; on hardware the loops run on this
-        bench one after the other. Called again with the same folder it goes on where it was.
+        With twins the loops run in parallel processes, each on its own twin; on hardware they run one after
+        the other on this bench. A second call with the same folder continues the sweep.
 
         Parameters
         ----------
         matrices
-            Calibrations or loaded matrices by name; the first is the one that the others are compared with.
+            Calibrations or loaded matrices by name; the others are compared with the first.
         folder
-            Where the matrices and, by default, the trials are kept.
+            Folder for the matrices and, by default, the trials.
         vary
             ``"gain=0.1:1"``, ``"leak=1e-3:0.1:log"``, ``"twin.latency_s=0:2e-3"`` ...; gain, leak and dropped
-            modes have usual ranges on twins and none on hardware.
+            modes have default ranges on twins and none on hardware.
         trials
             Loops with drawn parameters, over all matrices.
         frames
@@ -333,20 +325,20 @@ class System(Bench):
         sampler
             ``"random"``, the same draws for every matrix, or ``"tpe"``.
         margin
-            Difference in the Strehl ratio that does not matter.
+            Largest difference of Strehl ratios that counts as equivalent.
         workers, scheduler
             Processes, or the address of a Dask scheduler.
         storage
-            SQLAlchemy's URL of the study; SQLite in the folder by default.
+            SQLAlchemy URL of the study; SQLite in the folder by default.
         progress
             Show a bar with the time left.
 
         Raises
         ------
         ConfigError
-            Optuna is not installed, a range means nothing, or hardware without limits.
+            Optuna is not installed, a range is invalid, or a range is missing on hardware.
         CalibrationError
-            No loop with one of the matrices stays closed.
+            The loop with one of the matrices is never stable.
         """
         from escape_hw.runtime.sweep.request import run_matrix_sweep
 
@@ -355,52 +347,42 @@ class System(Bench):
             self, matrices, Path(folder), vary, asked, workers=workers, scheduler=scheduler, progress=progress
         )
 
+    @procedure_method(TrackProcedure)
     def track(
         self,
         calibration: CalibrationLike,
         *,
         seconds: float = 60.0,
         poke: float | None = None,
-        memory_s: float | None = None,
+        forgetting_time_s: float | None = None,
         exchange: bool = True,
         gain: float | None = None,
         model_psf: NDArray[np.float32] | None = None,
         progress: bool = False,
     ) -> TrackResult:
-        """Close the loop and follow what drifts: registration, optical gains, matrix; the mirror ends flat.
+        """Close the loop and follow drifts of registration, optical gains and matrix; the mirror ends flat.
 
         Parameters
         ----------
         calibration
-            From :meth:`calibrate` or ``escape_hw.load_matrix``, or the ``rescaled_calibration`` one of
-            :meth:`find_optical_gains`; a registration that is not in it is found from its matrix.
-        seconds
-            How long, at least one.
-        poke
-            Pokes of each mode, rms surface as fraction of full stroke; as configured by default.
-        memory_s
-            Time in which old frames fade; as configured by default.
-        exchange
-            False: new matrices are only proposed.
-        gain
-            Gain of the integrator; as configured by default.
+            From :meth:`calibrate`, ``escape_hw.load_matrix``, or ``rescaled_calibration`` of
+            :meth:`find_optical_gains`; a missing registration is estimated from the matrix.
         model_psf
-            From :meth:`take_model_psf`; with it the Strehl ratio is followed, too.
-        progress
-            Show a bar with the time left.
+            From :meth:`take_model_psf`; the Strehl ratio is then followed too.
 
         Returns
         -------
         TrackResult
-            ``rows`` holds a line per second, ``latest`` the matrix to go on with, ``alarms`` what a new
-            registration does not explain. ``stable`` is false when the loop was lost.
+            ``rows`` holds a row per second, ``latest`` the last matrix, ``alarms`` changes that a new
+            registration does not explain. ``stable`` is false if the loop was opened because it diverged.
 
         Raises
         ------
         ConfigError
-            A time, poke or memory that means nothing; nothing moved.
+            The duration, poke or forgetting time is out of range; nothing has moved.
         IncompatibleProduct, CalibrationError
-            The matrix does not fit, cannot be inverted, or shows no registration; nothing moved.
+            The matrix belongs to another system, cannot be inverted, or holds no registration; nothing has
+            moved.
         Aborted
             Stopped by Ctrl-C.
         """
@@ -410,31 +392,30 @@ class System(Bench):
         procedure = track(
             self, calibration.matrix, calibration.grid, seconds=seconds,
             registration=calibration.registration, response=calibration.response, poke=poke,
-            memory_s=memory_s, exchange=exchange, gain=gain, model_psf=model_psf,
+            memory_s=forgetting_time_s, exchange=exchange, gain=gain, model_psf=model_psf,
         )  # fmt: skip
         return self.run(procedure, progress=progress)
 
+    @procedure_method(SensorProcedure)
     def find_sensor(self, *, frames: int = 200, progress: bool = False) -> SensorSetup:
-        """Watch the sensor and find its geometry; the mirror stays as it is.
+        """Find the geometry of the sensor on averaged frames; the mirror is not moved.
 
-        Parameters
-        ----------
-        frames
-            Frames to average; under turbulence, the more the better.
-        progress
-            Show a bar with the time left.
+        Returns
+        -------
+        SensorSetup
+            ``grid`` is the geometry.
 
         Raises
         ------
         CalibrationError
-            No spots or pupil images where the design says there should be.
+            There are no spots or pupil images where the configuration expects them.
         """
         from escape_hw.calibration.acquisition.sensor_setup import find_sensor
 
         return self.run(find_sensor(self, frames=frames), progress=progress)
 
     def slopes_of(self, grid: SensorGeometry) -> SlopeFunction:
-        """A function that takes ``frame.data`` and returns slopes ``(n_slopes,)``.
+        """A function that computes slopes ``(n_slopes,)`` from ``frame.data``.
 
         Parameters
         ----------
@@ -445,6 +426,7 @@ class System(Bench):
 
         return build_slope_function(self, grid)
 
+    @procedure_method(EscapeProcedure, DocrimeProcedure, renamed={"keep": "checkpoint"})
     def calibrate(
         self,
         method: str = "escape",
@@ -464,42 +446,28 @@ class System(Bench):
         Parameters
         ----------
         method
-            ``"push-pull"`` (needs a source: the phase screen, where the bench moves one, is out of
-            the beam meanwhile), ``"modulated"`` (with or without one), ``"push-pull-fast"``,
-            ``"docrime"`` or ``"escape"`` (all three under turbulence, in open or closed loop).
-        frames
-            Frames to measure with (push-pull: per push and per pull; modulated: per batch of modes);
-            as configured by default.
-        poke
-            Rms surface as fraction of full stroke; as configured by default.
+            ``"push-pull"`` (needs a source; a movable phase screen is taken out of the beam),
+            ``"modulated"`` (with or without a source), ``"push-pull-fast"``, ``"docrime"`` or ``"escape"``
+            (these three under turbulence, in open or closed loop).
         grid
-            The sensor's grid, when it is known already; found on the frames by default.
-        whiten
-            False: the paper's plain estimator of ``"docrime"`` and ``"escape"``.
-        estimator
-            What ``"escape"`` fits: ``"matrix"``, ``"telemetry"`` (fewer frames than modes are enough)
-            or ``"auto"``; as configured by default.
-        closing
-            An earlier calibration, or a loaded one: its matrix closes the loop, and the pokes stand beside
-            the integrator.
+            Geometry of the sensor, if it is known already; found on the frames by default. ``closed_loop`` is
+            a calibration here, whose matrix closes the loop.
         until
-            Stop when this signal-to-noise ratio or accuracy is reached.
-        keep
-            Where the state is kept meanwhile, and what to go on with.
-        progress
-            Show a bar with the time left.
+            Stop at this signal-to-noise ratio or accuracy.
+        checkpoint
+            File for the state of the run, and the state to resume from.
 
         Returns
         -------
         CalibrationResult
-            ``matrix`` and ``grid`` are what :meth:`close_loop` needs.
+            The argument of :meth:`close_loop`.
 
         Raises
         ------
         ConfigError
-            No such method.
+            The method is unknown, or arguments exclude each other.
         TooFewFrames, CalibrationError
-            The data cannot constrain the matrix, or the sensor sees nothing.
+            The frames cannot constrain the matrix, or the sensor gets no light.
         Aborted
             Stopped by Ctrl-C.
         """
@@ -507,25 +475,26 @@ class System(Bench):
 
         procedure = calibrate_with_method(
             self, method, frames=frames, poke=poke, grid=grid, whiten=whiten, estimator=estimator,
-            closed_loop=None if closed_loop is None else as_calibration(closed_loop), until=until, checkpoint=checkpoint,
+            closed_loop=None if closed_loop is None else as_calibration(closed_loop), until=until,
+            checkpoint=checkpoint,
         )  # fmt: skip
         return self.run(procedure, progress=progress)
 
     def find_registration(
         self, matrix: InteractionMatrix | CalibrationLike, grid: SensorGeometry | None = None
     ) -> RegistrationEstimate:
-        """Where the mirror sits on the sensor, from a measured matrix (SPRINT); nothing moves.
+        """Estimate the registration from a measured matrix with SPRINT; nothing moves.
 
-        ``calibrate("escape")`` does this as well, and its error bars are the better ones: it still
-        knows how the turbulence moves slopes together, which a matrix tells only roughly.
+        ``calibrate("escape")`` includes this step and has the more accurate standard errors, because it uses
+        the covariance of the slopes under turbulence, of which a matrix keeps an approximation only.
 
         Parameters
         ----------
         matrix
-            A measured matrix, by push-pull or DO-CRIME, or a calibration, as :meth:`calibrate` or
-            ``escape_hw.load_matrix`` returns it; of a pseudo-synthetic one, the measured matrix behind it.
+            A measured matrix, or a calibration from :meth:`calibrate` or ``escape_hw.load_matrix``; for a
+            pseudo-synthetic one, the measured matrix behind it is used.
         grid
-            The grid it was measured on; a calibration tells its own.
+            The grid of the matrix; a calibration has its own.
 
         Raises
         ------
@@ -559,7 +528,7 @@ def open_system(
 ) -> System:
     """Load a configuration, build its devices and open them.
 
-    Use it in a ``with`` statement, or call ``close()``: that flattens the mirror.
+    Use the system in a ``with`` statement, or call ``close()``, which flattens the mirror.
 
     Parameters
     ----------
