@@ -36,5 +36,5 @@ for name, result in (("DO-CRIME", docrime), ("ESCAPE", escape)):
 
 print(f"SPRINT {'converged' if escape.registration.converged else 'did NOT converge'}:")
 for name, estimate in escape.registration.parameters().items():
-    injected_value = getattr(injected, name)
-    print(f"{name:>18}: {estimate.value:8.3f} ± {estimate.sigma:.3f} {estimate.unit} (injected {injected_value:g})")
+    value = getattr(injected, name)
+    print(f"{name:>18}: {estimate.value:8.3f} ± {estimate.sigma:.3f} {estimate.unit} (injected {value:g})")

@@ -74,7 +74,8 @@ def short_and_long_agree(short: RegistrationEstimate, long: RegistrationEstimate
         allowed = PAPER_DIFFERENCES[name]
         criteria_met.append(
             criterion(
-                f"SHORT and LONG agree in {_readable_name(name)}: {difference:.3g} (paper: {allowed:g} {value.unit})",
+                f"SHORT and LONG agree in {_readable_name(name)}: {difference:.3g} "
+                f"(paper: {allowed:g} {value.unit})",
                 difference <= allowed,
             )
         )

@@ -104,7 +104,7 @@ def read_variants(
     scaled = {} if gains is None else _scale_by_gains({k: one.result for k, one in named.items()}, gains)
     if gains is not None and not scaled:
         raise ConfigError(
-            f"the optical gains are those of {gains.method} and {', '.join(gains.comparisons) or 'nothing else'}; "
+            f"the optical gains are those of {', '.join((gains.method, *gains.comparisons))}; "
             f"the matrices are {', '.join(named)}"
         )
     variants = []
