@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 #: Reason why a report does not show the injected registration of a drifting twin.
 INJECTED_UNKNOWN = (
-    "the twin behind these drivers drifts with a clock of its own, so the injected registration is not known"
+    "the twin behind these drivers drifts with a clock of its own, so its true registration is not known"
 )
 
 
