@@ -1,1 +1,4 @@
-"""The graphical interface: the only package that may import Qt. A client of the server, and no more."""
+"""The graphical interface, a client of the server, and the only package that imports Qt.
+
+It has no numerics and no device access.
+"""

@@ -18,7 +18,7 @@ from PySide6.QtWidgets import QApplication
 from escape_gui.client.connection import LiveSource, LocalServer, ServerAttachment
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
-from escape_gui.replay.opener import REPLAY_WORKSPACE, is_recording
+from escape_gui.replay.opener import is_recording
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, load_settings, settings_file
 from escape_gui.widgets.controls.status_indicator import Level
@@ -28,14 +28,22 @@ from escape_hw.errors import ConfigError
 from escape_hw.remote.address import find_server, running_servers
 from escape_hw.remote.state import Phase
 
+log = logging.getLogger(__name__)
+#: System to serve if none is named and no server runs.
+DEFAULT_SYSTEM = "razor-shwfs"
+#: Delay between a ready engine and the screenshot, and longest wait for the engine; milliseconds.
+_SCREENSHOT_DELAY_MS, _SCREENSHOT_TIMEOUT_MS = 4000, 60_000
+#: Niceness of the window's process, so that a loop on the same computer takes precedence.
+_NICENESS = 10
+
 
 def require_display() -> None:
-    """Refuse before Qt does.
+    """Check that a display is available, with a clearer message than Qt's.
 
     Raises
     ------
     ConfigError
-        There is no display, or a library that Qt needs for it is missing; says the way out.
+        There is no display, or a library that Qt needs for it is missing.
     """
     if os.environ.get("QT_QPA_PLATFORM") or os.environ.get("WAYLAND_DISPLAY"):
         return
@@ -47,38 +55,18 @@ def require_display() -> None:
         raise ConfigError("Qt needs the library libxcb-cursor: install it with 'apt install libxcb-cursor0'")
 
 
-log = logging.getLogger(__name__)
-#: What is served when nothing is named and no server runs.
-DEFAULT_SYSTEM = "razor-shwfs"
-#: Milliseconds from an engine that is ready to the picture, and how long to wait for one at most.
-_SCREENSHOT_DELAY_MS, _SCREENSHOT_TIMEOUT_MS = 4000, 60_000
-
-#: A window may wait for a loop on the same machine.
-_NICENESS = 10
-
-
 def qt_application() -> QApplication:
-    """The Qt application of this process, made once."""
-    found = QApplication.instance()
-    created = found if isinstance(found, QApplication) else QApplication(sys.argv[:1])
-    created.setApplicationName("ESCAPE")
-    # Pictures come row by row; antialiasing of curves costs five times their drawing.
+    """The Qt application of this process; created on the first call."""
+    existing = QApplication.instance()
+    qt_app = existing if isinstance(existing, QApplication) else QApplication(sys.argv[:1])
+    qt_app.setApplicationName("ESCAPE")
+    # Antialiased curves take five times as long to draw.
     pyqtgraph.setConfigOptions(imageAxisOrder="row-major", antialias=False)
-    return created
+    return qt_app
 
 
 class WindowController(QObject):
-    """A window, its session, the way to a server, and the server if it is the window's own.
-
-    Parameters
-    ----------
-    window, session
-        What is shown, and through what.
-    address
-        Server to attach to.
-    own
-        The server that was started for this window.
-    """
+    """Connects a window to the server at an address, and stops ``local_server`` if the window started one."""
 
     def __init__(
         self, window: MainWindow, session: Session, address: str, local_server: LocalServer | None
@@ -106,7 +94,7 @@ class WindowController(QObject):
             self.window.notifications.show_message(Level.ERROR, "The server did not start", exit_message)
 
     def close(self) -> None:
-        """Hang up, and end the window's own server with its mirror flat; after the session was closed."""
+        """Disconnect, and stop the local server with a flat mirror. Close the session first."""
         if self.local_server is not None:
             self.local_server.terminate(None if self._live is None else self._live.connection)
         self.attachment.close()
@@ -118,19 +106,19 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     Parameters
     ----------
     system
-        System to serve on its twin, or whose running server is looked at; empty with ``address``. A FITS
-        product or the folder of a run is shown as a recording.
+        System to serve with simulated devices or whose running server to attach to, or a recorded run
+        (a FITS product or a run folder); empty with ``address``.
     address
         Address of a server.
     screenshot
-        Take a picture into this file and end.
+        Save an image of the window into this file and return.
     reset_settings
-        Begin with the defaults.
+        Ignore the saved settings.
 
     Returns
     -------
     int
-        Exit code; 1 for a picture without a server.
+        Exit code; 1 for a screenshot without a server.
 
     Raises
     ------
@@ -141,7 +129,7 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     qt_app = qt_application()
     recording = bool(system) and is_recording(Path(system))
     address, local_server = ("", None) if recording else _find_or_start_server(system, address)
-    # Only now: a server of its own, whose engine runs a loop, stands in front.
+    # After the start of a local server, whose engine must keep the normal priority.
     os.nice(_NICENESS)
     settings_path = settings_file()
     settings, warnings = (Settings(), ()) if reset_settings else load_settings(settings_path)
@@ -152,23 +140,21 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
         window.notifications.show_message(Level.WARNING, "Settings", warning)
     if screenshot is not None:
         _take_screenshot(window, session, screenshot)
-    desk = None
+    controller = None
     if recording:
-        session.set_source(ReplaySource(system), None)
-        window.show_workspace(REPLAY_WORKSPACE)
+        window.show_recording(ReplaySource(system))
     else:
-        desk = WindowController(window, session, address, local_server)
+        controller = WindowController(window, session, address, local_server)
     window.update_timer.start()
     window.show()
     try:
         with _close_on_signals(qt_app):
             code = qt_app.exec()
-        # A picture of a window that never found its server is no picture of what was asked for.
         return code if screenshot is None or not isinstance(session.source, EmptySource) else 1
     finally:
         session.close()
-        if desk is not None:
-            desk.close()
+        if controller is not None:
+            controller.close()
 
 
 def _find_or_start_server(system: str, address: str) -> tuple[str, LocalServer | None]:
@@ -186,9 +172,9 @@ def _find_or_start_server(system: str, address: str) -> tuple[str, LocalServer |
 
 @contextmanager
 def _close_on_signals(qt_app: QApplication) -> Iterator[None]:
-    """Ctrl-C and SIGTERM close the window in order; an exception out of a slot would be swallowed by Qt.
+    """Close all windows on Ctrl-C and SIGTERM, because Qt swallows an exception raised in a slot.
 
-    Python hears of them with the next tick.
+    Python runs the handler at the next tick of the window's timer.
     """
 
     def close(*_: object) -> None:
@@ -203,19 +189,19 @@ def _close_on_signals(qt_app: QApplication) -> Iterator[None]:
 
 
 def _take_screenshot(window: MainWindow, session: Session, path: Path) -> None:
-    """Take the picture when something is to be seen, and close the window."""
-    waiting = QTimer(window)
+    """Save an image once the engine has started, and close the window."""
+    poll = QTimer(window)
 
     def take() -> None:
         save_png(path, window)
         window.close()
 
-    def look() -> None:
+    def check() -> None:
         source = session.source
         if source.connected and source.state.phase is not Phase.STARTING:
-            waiting.stop()
+            poll.stop()
             QTimer.singleShot(_SCREENSHOT_DELAY_MS, take)
 
-    waiting.timeout.connect(look)
-    waiting.start(200)
+    poll.timeout.connect(check)
+    poll.start(200)
     QTimer.singleShot(_SCREENSHOT_TIMEOUT_MS, take)

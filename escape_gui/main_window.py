@@ -1,10 +1,11 @@
-"""The window: docks in three workspaces under one band, and what the actions do."""
+"""Main window: dock panels in three workspaces below a header, and the implementation of the actions."""
 
 from __future__ import annotations
 
 import base64
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from PySide6.QtCore import QByteArray, Qt
@@ -17,19 +18,21 @@ from PySide6.QtWidgets import (
     QMenuBar,
     QTabBar,
     QTabWidget,
-    QVBoxLayout,
     QWidget,
 )
 
-from escape_gui.client.availability import RequestContext
-from escape_gui.client.session import ServerControl, Session
+from escape_gui.client.availability import tooltip
+from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
 from escape_gui.panels.base import Context, Panel
 from escape_gui.replay.opener import RecordingOpener
+from escape_gui.replay.player import PlaybackBar
+from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, save_settings
 from escape_gui.theme import Theme
 from escape_gui.widgets.controls.overlay import Overlay
 from escape_gui.widgets.controls.status_indicator import Level
+from escape_gui.widgets.layouts import column
 from escape_gui.window.actions import ACTIONS, MENUS
 from escape_gui.window.dock import Dock
 from escape_gui.window.export import Exporter
@@ -41,23 +44,25 @@ from escape_gui.window.workspaces import WORKSPACES, arrange_docks, hide_orphan_
 from escape_hw.errors import StorageError
 
 log = logging.getLogger(__name__)
-#: Version of the arrangement Qt stores; layouts of another one are dropped.
+#: Version of the dock arrangement that Qt stores; layouts of other versions are discarded.
 LAYOUT_VERSION = 3
+#: Workspace in which recorded runs are opened.
+REPLAY_WORKSPACE = "calibrate"
 
 
 class MainWindow(QMainWindow):
-    """One window on one source.
+    """Window on one data source.
 
     Parameters
     ----------
     session
-        Data and requests; the window does not close it.
+        Data and requests; not closed by the window.
     settings
-        What is remembered.
-    store
-        Where to remember it; ``None``: nowhere.
+        Theme, font size and layouts.
+    settings_path
+        File in which the settings are saved on closing; ``None``: not saved.
     panels
-        Kinds of panels to show.
+        Classes of the panels to create.
     """
 
     def __init__(
@@ -68,10 +73,11 @@ class MainWindow(QMainWindow):
         panels: Sequence[type[Panel]] = PANELS,
     ) -> None:
         super().__init__()
-        self._settings, self._store = settings, settings_path
+        self._settings, self._settings_path = settings, settings_path
         self.context = Context(Theme(settings.theme, settings.font_scale), session)
-        self.context.theme.apply()
-        self.context.theme.changed.connect(self._resize_tabs)
+        theme = self.context.theme
+        theme.apply()
+        theme.changed.connect(self._resize_tabs)
         self.setDockNestingEnabled(True)
         self.setDockOptions(
             QMainWindow.DockOption.AnimatedDocks
@@ -89,38 +95,80 @@ class MainWindow(QMainWindow):
         self.docks = {name: self._make_dock(panel) for name, panel in self.panels.items()}
         self._make_header()
         self._status_labels = {name: QLabel() for name in ("frozen", "busy", "saved", "recording", "disk")}
-        self.notifications = NotificationBar(self.context.theme)
+        self.notifications = NotificationBar(theme)
         self.statusBar().addWidget(self.notifications, 1)
         for label in self._status_labels.values():
             self.statusBar().addPermanentWidget(label)
-        self.overlay = Overlay(self, self.context.theme)
+        self.overlay = Overlay(self, theme)
         self.state_notifier = StateNotifier(self.notifications)
-        self.exporter: Exporter = Exporter(self)
-        self.update_timer = UpdateTimer(session, self.panels.values(), self.refresh)
-        self.replay: RecordingOpener = RecordingOpener(
-            self, lambda: MainWindow(Session(), settings.model_copy(deep=True), None, panels)
+        self.exporter = Exporter(
+            self, session, self.notifications, lambda path: self._set_status("saved", f"saved {path.name}")
         )
+        self.update_timer = UpdateTimer(session, self.panels.values(), self.refresh)
+        self.playback_bar = PlaybackBar(session)
+        self.addToolBar(Qt.ToolBarArea.BottomToolBarArea, self.playback_bar)
+        self.replay = RecordingOpener(self)
+        self.replay.opened.connect(self.show_recording)
+        self.replay.failed.connect(
+            lambda why: self.notifications.show_message(Level.ERROR, "Cannot be opened", why)
+        )
+        #: Windows in which recorded runs were opened from this one.
+        self.replay_windows: list[MainWindow] = []
         session.failed.connect(
             lambda what, why: self.notifications.show_message(Level.ERROR, f"Could not {what}", why)
         )
         session.pending_changed.connect(
-            lambda n: self.set_status_text("busy", f"{n} request(s) under way" if n else "")
+            lambda n: self._set_status("busy", f"{n} request(s) pending" if n else "")
         )
+        self.handlers = self._make_handlers()
         self.workspace = workspace(settings.workspace)
         self._restore()
 
-    # ------------------------------------------------------------ building
+    # ------------------------------------------------------------ construction
     def _make_actions(self) -> dict[str, QAction]:
-        made = {}
+        actions = {}
         for one in ACTIONS:
             action = QAction(one.text, self)
             action.setObjectName(one.name)
             action.setShortcuts([QKeySequence(key) for key in one.keys])
             action.setShortcutContext(Qt.ShortcutContext.WindowShortcut)
-            action.triggered.connect(lambda _=False, one=one: one.run(self))
+            action.triggered.connect(lambda _=False, name=one.name: self.handlers[name]())
             self.addAction(action)
-            made[one.name] = action
-        return made
+            actions[one.name] = action
+        return actions
+
+    def _make_handlers(self) -> dict[str, Callable[[], object]]:
+        """What each action of :data:`~escape_gui.window.actions.ACTIONS` does, by its name."""
+        session = self.context.session
+        ask = session.ask
+        return {
+            "open_product": self.replay.ask_product,
+            "open_run": self.replay.ask_run,
+            "save_png": lambda: self.exporter.panel("png", self.focused_panel()),
+            "save_csv": lambda: self.exporter.panel("csv", self.focused_panel()),
+            "save_fits": lambda: self.exporter.panel("fits", self.focused_panel()),
+            "save_window": self.exporter.window,
+            "quit": self.close,
+            **{f"workspace_{one.name}": partial(self.show_workspace, one.name) for one in WORKSPACES},
+            "reset_layout": self.reset_layout,
+            "next_panel": lambda: self.focus_panel(+1),
+            "previous_panel": lambda: self.focus_panel(-1),
+            "freeze": self.toggle_freeze,
+            "theme": self.toggle_theme,
+            "larger": lambda: self.context.theme.step_scale(+1),
+            "smaller": lambda: self.context.theme.step_scale(-1),
+            "normal": lambda: self.context.theme.step_scale(0),
+            "open_loop": lambda: ask("open the loop", lambda server: server.open_loop(), urgent=True),
+            "flatten": lambda: ask("flatten the mirror", lambda server: server.flatten(), urgent=True),
+            "abort": session.abort,
+            "pause": session.toggle_pause,
+            "take_control": self.take_control,
+            "give_back": lambda: ask("release control", lambda server: server.release()),
+            "record": self.toggle_recording,
+            "clear_fault": lambda: ask("clear the fault", lambda server: server.clear_fault()),
+            "help_panel": self.show_panel_help,
+            "keys": self.toggle_keyboard_table,
+        }
 
     def _make_tabs(self) -> QTabBar:
         tabs = QTabBar()
@@ -135,7 +183,6 @@ class MainWindow(QMainWindow):
         return tabs
 
     def _resize_tabs(self) -> None:
-        """Another look has wider or narrower words."""
         self.tabs.setMinimumWidth(self.tabs.sizeHint().width())
         self.tabs.updateGeometry()
 
@@ -154,16 +201,12 @@ class MainWindow(QMainWindow):
                     menu.addAction(self.actions_by_name[one.name])
             if title == "&View":
                 menu.addSeparator()
-                shown = menu.addMenu("Sho&w")
+                submenu = menu.addMenu("Sho&w")
                 for dock in self.docks.values():
-                    shown.addAction(dock.toggleViewAction())
+                    submenu.addAction(dock.toggleViewAction())
         bar.setCornerWidget(self.tabs, Qt.Corner.TopRightCorner)
         top = QWidget()
-        column = QVBoxLayout(top)
-        column.setContentsMargins(0, 0, 0, 0)
-        column.setSpacing(0)
-        for widget in (bar, self.header, self.fault_banner):
-            column.addWidget(widget)
+        column(bar, self.header, self.fault_banner, parent=top, spacing=0)
         self.setMenuWidget(top)
 
     # ------------------------------------------------------------ layout
@@ -181,14 +224,14 @@ class MainWindow(QMainWindow):
         size = self.size()
         if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
             arrange_docks(self, docks, self.workspace)
-        # A layout of a larger window must not make this one larger.
+        # The layout of a larger window must not enlarge this one.
         self.resize(size)
         hide_orphan_tab_bars(self, docks)
-        # Docks that were shown anew lie over everything.
+        # Docks that were shown again lie above everything else.
         self.overlay.raise_()
 
     def show_workspace(self, name: str) -> None:
-        """Change to another workspace, each as it was left."""
+        """Save the layout of this workspace and change to another one."""
         if name == self.workspace.name:
             return
         self._store_layout()
@@ -197,7 +240,6 @@ class MainWindow(QMainWindow):
         self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
 
     def reset_layout(self) -> None:
-        """Put this workspace's panels back in place."""
         self._settings.layouts.pop(self.workspace.name, None)
         self._apply_layout()
 
@@ -205,121 +247,125 @@ class MainWindow(QMainWindow):
         self._settings.layouts[self.workspace.name] = _text(self.saveState(LAYOUT_VERSION))
 
     def focus_panel(self, step: int) -> None:
-        """Give the focus to the next visible panel."""
-        seen = [name for name, dock in self.docks.items() if not dock.visibleRegion().isEmpty()]
-        if not seen:
+        """Move the focus by ``step`` visible panels."""
+        visible = [name for name, dock in self.docks.items() if not dock.visibleRegion().isEmpty()]
+        if not visible:
             return
         now = self.focused_panel()
-        k = seen.index(now.name) + step if now is not None and now.name in seen else 0
-        panel = self.panels[seen[k % len(seen)]]
+        k = visible.index(now.name) + step if now is not None and now.name in visible else 0
+        panel = self.panels[visible[k % len(visible)]]
         panel.setFocus(Qt.FocusReason.TabFocusReason)
         if not panel.hasFocus():
             panel.focusNextChild()
 
     def focused_panel(self) -> Panel | None:
-        """The panel that has the focus."""
+        """The panel that has the focus, if any."""
         widget = QApplication.focusWidget()
         while widget is not None and not isinstance(widget, Panel):
             widget = widget.parentWidget()
         return widget
 
-    # ------------------------------------------------------------ five times a second
+    # ------------------------------------------------------------ state, five times a second
     def refresh(self) -> None:
-        """Bring band, actions and notes up to date."""
+        """Update header, actions, dock titles, notifications and status bar from the newest state."""
         session = self.context.session
-        source, live = session.source, session.live
-        state = source.state
-        now = RequestContext(state, source.connected, live, session.may_write)
-        self.header.show_state(state, connected=now.connected, live=live, mine=now.may_write)
+        now = session.request_context
+        state = now.state
+        self.header.show_state(state, connected=now.connected, live=now.live, mine=now.may_write)
         self.fault_banner.show_state(state)
         for one in ACTIONS:
-            why = one.unavailable(now)
+            reason = one.unavailable(now)
             action = self.actions_by_name[one.name]
-            action.setEnabled(not why)
-            keys = f" ({format_shortcuts(one.keys)})" if one.keys else ""
-            action.setToolTip(f"{one.tip}{keys}" if not why else f"{one.tip} Not now: {why}.")
+            action.setEnabled(not reason)
+            keys = f" ({format_shortcuts(one.keys)})" if one.keys and not reason else ""
+            action.setToolTip(tooltip(f"{one.tip}{keys}", reason))
         for dock in self.docks.values():
             dock.show_health()
         self.state_notifier.update(state, connected=now.connected)
-        written = state.telemetry
-        self.set_status_text(
+        telemetry = state.recording
+        self._set_status(
             "recording",
-            f"recording {written.written} frames, {written.dropped} dropped" if written.recording else "",
+            f"recording {telemetry.written} frames, {telemetry.dropped} dropped"
+            if telemetry.recording
+            else "",
         )
-        self.set_status_text("disk", f"{state.disk.free_gb:.1f} GB free" if state.disk.folder else "")
+        self._set_status("disk", f"{state.disk.free_gb:.1f} GB free" if state.disk.folder else "")
         self.setWindowTitle(f"ESCAPE · {state.system}" if state.system else "ESCAPE")
 
-    def set_status_text(self, name: str, text: str) -> None:
-        """Change a note in the status bar: frozen, busy, saved, recording, disk."""
+    def _set_status(self, name: str, text: str) -> None:
         self._status_labels[name].setText(text)
 
-    # ------------------------------------------------------------ what actions do
-    def ask(self, what: str, call: Callable[[ServerControl], object], *, urgent: bool = False) -> None:
-        """Send a request whose answer nobody waits for."""
-        requests = self.context.session.requests
-        if requests is not None:
-            requests.ask(what, call, urgent=urgent)
-
+    # ------------------------------------------------------------ actions
     def take_control(self) -> None:
-        """Ask for the lease, from its holder if there is one."""
+        """Request control, from the client that has it if there is one."""
         held = self.context.session.source.state.lease is not None
-        self.ask("take control", lambda server: server.acquire(take_over=held))
-
-    def toggle_pause(self) -> None:
-        """Halt the procedure or go on with it."""
-        running = self.context.session.source.state.procedure
-        if running is not None and running.paused:
-            self.ask("go on", lambda server: server.resume())
-        else:
-            self.ask("pause", lambda server: server.pause())
+        self.context.session.ask("take control", lambda server: server.acquire(take_over=held))
 
     def toggle_recording(self) -> None:
-        """Begin or end telemetry."""
-        on = not self.context.session.source.state.telemetry.recording
-        self.ask("record telemetry" if on else "stop recording", lambda server: server.record(on))
+        on = not self.context.session.source.state.recording.recording
+        self.context.session.ask(
+            "record telemetry" if on else "stop recording", lambda server: server.record(on)
+        )
 
     def toggle_theme(self) -> None:
-        """The other palette."""
         self.context.theme.set_palette("light" if self.context.theme.palette_name == "dark" else "dark")
 
-    def step_font_scale(self, steps: int) -> None:
-        """Larger or smaller letters; 0: the normal size."""
-        self.context.theme.step_scale(steps)
-
     def toggle_freeze(self) -> None:
-        """Hold the panels, or let them go on; band and safety buttons never freeze."""
+        """Freeze the panels or resume them; header and safety buttons never freeze."""
         self.update_timer.frozen = not self.update_timer.frozen
-        self.set_status_text("frozen", "Panels are frozen; X goes on" if self.update_timer.frozen else "")
+        self._set_status("frozen", "Panels frozen (X to resume)" if self.update_timer.frozen else "")
 
     def toggle_keyboard_table(self) -> None:
-        """Show the keys, or close them."""
         if self.overlay.isVisible():
             self.overlay.hide()
         else:
             self.overlay.open("Keyboard", keyboard_table())
 
     def show_panel_help(self, panel: Panel | None = None) -> None:
-        """Show a panel's help page; without one, of the panel in focus."""
+        """Show the help page of a panel, by default of the one with the focus."""
         panel = panel or self.focused_panel()
         if panel is None:
             self.toggle_keyboard_table()
         else:
             self.overlay.open(panel.title, help_page(panel), markdown=True)
 
+    def show_recording(self, source: ReplaySource) -> None:
+        """Show a recorded run, in a window of its own if this one is connected to a server.
+
+        The safety buttons of a window on a bench must remain those of the bench.
+        """
+        session = self.context.session
+        if session.requests is None:
+            session.set_source(source, None)
+            self.show_workspace(REPLAY_WORKSPACE)
+            return
+        kinds = [type(panel) for panel in self.panels.values()]
+        other = MainWindow(Session(), self._settings.model_copy(deep=True), None, kinds)
+        self.replay_windows.append(other)
+        other.show_recording(source)
+        other.setWindowTitle(f"ESCAPE · {source.path.name}")
+        other.update_timer.start()
+        other.show()
+
     def closeEvent(self, event: QCloseEvent) -> None:
-        """Remember the layout; the server goes on."""
+        """Save settings and layout; a connected server keeps running."""
         self.update_timer.stop()
         self.replay.close()
+        for other in self.replay_windows:
+            other.close()
+            other.context.session.close()
+            other.deleteLater()
+        self.replay_windows.clear()
         self._store_layout()
         theme, settings = self.context.theme, self._settings
         settings.geometry = _text(self.saveGeometry())
         settings.theme, settings.font_scale = theme.palette_name, theme.scale
         settings.workspace = self.workspace.name
-        if self._store is not None:
+        if self._settings_path is not None:
             try:
-                save_settings(self._store, settings)
+                save_settings(self._settings_path, settings)
             except StorageError as error:
-                log.warning("settings are not kept: %s", error)
+                log.warning("settings not saved: %s", error)
         super().closeEvent(event)
 
 

@@ -1,4 +1,4 @@
-"""What the window remembers. A damaged file never keeps it from starting."""
+"""Settings of the window, saved between sessions. A damaged file does not prevent the start."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ from escape_hw.io.storage import write_atomic
 
 
 class Settings(BaseModel):
-    """Look and layout."""
+    """Theme, font size and layouts."""
 
     model_config = ConfigDict(validate_assignment=True, extra="ignore")
 
     theme: Literal["dark", "light"] = "dark"
     font_scale: float = Field(1.0, ge=0.8, le=2.0)
     workspace: str = "operate"
-    #: Arrangement of the docks by workspace, as Qt wrote it, base64.
+    #: Arrangement of the docks by workspace: Qt's format, base64.
     layouts: dict[str, str] = Field(default_factory=dict)
-    #: Size and place of the window, as Qt wrote it, base64.
+    #: Size and position of the window: Qt's format, base64.
     geometry: str = ""
 
 
 def settings_file() -> Path:
-    """Where the settings lie."""
+    """Path of the settings file in the user's configuration folder."""
     return Path(platformdirs.user_config_dir("escape")) / "gui.json"
 
 
 def load_settings(path: Path) -> tuple[Settings, tuple[str, ...]]:
-    """Read settings; whatever is wrong in the file is left out and told.
+    """Read settings and ignore invalid entries.
 
     Returns
     -------
     settings : Settings
-        What could be read, defaults for the rest.
+        Valid entries, and defaults for the others.
     warnings : tuple of str
-        One line for each thing that was left out; empty for a sound or absent file.
+        One line per ignored entry; empty for a valid or missing file.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return Settings(), ()
     except (OSError, ValueError) as error:
-        return Settings(), (f"{path}: cannot be read ({error}); the window starts with its defaults",)
+        return Settings(), (f"{path}: cannot be read ({error}); using the default settings",)
     if not isinstance(content, dict):
-        return Settings(), (f"{path}: not a table of settings; the window starts with its defaults",)
+        return Settings(), (f"{path}: not a table of settings; using the default settings",)
     return _valid_settings(path, content)
 
 
@@ -70,11 +70,5 @@ def _valid_settings(path: Path, content: dict[str, Any]) -> tuple[Settings, tupl
 
 
 def save_settings(path: Path, settings: Settings) -> None:
-    """Write settings; the file is whole or the old one.
-
-    Raises
-    ------
-    StorageError
-        It cannot be written.
-    """
+    """Write settings atomically; raise `StorageError` if the file cannot be written."""
     write_atomic(path, (settings.model_dump_json(indent=2) + "\n").encode())

@@ -1,4 +1,4 @@
-"""Colours and fonts: one dark and one light palette, and the two sizes of every number on the screen."""
+"""Theme of the window: a dark and a light palette, fonts, and Qt's style sheet."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _MONO = ("JetBrains Mono", "Noto Sans Mono", "DejaVu Sans Mono", "Liberation Mon
 
 @dataclass(frozen=True, slots=True)
 class Palette:
-    """One palette. Text colours keep a contrast of 4.5 : 1 on every surface they may stand on."""
+    """Colours of a theme. Text has a contrast of at least 4.5 : 1 on every surface that it is used on."""
 
-    #: Surfaces from the back to the front: window, panel, plots and fields, buttons.
+    #: Surfaces from back to front: window, panel, plots and fields, buttons.
     window: str
     panel: str
     field: str
@@ -32,90 +32,45 @@ class Palette:
     muted: str
     accent: str
     on_accent: str
-    #: Conditions; each is text and shape on any surface.
+    #: Conditions, used for text and shapes on any surface.
     good: str
     warn: str
     bad: str
-    #: Full-width bands with the word on them.
+    #: Connection banner and its text.
     simulated: str
     on_simulated: str
     hardware: str
     on_hardware: str
-    #: The safety buttons.
+    #: Safety buttons.
     stop: str
     on_stop: str
-    #: Curves, after Okabe and Ito, to be told apart with any colour vision.
+    #: Curves, after Okabe and Ito: distinguishable with any colour vision.
     series: tuple[str, ...]
 
 
+# fmt: off
 DARK = Palette(
-    window="#131517",
-    panel="#1a1d20",
-    field="#0e1012",
-    button="#2a2f34",
-    line="#353b41",
-    text="#e4e7ea",
-    muted="#9aa4ad",
-    accent="#56b4e9",
-    on_accent="#06141d",
-    good="#3fc79a",
-    warn="#f0b429",
-    bad="#ff7a6b",
-    simulated="#1f3d52",
-    on_simulated="#d6edfb",
-    hardware="#e69f00",
-    on_hardware="#171000",
-    stop="#b3261e",
-    on_stop="#ffffff",
+    window="#131517", panel="#1a1d20", field="#0e1012", button="#2a2f34",
+    line="#353b41", text="#e4e7ea", muted="#9aa4ad", accent="#56b4e9", on_accent="#06141d",
+    good="#3fc79a", warn="#f0b429", bad="#ff7a6b",
+    simulated="#1f3d52", on_simulated="#d6edfb", hardware="#e69f00", on_hardware="#171000",
+    stop="#b3261e", on_stop="#ffffff",
     series=("#56b4e9", "#e69f00", "#2bbf94", "#e08fbb", "#f0e442", "#ff8f4d"),
 )
 LIGHT = Palette(
-    window="#e9ebed",
-    panel="#f6f7f8",
-    field="#ffffff",
-    button="#dde1e5",
-    line="#b9c0c7",
-    text="#15191d",
-    muted="#4d5760",
-    accent="#005f9e",
-    on_accent="#ffffff",
-    good="#00634a",
-    warn="#7d4e00",
-    bad="#b3261e",
-    simulated="#cfe5f4",
-    on_simulated="#0b3550",
-    hardware="#ffc04d",
-    on_hardware="#241800",
-    stop="#b3261e",
-    on_stop="#ffffff",
+    window="#e9ebed", panel="#f6f7f8", field="#ffffff", button="#dde1e5",
+    line="#b9c0c7", text="#15191d", muted="#4d5760", accent="#005f9e", on_accent="#ffffff",
+    good="#00634a", warn="#7d4e00", bad="#b3261e",
+    simulated="#cfe5f4", on_simulated="#0b3550", hardware="#ffc04d", on_hardware="#241800",
+    stop="#b3261e", on_stop="#ffffff",
     series=("#0072b2", "#b85c00", "#00795a", "#a84a82", "#7a6f00", "#444c54"),
 )
+# fmt: on
 PALETTES: dict[PaletteName, Palette] = {"dark": DARK, "light": LIGHT}
 
 
-def contrast(one: str, other: str) -> float:
-    """Contrast ratio of two colours, from 1 to 21 (Web Content Accessibility Guidelines 2.2, 1.4.3)."""
-    bright, dim = sorted((_luminance(one), _luminance(other)), reverse=True)
-    return (bright + 0.05) / (dim + 0.05)
-
-
-def _luminance(colour: str) -> float:
-    """Relative luminance of an sRGB colour, 0 to 1 (same source)."""
-    channels = (int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-
-
 class Theme(QObject):
-    """The look in force. Panels ask it for colours and fonts and repaint on :attr:`changed`.
-
-    Parameters
-    ----------
-    shade
-        Palette to begin with.
-    scale
-        Font scale, one of :data:`SCALES` or anything between.
-    """
+    """Palette and font scale (within :data:`SCALES`); :attr:`changed` is emitted when either changes."""
 
     changed = Signal()
 
@@ -126,7 +81,6 @@ class Theme(QObject):
 
     @property
     def colours(self) -> Palette:
-        """The palette in force."""
         return PALETTES[self.palette_name]
 
     def colour(self, name: str) -> QColor:
@@ -134,18 +88,17 @@ class Theme(QObject):
         return QColor(str(getattr(self.colours, name)))
 
     def series(self, number: int) -> QColor:
-        """Colour of curve ``number``; begins again after the last."""
+        """Colour of curve ``number``, cyclic."""
         names = self.colours.series
         return QColor(names[number % len(names)])
 
     def set_palette(self, palette_name: PaletteName) -> None:
-        """Take the other palette."""
         if palette_name != self.palette_name:
             self.palette_name = palette_name
             self.apply()
 
     def step_scale(self, steps: int) -> None:
-        """Larger (+1) or smaller (-1) letters; 0 takes the normal size."""
+        """Increase (+1) or decrease (-1) the font scale by a step; 0: reset it."""
         nearest = min(range(len(SCALES)), key=lambda k: abs(SCALES[k] - self.scale))
         chosen = SCALES[min(max(nearest + steps, 0), len(SCALES) - 1)] if steps else 1.0
         if chosen != self.scale:
@@ -153,18 +106,18 @@ class Theme(QObject):
             self.apply()
 
     def font(self, size: float = 1.0, *, mono: bool = False, bold: bool = False) -> QFont:
-        """A font at a multiple of the normal size; numbers that change stand in ``mono``."""
+        """A font of ``size`` times the normal size; ``mono`` for numbers that change."""
         font = QFont(_family(_MONO if mono else _SANS, mono))
         font.setPointSizeF(_POINTS * self.scale * size)
         font.setBold(bold)
         return font
 
     def pixels(self, at_normal_size: float) -> int:
-        """A length that grows with the letters."""
+        """A length in pixels, scaled like the fonts."""
         return round(at_normal_size * self.scale)
 
     def apply(self) -> None:
-        """Dress the application and tell everybody."""
+        """Set palette, font and style sheet of the application."""
         application = QApplication.instance()
         if isinstance(application, QApplication):
             application.setStyle(QStyleFactory.create("Fusion"))
@@ -181,26 +134,17 @@ def _family(wanted: tuple[str, ...], mono: bool) -> str:
 
 
 def qt_palette(colours: Palette) -> QPalette:
-    """The palette as Qt's Fusion style wants it."""
+    """The palette as roles of Qt's Fusion style."""
     role = QPalette.ColorRole
     roles = {
-        role.Window: colours.panel,
-        role.WindowText: colours.text,
-        role.Base: colours.field,
-        role.AlternateBase: colours.panel,
-        role.Text: colours.text,
-        role.Button: colours.button,
-        role.ButtonText: colours.text,
-        role.BrightText: colours.bad,
-        role.Highlight: colours.accent,
-        role.HighlightedText: colours.on_accent,
-        role.ToolTipBase: colours.button,
-        role.ToolTipText: colours.text,
-        role.PlaceholderText: colours.muted,
-        role.Link: colours.accent,
-        role.Mid: colours.line,
-        role.Dark: colours.line,
-    }
+        role.Window: colours.panel, role.WindowText: colours.text,
+        role.Base: colours.field, role.AlternateBase: colours.panel, role.Text: colours.text,
+        role.Button: colours.button, role.ButtonText: colours.text, role.BrightText: colours.bad,
+        role.Highlight: colours.accent, role.HighlightedText: colours.on_accent,
+        role.ToolTipBase: colours.button, role.ToolTipText: colours.text,
+        role.PlaceholderText: colours.muted, role.Link: colours.accent,
+        role.Mid: colours.line, role.Dark: colours.line,
+    }  # fmt: skip
     palette = QPalette()
     for key, value in roles.items():
         palette.setColor(key, QColor(value))
@@ -210,7 +154,7 @@ def qt_palette(colours: Palette) -> QPalette:
 
 
 def style_sheet(theme: Theme) -> str:
-    """What the Fusion style leaves open: flat docks, a focus ring, tabs and buttons of one kind."""
+    """Style sheet that complements the Fusion style: flat docks, focus ring, tabs and buttons."""
     names = {field.name: getattr(theme.colours, field.name) for field in fields(Palette)}
     sheet = _SHEET
     for name in sorted(names, key=len, reverse=True):
@@ -220,7 +164,7 @@ def style_sheet(theme: Theme) -> str:
     return sheet.replace("@arrow", _ARROW.as_posix())
 
 
-#: Of lists to choose from: Qt's own comes with a frame that belongs to no palette of ours.
+#: Arrow of combo boxes; Qt's has a frame in a colour outside the palettes.
 _ARROW = Path(__file__).with_name("down.png")
 _SHEET = """
 QMainWindow, QDialog { background: @window; }

@@ -22,6 +22,7 @@ from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.devices import DeviceConfig
 from escape_hw.config.registry import call_factory, device_factory, model_factory
 from escape_hw.config.system import SystemConfig
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ log = logging.getLogger(__name__)
 D = TypeVar("D", bound=Device)
 
 
+@renamed_members(taps="callbacks")
 class Bench:
     """The devices of a system and its configuration; usable as a context manager.
 

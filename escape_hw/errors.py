@@ -1,30 +1,35 @@
-"""The error tree: every failure names its subject, the value, the limit and the way out."""
+"""Exceptions of ESCAPE. Messages name the subject, the value, the limit and the remedy."""
 
 from __future__ import annotations
 
 
 class EscapeError(Exception):
-    """Root of every error this package raises on purpose."""
+    """Base class of all exceptions raised by ESCAPE; ``exit_code`` is that of the command line."""
 
     exit_code = 1
 
 
 class ConfigError(EscapeError):
-    """A configuration or command-line value is wrong; nothing was opened."""
+    """A configuration or command-line value is invalid; nothing was opened."""
 
     exit_code = 2
 
 
 class DeviceError(EscapeError):
-    """A device refused, failed or vanished.
+    """A device rejected a request, failed or was lost.
 
-    The message starts with the device's name, so that a log line stands alone.
+    Parameters
+    ----------
+    device
+        Name of the device; the text of the exception begins with it.
+    message
+        What failed.
     """
 
     exit_code = 3
 
     def __init__(self, device: str, message: str) -> None:
-        # Both stay in ``args``: that is what lets the error cross to another process.
+        # Both are in ``args`` so that the exception can be pickled and sent to another process.
         super().__init__(device, message)
         self.device = device
 
@@ -37,7 +42,7 @@ class NotOpen(DeviceError):
 
 
 class DeviceLost(DeviceError):
-    """The device vanished (unplugged, powered off, link closed)."""
+    """The connection to a device was lost (unplugged, powered off, link closed)."""
 
 
 class FrameTimeout(DeviceError):
@@ -45,29 +50,29 @@ class FrameTimeout(DeviceError):
 
 
 class SettingRejected(DeviceError):
-    """A setting is outside what the device can do."""
+    """A setting is outside the range of the device."""
 
 
 class CommandRejected(DeviceError):
-    """A mirror command was refused whole; the last good shape is kept."""
+    """A mirror command was rejected; the last shape is kept."""
 
 
 class CalibrationError(EscapeError):
-    """A calibration could not reach a trustworthy result."""
+    """A calibration did not give a valid result."""
 
 
 class TooFewFrames(CalibrationError):
-    """The data cannot constrain what was asked for."""
+    """Too few frames to estimate the requested quantity."""
 
 
 class ProductError(EscapeError):
-    """A stored product is damaged, foreign or of the wrong kind."""
+    """A stored product is damaged, not a product of ESCAPE, or of the wrong kind."""
 
     exit_code = 2
 
 
 class IncompatibleProduct(ProductError):
-    """A product belongs to another system, sensor, basis or mode (simulated against hardware)."""
+    """A product belongs to another system, sensor, basis or mode (simulation, hardware)."""
 
 
 class StorageError(EscapeError):
@@ -75,7 +80,7 @@ class StorageError(EscapeError):
 
 
 class Aborted(EscapeError):
-    """The operator stopped a procedure; what was measured so far is kept."""
+    """The operator stopped a procedure; ``partial`` is its result so far, or ``None``."""
 
     exit_code = 130
 
@@ -85,20 +90,20 @@ class Aborted(EscapeError):
 
 
 class LeaseHeld(EscapeError):
-    """Somebody else has the right to write, or nobody asked for it."""
+    """The client does not have control of the server."""
 
 
 class ServerGone(EscapeError):
-    """No server answers."""
+    """The server does not answer."""
 
     exit_code = 3
 
 
 class RequestRefused(EscapeError):
-    """A server does not take a request: malformed, not now, or not from here."""
+    """The server rejects a request: malformed, not possible now, or not permitted."""
 
     exit_code = 2
 
 
 class ClientUnknown(RequestRefused):
-    """A server does not know who asks: it was started anew, or had not heard of the client for long."""
+    """The client is not registered with the server, for example after a restart of the server."""

@@ -1,4 +1,4 @@
-"""Measure the interaction matrix three ways and compare them.
+"""Measure the interaction matrix in three ways and compare the results.
 
 Run it with: python examples/calibrate.py
 """
@@ -13,28 +13,28 @@ from escape_hw.report.comparison import compare
 FRAMES = 1000  # two seconds at 500 Hz; the paper's SHORT run has 10,000
 
 with escape_hw.open_system("razor-shwfs") as bench:
-    # Push-pull needs a calm beam: the phase screen is taken out for it, and put back.
+    # Push-pull needs a source: the phase screen is removed during the measurement.
     push_pull = bench.calibrate("push-pull", frames=5, progress=True)
 
-    # ESCAPE works under turbulence: DO-CRIME, then SPRINT, then a matrix computed from a model.
+    # ESCAPE works under turbulence: DO-CRIME, then SPRINT, then a pseudo-synthetic matrix.
     escape = bench.calibrate("escape", frames=FRAMES, progress=True)
-    planted = bench.config.twin.registration.to_registration()  # nobody but a twin can tell
+    injected = bench.config.twin.registration.to_registration()  # true value, known for a twin only
 
-print(f"{escape.frames} frames, {escape.sky_seconds:.1f} s of them; delay {escape.response.delay:.2f} frames")
+print(f"{escape.frames} frames in {escape.sky_seconds:.1f} s; delay {escape.response.delay:.2f} frames")
 
-# The DO-CRIME matrix that ESCAPE started from is kept, with a standard error for every element.
+# The result includes the DO-CRIME matrix, with a standard error for every element.
 docrime = replace(escape, matrix=escape.measured, registration=None)
 snr = docrime.matrix.snr()
-print(f"DO-CRIME, signal-to-noise ratio per mode: least {snr.min():.1f}, median {np.median(snr):.1f}")
+print(f"DO-CRIME, signal-to-noise ratio per mode: minimum {snr.min():.1f}, median {np.median(snr):.1f}")
 
-# Compared over the sub-apertures that both runs found lit. Moving spots answer a push less than
-# spots at rest, so the gains differ; the loop gain takes that up.
+# Comparison over the sub-apertures that are valid in both runs. The gains differ because turbulence reduces
+# the response of the spots; the loop gain compensates for this.
 for name, result in (("DO-CRIME", docrime), ("ESCAPE", escape)):
     difference = compare(push_pull, result)
     gain, agreement = np.median(difference.gain_ratio), np.median(difference.correlation)
     print(f"{name:>8} against push-pull: median gain {gain:.3f}, median correlation {agreement:.4f}")
 
 print(f"SPRINT {'converged' if escape.registration.converged else 'did NOT converge'}:")
-for name, found in escape.registration.measured().items():
-    truth = getattr(planted, name)
-    print(f"{name:>18}: {found.value:8.3f} ± {found.sigma:.3f} {found.unit} (planted {truth:g})")
+for name, estimate in escape.registration.measured().items():
+    true_value = getattr(injected, name)
+    print(f"{name:>18}: {estimate.value:8.3f} ± {estimate.sigma:.3f} {estimate.unit} (injected {true_value:g})")

@@ -1,4 +1,4 @@
-"""Calibrate without a source, save the matrix, close the loop with it, measure the Strehl ratio.
+"""Calibrate without a source, save the matrix, close the loop, and measure the Strehl ratio.
 
 Run it with: python examples/close_the_loop.py [im.fits]
 """
@@ -12,14 +12,14 @@ import escape_hw
 path = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(tempfile.mkdtemp()) / "im.fits"
 
 with escape_hw.open_system("razor-shwfs", seed=4) as bench:
-    found = bench.calibrate("escape", frames=1000, progress=True)
-    escape_hw.save_matrix(path, found)
+    result = bench.calibrate("escape", frames=1000, progress=True)
+    escape_hw.save_matrix(path, result)
 
-    # Another day, another script: the file carries grid, basis, errors and checksum.
+    # Another script can load the file; it contains geometry, basis, standard errors and a checksum.
     product = escape_hw.load_matrix(path, expect_system="razor-shwfs")
     print(f"{path.name}: {product.matrix.method}, {product.matrix.n_modes} modes")
 
-    model = bench.take_model_psf()  # flat mirror, no turbulence: Strehl 1 by definition
+    model = bench.take_model_psf()  # flat mirror without turbulence; Strehl ratio 1 by definition
     run = bench.close_loop(product, frames=1500, model_psf=model, progress=True)
 
 print(f"gain {run.gain}, leak {run.leak}: {'stable' if run.stable else 'DIVERGED'}")

@@ -1,4 +1,4 @@
-"""Set the camera of the wavefront sensor, grab frames, and keep them.
+"""Configure the camera of the wavefront sensor, record frames, and save them.
 
 Run it with: python examples/grab_frames.py [frames.npz]
 """
@@ -16,16 +16,16 @@ with escape_hw.open_system("razor-shwfs") as bench:
     camera = bench.wfs
     print(f"{camera.info.model}, serial {camera.info.serial}, simulated: {camera.info.simulated}")
 
-    # Ask for settings; what comes back is what the hardware really does.
+    # configure() returns the settings read back from the hardware.
     wanted = replace(camera.settings, exposure_s=1.0e-3, frame_rate_hz=400.0)
-    print(f"nearest possible: {camera.check(wanted)}")  # changes nothing
+    print(f"nearest achievable: {camera.check(wanted)}")  # changes nothing
     settings = camera.configure(wanted)
 
     frames = [camera.next_frame(timeout_s=1.0) for _ in range(N_FRAMES)]
     status = camera.status()
 
 cube = np.stack([frame.data for frame in frames])  # 16-bit counts (frames, rows, columns)
-index = np.array([frame.index for frame in frames])  # the device's own counter: it shows lost frames
+index = np.array([frame.index for frame in frames])  # frame counter of the device; gaps are lost frames
 arrived_s = np.array([frame.arrived_ns for frame in frames]) * 1e-9  # monotonic clock
 saturated = sum(frame.n_saturated for frame in frames)
 

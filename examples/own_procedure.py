@@ -1,7 +1,7 @@
-"""Write a procedure of your own, here one that asks over which range the sensor is linear.
+"""Write a procedure, here a measurement of the linear range of the sensor.
 
-A procedure is a generator: it moves hardware, yields its progress, and returns a result. Whoever
-drives it (a script, the command line, a window) gets progress bars and a safe Ctrl-C for nothing.
+A procedure is a generator that moves hardware, yields progress, and returns a result. The function that runs
+it shows progress and handles Ctrl-C.
 
 Run it with: python examples/own_procedure.py
 """
@@ -29,26 +29,26 @@ def linear_range(
     Returns
     -------
     ndarray, same shape as ``amplitudes``
-        1 where the sensor is linear.
+        1 in the linear range.
     """
-    setup = yield from escape_hw.find_sensor(bench, frames=20)  # procedures can use procedures
+    setup = yield from escape_hw.find_sensor(bench, frames=20)  # a procedure can call other procedures
     slopes_of = bench.slopes_of(setup.grid)
     shape = build_modal_basis(bench)[:, mode]
     report = escape_hw.Reporter("linear range", len(amplitudes), "amplitude")
     columns = []
     try:
         for done, amplitude in enumerate(amplitudes, start=1):
-            push, pull = (look(bench, slopes_of, sign * amplitude * shape, frames) for sign in (1, -1))
+            push, pull = (mean_slopes(bench, slopes_of, sign * amplitude * shape, frames) for sign in (1, -1))
             columns.append((push - pull) / (2 * amplitude))
-            yield report(done, amplitude=amplitude)  # Ctrl-C arrives here, never inside a transfer
+            yield report(done, amplitude=amplitude)  # Ctrl-C takes effect here, never inside a transfer
     finally:
-        bench.dm.flatten()  # whatever happened
+        bench.dm.flatten()  # also after an abort or an error
     reference = columns[0]
     return np.array([reference @ column / (reference @ reference) for column in columns])
 
 
-def look(bench: escape_hw.System, slopes_of, command: np.ndarray, frames: int) -> np.ndarray:
-    """Mean slopes with this shape on the mirror, once it has settled."""
+def mean_slopes(bench: escape_hw.System, slopes_of, command: np.ndarray, frames: int) -> np.ndarray:
+    """Mean slopes with this shape on the mirror, after settling."""
     bench.dm.send(command)
     for _ in range(4):
         bench.wfs.next_frame()

@@ -17,7 +17,8 @@ from running import ESCAPE
 from escape_hw.errors import ServerGone
 from escape_hw.remote.client import Connection, connect
 from escape_hw.remote.state import Phase
-from escape_hw.streams.segments import process_start, segments
+from escape_hw.streams.segments import segments
+from escape_hw.supervision import process_start
 
 #: Longest wait for something that takes seconds on an idle machine.
 PATIENCE_S = 120.0
@@ -102,7 +103,7 @@ class Served:
         return self._process.wait(PATIENCE_S)
 
     def engines(self) -> list[int]:
-        """Engines and guardians that live, of this server or of one before in the same folder."""
+        """Engines and fail-safe processes that run, of this server or of one before in the same folder."""
         mine = f"XDG_RUNTIME_DIR={self.environment['XDG_RUNTIME_DIR']}".encode()
         found = []
         for entry in Path("/proc").iterdir():
@@ -130,7 +131,7 @@ def serving(*words: object, folder: Path, more: Mapping[str, str] | None = None)
             os.environ.pop("XDG_RUNTIME_DIR", None)
         else:
             os.environ["XDG_RUNTIME_DIR"] = before
-    wait_for(lambda: not served.engines(), "engine and guardian end")
+    wait_for(lambda: not served.engines(), "engine and fail-safe process end")
     assert not [one for one in segments(SYSTEM) if not one.alive]
 
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.config.loader import load_system
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, actuator_positions, pitch_on_pupil
 from escape_sim.models.pyramid_turbulence import unit_screens
-from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import pupil_geometry
 
 #: Wavelength in metres at which the Fried parameter of open-air turbulence is given.
 _FRIED_M = 5e-7

@@ -85,7 +85,7 @@ def main() -> None:
             seen.append((pair["with"], pair["without"]))
             words = ", ".join(f"{name} {p50:.0f} / {p99:.0f} us" for name, (p50, p99) in pair.items())
             print(f"turn {number + 1}: {words}", flush=True)
-        lost, frames = bench.state.rates.lost, bench.state.rates.frames
+        lost, frames = bench.state.rates.lost_frames, bench.state.rates.frames
         shown.kill()
         shown.wait()
         bench.open_loop()

@@ -42,8 +42,8 @@ def prepare_entries() -> list[dict[str, Sample]]:
     sets = []
     for seed in range(N_ENTRIES):
         source.push_all(seed)
-        rng, valid = np.random.default_rng(seed), mask_from_rows(source.places.valid)
-        matrix = rng.normal(0, 1, (2 * int(valid.sum()), source.places.n_modes)).astype(np.float32)
+        rng, valid = np.random.default_rng(seed), mask_from_rows(source.geometry_data.valid)
+        matrix = rng.normal(0, 1, (2 * int(valid.sum()), source.geometry_data.n_modes)).astype(np.float32)
         source.push("valid", valid.astype(np.uint8))
         source.push("matrix", matrix, stage="DO-CRIME")
         source.push("matrix_sigma", np.full_like(matrix, 0.3))
@@ -57,7 +57,7 @@ def measure(name: str, size: tuple[int, int], sets: list[dict[str, Sample]]) -> 
     session, source = Session(), ScriptedSource()
     window = MainWindow(session, Settings(workspace=name))
     window.resize(*size)
-    session.use(source, ScriptedControl())
+    session.set_source(source, ScriptedControl())
     window.show()
     qt.processEvents()
     _push(source, sets[0])

@@ -103,10 +103,10 @@ def _pyramid(n: int) -> tuple[str, ...]:
 def measure(system: str, overrides: tuple[str, ...], who: str, seconds: float) -> dict[str, float]:
     """Median time per frame, set-up time and peak memory, in this process."""
     from escape_benchmarks.optics.frame_rate import oopao_frame, twin_frame
-    from escape_hw.api.benchmark import single_thread
+    from escape_hw.api.concurrency import limit_to_one_thread
 
     start = time.perf_counter()
-    with single_thread():
+    with limit_to_one_thread():
         if who == "ours":
             call = twin_frame(load_system(system, overrides=overrides))
         elif system == "razor-shwfs":

@@ -26,9 +26,9 @@ from escape_hw.runtime.session.system import System
 
 #: What is tried, by name; the first is the default that times are given in units of.
 VARIANTS: dict[str, dict[str, Any]] = {
-    "effects": {},
-    "light": {"solver": "light"},
-    "frozen": {"solver": "frozen"},
+    "mixed-effects": {},
+    "registration-only": {"solver": "registration-only"},
+    "frozen-derivatives": {"solver": "frozen-derivatives"},
     "batches, rate 1": {"solver": "batches"},
     "batches, rate 0.2": {"solver": "batches", "learning_rate": 0.2, "max_iterations": 60},
     "diagonal": {"solver": "diagonal"},
@@ -45,8 +45,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 BAD_SUBAPERTURE_VARIANTS: dict[str, dict[str, Any]] = {
     "bad sub-apertures: effects": {},
     "bad sub-apertures: effects, Huber": {"loss": "huber"},
-    "bad sub-apertures: light": {"solver": "light"},
-    "bad sub-apertures: light, Huber": {"solver": "light", "loss": "huber"},
+    "bad sub-apertures: light": {"solver": "registration-only"},
+    "bad sub-apertures: light, Huber": {"solver": "registration-only", "loss": "huber"},
 }
 #: Share of sub-apertures that are spoiled, by taking the slopes of another one.
 _BAD = 0.03

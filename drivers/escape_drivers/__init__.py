@@ -1,4 +1,4 @@
-"""Drivers of real hardware, found by the core through the ``escape.devices`` entry points.
+"""Drivers of real hardware, found through the entry points ``escape.devices``.
 
-Vendor libraries are loaded when a device is opened, never before.
+Vendor libraries are loaded when a device is opened. Twins, emulators and stand-ins are in ``escape_sim``.
 """

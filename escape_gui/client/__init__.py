@@ -1,1 +1,1 @@
-"""Where the window's data come from and where its requests go: session, server connection, product library, preconditions of requests. No widgets."""
+"""Data source and requests of the window: session, connection, product library, preconditions. No widgets."""

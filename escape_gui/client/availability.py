@@ -1,4 +1,4 @@
-"""What decides whether an action is possible now, and the words for why it is not."""
+"""Preconditions of requests: whether an action is available, and the reason if it is not."""
 
 from __future__ import annotations
 
@@ -10,56 +10,51 @@ from escape_hw.remote.state import Phase, State
 
 @dataclass(frozen=True, slots=True)
 class RequestContext:
-    """What decides whether an action is possible now.
+    """Facts that decide whether an action is available."""
 
-    Parameters
-    ----------
-    state
-        Newest state.
-    connected
-        The other side was heard of lately.
-    live
-        Requests can be made at all: no replay.
-    may_write
-        The lease is ours.
-    """
-
+    #: Newest state.
     state: State
+    #: The server responded recently.
     connected: bool
+    #: The source is a server, not a recorded run.
     live: bool
+    #: This client holds the lease.
     may_write: bool
 
 
-#: What stands for a number that nobody knows.
+#: Shown instead of a number that is not measured.
 UNKNOWN_VALUE = "–"
+#: Returns the reason why an action is unavailable; empty if it is available.
+UnavailableReason = Callable[[RequestContext], str]
+
+
+def tooltip(tip: str, reason: str) -> str:
+    """Tooltip of a control, with the reason if it is unavailable."""
+    return f"{tip} Not now: {reason}." if reason else tip
 
 
 def is_measured(state: State) -> bool:
-    """Whether a server measures the state's numbers; a recording, or no word yet, leaves them at zero."""
+    """Whether a server measures the numbers of a state; without one, or in a recording, they are zero."""
     return state.server_pid != 0
 
 
 def has_frames(state: State) -> bool:
-    """Whether frames have come, so that what is said of the light is true."""
+    """Whether frames have arrived, so that the illumination is known."""
     return is_measured(state) and state.rates.frames > 0
 
 
-#: Says why an action is impossible now; empty when it is possible.
-UnavailableReason = Callable[[RequestContext], str]
-
-
 def always_available(_: RequestContext) -> str:
-    """Nothing is in the way."""
+    """Available in every context."""
     return ""
 
 
 def reason_no_request(now: RequestContext) -> str:
-    """Why no request can be made at all."""
+    """Why no request can be sent."""
     if not now.connected and not is_measured(now.state):
-        return "no server was found yet; start one with 'escape serve SYSTEM'"
+        return "no server found; start one with 'escape serve SYSTEM'"
     if not now.live:
-        return "a finished run is replayed, there is no server to ask"
-    return "" if now.connected else "the server does not answer"
+        return "replay of a recorded run: no server"
+    return "" if now.connected else "server not responding"
 
 
 def reason_no_write(now: RequestContext) -> str:
@@ -74,12 +69,12 @@ def reason_no_write(now: RequestContext) -> str:
 
 def reason_no_abort(now: RequestContext) -> str:
     """Why there is nothing to abort."""
-    return reason_no_request(now) or ("" if now.state.procedure else "no procedure runs")
+    return reason_no_request(now) or ("" if now.state.active_run else "no procedure is running")
 
 
 def reason_no_pause(now: RequestContext) -> str:
-    """Why the procedure cannot be halted or continued."""
-    return reason_no_write(now) or ("" if now.state.procedure else "no procedure runs")
+    """Why the procedure cannot be paused or resumed."""
+    return reason_no_write(now) or ("" if now.state.active_run else "no procedure is running")
 
 
 def reason_no_take_control(now: RequestContext) -> str:
@@ -88,10 +83,10 @@ def reason_no_take_control(now: RequestContext) -> str:
 
 
 def reason_no_release(now: RequestContext) -> str:
-    """Why control cannot be given back."""
+    """Why control cannot be released."""
     return reason_no_request(now) or ("" if now.may_write else "you do not have control")
 
 
 def reason_no_clear_fault(now: RequestContext) -> str:
     """Why there is no fault to clear."""
-    return reason_no_write(now) or ("" if now.state.phase is Phase.FAULT else "there is no fault")
+    return reason_no_write(now) or ("" if now.state.phase is Phase.FAULT else "no active fault")

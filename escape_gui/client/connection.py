@@ -1,4 +1,4 @@
-"""Connection to a server with background fetching and reconnection, and a server process started by the window."""
+"""Connection to a server that fetches and reconnects in a thread, and a server started by the window."""
 
 from __future__ import annotations
 
@@ -22,24 +22,21 @@ from escape_hw.remote.source import Sample
 from escape_hw.remote.state import Arguments, Geometry, LogLine, ProcedureEntry, ProcedurePlan, State
 
 log = logging.getLogger(__name__)
-#: Pauses of the thread: between looks at a server on this machine or another one, between attempts to
-#: find one, and how long a stream is fetched that no panel asks for any more; seconds.
+#: Period of the thread for a local and a remote server, interval between connection attempts, and time for
+#: which a stream is fetched after the last request for it; seconds.
 _LOCAL_PERIOD_S, _REMOTE_PERIOD_S, _RETRY_S, _STREAM_EXPIRY_S = 0.2, 0.02, 1.0, 1.0
-#: A connection that was silent for so long is made anew, seconds.
+#: A connection without a message for this time is replaced, seconds.
 _RECONNECT_AFTER_S = 5.0
-#: A wait that was longer than asked by so much was a halt of this process, seconds.
+#: A wait that exceeds the requested time by this much means that this process was suspended, seconds.
 _SUSPEND_DETECT_S = 2.0
 
 
 class LiveSource:
-    """A connection whose every word is at hand; satisfies :class:`~escape_hw.remote.source.Source`.
+    """A server as non-blocking :class:`~escape_hw.remote.source.DataSource`.
 
-    Parameters
-    ----------
-    connection
-        To the server.
-    here
-        The server runs on this machine, and its streams lie in shared memory.
+    Slow requests (geometry, procedures, streams of a remote server) are made by :meth:`fetch` in a thread;
+    the other methods return the last result.
+    The streams of a local server are read from shared memory (``is_local``).
     """
 
     def __init__(self, connection: Connection, *, is_local: bool) -> None:
@@ -51,16 +48,14 @@ class LiveSource:
 
     @property
     def connected(self) -> bool:
-        """Whether the server was heard of lately."""
         return self.connection.connected
 
     @property
     def state(self) -> State:
-        """The newest state."""
         return self.connection.state
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
-        """The newest entry of a stream; from another machine, the newest that has arrived."""
+        """Newest entry of a stream unless its index is ``after``; for a remote server, the last fetched."""
         if self.is_local:
             return self.connection.latest(stream, after)
         self._requested_s[stream] = time.monotonic()
@@ -68,33 +63,32 @@ class LiveSource:
         return None if sample is None or sample.index == after else sample
 
     def geometry(self) -> Geometry:
-        """Where things stand; the same object as long as nothing has changed."""
+        """Geometry; the same object until it changes."""
         return self._geometry
 
     def log_after(self, number: int) -> Sequence[LogLine]:
-        """Log lines after a number."""
         return self.connection.log_after(number)
 
     def procedures(self) -> Sequence[ProcedureEntry]:
-        """What can be started, once that has arrived."""
+        """Available procedures; empty until they were fetched."""
         return self._procedures
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
-        """Ask the server; waits for the answer."""
-        return self.connection.check(procedure, arguments)
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+        """Check the arguments of a procedure; blocks until the server answers."""
+        return self.connection.plan(procedure, arguments)
 
     def fetch(self) -> None:
-        """Fetch what takes time; called by the thread only."""
-        places = self.connection.geometry()
-        if places != self._geometry:
-            self._geometry = places
+        """Make the slow requests; called by the thread of :class:`ServerAttachment`."""
+        geometry = self.connection.geometry()
+        if geometry != self._geometry:
+            self._geometry = geometry
         if not self._procedures:
             self._procedures = tuple(self.connection.procedures())
         if self.is_local:
             return
         now = time.monotonic()
-        for stream, asked in list(self._requested_s.items()):
-            if now - asked > _STREAM_EXPIRY_S:
+        for stream, requested_s in list(self._requested_s.items()):
+            if now - requested_s > _STREAM_EXPIRY_S:
                 del self._requested_s[stream]
                 continue
             known = self._fetched.get(stream)
@@ -104,17 +98,14 @@ class LiveSource:
 
 
 class ServerAttachment(QObject):
-    """Keeps a window attached to a server, in a thread of its own.
+    """Connects to a server, and reconnects when it is lost, in a thread.
 
-    Parameters
-    ----------
-    address
-        Name of a system served on this machine, or ``tcp://host:port``.
+    The address is the name of a system served on this computer, or ``tcp://host:port``.
     """
 
-    #: A new connection, as :class:`LiveSource`; after the first one the server had been away.
+    #: A new connection, as :class:`LiveSource`.
     attached = Signal(object)
-    #: Why there is none; told once for each reason.
+    #: Why the connection failed; emitted when the reason changes.
     connection_failed = Signal(str)
 
     def __init__(self, address: str) -> None:
@@ -129,15 +120,13 @@ class ServerAttachment(QObject):
         self._thread = threading.Thread(target=self._run_loop, name="escape-gui-attachment", daemon=True)
 
     def start(self) -> None:
-        """Begin to look for the server."""
         self._thread.start()
 
     def discard(self, old: LiveSource) -> None:
-        """Close a connection that no panel looks at any more."""
         self._jobs.put(old.connection.close)
 
     def close(self) -> None:
-        """Hang up; nobody may look at the source any more."""
+        """Stop the thread and disconnect; the source must not be used afterwards."""
         self._stop.set()
         self._jobs.put(lambda: None)
         if self._thread.is_alive():
@@ -150,7 +139,7 @@ class ServerAttachment(QObject):
             except EscapeError as error:
                 self._report_failure(str(error))
             except Exception:
-                log.exception("looking after the server failed")
+                log.exception("connection check failed")
             self._wait_and_run_jobs()
         if self._live is not None:
             self._live.connection.close()
@@ -170,7 +159,7 @@ class ServerAttachment(QObject):
         self.attached.emit(self._live)
 
     def _same_server(self) -> bool:
-        """Whether the server that fell silent is still the one to be found under the address."""
+        """Whether the process that serves the system is still the one of this connection."""
         if not self._is_local or self._live is None:
             return True
         listing = find_server(self.address)
@@ -182,7 +171,7 @@ class ServerAttachment(QObject):
             self.connection_failed.emit(reason)
 
     def _wait_and_run_jobs(self) -> None:
-        """Wait for the next look; close what is to be closed meanwhile."""
+        """Wait for one period, or run a job that arrives meanwhile."""
         pause = _RETRY_S if self._live is None else _LOCAL_PERIOD_S if self._is_local else _REMOTE_PERIOD_S
         began = time.monotonic()
         try:
@@ -190,7 +179,7 @@ class ServerAttachment(QObject):
         except queue.Empty:
             now = time.monotonic()
             if now - began > pause + _SUSPEND_DETECT_S:
-                # This process slept, not the server: what has come meanwhile is still to be read.
+                # This process was suspended, not the server: unread messages are waiting.
                 self._last_heard_s = now
             return
         try:
@@ -200,26 +189,21 @@ class ServerAttachment(QObject):
 
 
 _SERVE_COMMAND = (sys.executable, "-c", "from escape_hw.cli import main; main()", "serve")
-#: Seconds that a server may take to make its mirror flat and end.
+#: Time for a server to flatten the mirror and exit, seconds.
 _EXIT_TIMEOUT_S = 20.0
 _MAX_ERROR_LINES = 6
 
 
 class LocalServer:
-    """A process that serves a system on its twin.
+    """A process that serves a system (name or file) with simulated devices.
 
-    It lives in a session of its own: killing the window does not disturb it, and the next window for the
-    same system finds it again.
-
-    Parameters
-    ----------
-    system
-        Name or file of the configuration.
+    It runs in its own process session: it survives if the window is killed, and the next window for the
+    system attaches to it.
     """
 
     def __init__(self, system: str) -> None:
-        # Open as long as the process lives, see :meth:`terminate`.
-        self._stderr: IO[str] = tempfile.TemporaryFile("w+", encoding="utf-8")
+        # Closed by :meth:`terminate`, after the process has ended.
+        self._stderr: IO[str] = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115
         self.process = subprocess.Popen(
             [*_SERVE_COMMAND, system, "--mode", "sim", "--quiet"],
             stdin=subprocess.DEVNULL,
@@ -230,16 +214,15 @@ class LocalServer:
 
     @property
     def exit_message(self) -> str:
-        """The last it said before it ended by itself; empty while it runs."""
+        """Last lines on standard error of a process that has ended; empty while it runs."""
         if self.process.poll() is None:
             return ""
         self._stderr.seek(0)
-        return (
-            "\n".join(self._stderr.read().strip().splitlines()[-_MAX_ERROR_LINES:]) or "the server has ended"
-        )
+        lines = self._stderr.read().strip().splitlines()[-_MAX_ERROR_LINES:]
+        return "\n".join(lines) or f"server exited with code {self.process.returncode}"
 
     def terminate(self, connection: Connection | None) -> None:
-        """Ask it to make the mirror safe and end, then wait; without a connection it gets Ctrl-C."""
+        """Shut the server down, by a signal (SIGINT) if there is no connection, and wait for it."""
         if self.process.poll() is None:
             try:
                 if connection is None:
@@ -247,10 +230,14 @@ class LocalServer:
                 connection.acquire(take_over=True)
                 connection.shutdown()
             except EscapeError as error:
-                log.info("the server is interrupted instead of asked to end: %s", error)
+                log.info("shutdown request failed (%s); sending SIGINT to the server", error)
                 self.process.send_signal(signal.SIGINT)
             try:
                 self.process.wait(_EXIT_TIMEOUT_S)
             except subprocess.TimeoutExpired:
-                log.warning("server %d has not ended; it is left alone", self.process.pid)
+                log.warning(
+                    "server %d did not exit within %g s; leaving it running",
+                    self.process.pid,
+                    _EXIT_TIMEOUT_S,
+                )
         self._stderr.close()

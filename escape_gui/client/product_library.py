@@ -1,4 +1,4 @@
-"""Products that a server or a recording names, read from disk beside the window's own thread."""
+"""Products listed by a server or a recorded run, read from disk in a worker thread."""
 
 from __future__ import annotations
 
@@ -20,43 +20,25 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Order of methods in every list: measured with a source, measured without, computed.
+#: Order of methods in lists: measured with a calibration source, measured without one, computed.
 _METHOD_ORDER = (
-    "push-pull",
-    "push-pull-fast",
-    "modulated",
-    "docrime",
-    "docrime-whitened",
-    "docrime-closed",
-    "escape",
-)
+    "push-pull", "push-pull-fast", "modulated", "docrime", "docrime-whitened", "docrime-closed", "escape",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedProducts:
-    """What was read so far; each time something is added it is a new one with a higher number.
+    """Products read so far; replaced by a new object at every change."""
 
-    Parameters
-    ----------
-    number
-        Counts up with every change.
-    matrices, gains
-        By label, baselines before what was measured without a source, and that before what was computed.
-    troubles
-        What could not be read, and why.
-    """
-
-    number: int = 0
+    #: By label; matrices in the order of ``_METHOD_ORDER``.
     matrices: dict[str, InteractionMatrix] = field(default_factory=dict)
     gains: dict[str, GainCurve] = field(default_factory=dict)
+    #: Reason by name of a product that could not be read.
     errors: dict[str, str] = field(default_factory=dict)
 
 
 class ProductLibrary:
-    """Reads products once, in a thread of its own, and shows what it has as a :class:`LoadedProducts`.
-
-    ``close`` ends the thread.
-    """
+    """Reads each product once in a worker thread and provides the results as :class:`LoadedProducts`."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="escape-library")
@@ -66,7 +48,7 @@ class ProductLibrary:
         self._lock = threading.Lock()
 
     def request(self, products: Iterable[ProductEntry]) -> None:
-        """Read these, and forget others; returns at once."""
+        """Start to read these matrices and gains, and drop others; returns at once."""
         known = {_key(one): one for one in products if one.kind in ("matrix", "gains")}
         with self._lock:
             for key in [key for key in self._futures if key not in known]:
@@ -77,27 +59,25 @@ class ProductLibrary:
 
     @property
     def is_reading(self) -> bool:
-        """Whether something is still being read."""
         with self._lock:
             return any(not one.done() for one in self._futures.values())
 
     @property
     def loaded(self) -> LoadedProducts:
-        """Everything that has been read by now."""
+        """The products read so far; the same object until another one is ready."""
         with self._lock:
             ready = {key: one for key, one in self._futures.items() if one.done()}
             if tuple(ready) != self._collected_keys:
                 self._collected_keys = tuple(ready)
-                self._loaded = _collect(self._loaded.number + 1, ready)
+                self._loaded = _collect(ready)
             return self._loaded
 
     def close(self) -> None:
-        """End the thread."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _key(product: ProductEntry) -> tuple[str, str, int]:
-    """A product by name, place and age: a file written again is another one."""
+    """Name, path and modification time of a product: a file that is written again is read again."""
     try:
         age = Path(product.path).stat().st_mtime_ns
     except OSError:
@@ -106,13 +86,13 @@ def _key(product: ProductEntry) -> tuple[str, str, int]:
 
 
 def _read(path: Path) -> RunContent:
-    # Reading FITS takes half a second to load; a window is there before.
+    # Imported here: it takes half a second, and the window appears before.
     from escape_hw.report.content import read_product
 
     return read_product(path)
 
 
-def _collect(number: int, ready: dict[tuple[str, str, int], Future[RunContent]]) -> LoadedProducts:
+def _collect(ready: dict[tuple[str, str, int], Future[RunContent]]) -> LoadedProducts:
     matrices: dict[str, InteractionMatrix] = {}
     gains: dict[str, GainCurve] = {}
     errors: dict[str, str] = {}
@@ -122,7 +102,7 @@ def _collect(number: int, ready: dict[tuple[str, str, int], Future[RunContent]])
             errors[name] = str(error)
             continue
         if error is not None:
-            log.error("%s cannot be shown", path, exc_info=error)
+            log.error("cannot read %s", path, exc_info=error)
             errors[name] = f"{path}: {error}"
             continue
         run = future.result()
@@ -133,24 +113,19 @@ def _collect(number: int, ready: dict[tuple[str, str, int], Future[RunContent]])
                 continue
             gains[label] = GainCurve.of(label, result.gains, [one.gains.best for one in result.rounds])
             gains |= {other: GainCurve.of(other, one) for other, one in result.beside.items()}
-    ordered = dict(sorted(matrices.items(), key=lambda item: _method_rank(item[1])))
-    return LoadedProducts(number, ordered, gains, errors)
+    rank = {method: k for k, method in enumerate(_METHOD_ORDER)}
+    ordered = dict(sorted(matrices.items(), key=lambda item: rank.get(item[1].method, len(rank))))
+    return LoadedProducts(ordered, gains, errors)
 
 
 def _add_unique(
     matrices: dict[str, InteractionMatrix], label: str, name: str, matrix: InteractionMatrix
 ) -> None:
-    """Under its label, or under label and product when another matrix has that label already."""
-    taken = matrices.get(label)
-    if taken is not None and _is_same_matrix(taken, matrix):
+    """Add a matrix under its label, with the product's name appended if the label is in use.
+
+    The same matrix may be read twice: as a product, and inside a product that was computed from it.
+    """
+    other = matrices.get(label)
+    if other is not None and other.data.shape == matrix.data.shape and (other.data == matrix.data).all():
         return
-    matrices[label if taken is None else f"{label} ({name})"] = matrix
-
-
-def _is_same_matrix(one: InteractionMatrix, other: InteractionMatrix) -> bool:
-    """Whether it is one matrix twice: as its own product, and inside of what was computed from it."""
-    return one.data.shape == other.data.shape and bool((one.data == other.data).all())
-
-
-def _method_rank(matrix: InteractionMatrix) -> int:
-    return _METHOD_ORDER.index(matrix.method) if matrix.method in _METHOD_ORDER else len(_METHOD_ORDER)
+    matrices[label if other is None else f"{label} ({name})"] = matrix

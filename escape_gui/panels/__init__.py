@@ -16,19 +16,9 @@ from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.panels.psf import PsfPanel
 from escape_gui.panels.sprint import SprintPanel
 
-#: All panels, in the order in which the View menu and F6 go through them. A panel is added here and
-#: in :data:`escape_gui.window.workspaces.WORKSPACES`.
+#: All panels, in the order of the View menu and of F6. A new panel is added here and in
+#: :data:`escape_gui.window.workspaces.WORKSPACES`.
 PANELS: tuple[type[Panel], ...] = (
-    DevicesPanel,
-    CameraPanel,
-    MirrorPanel,
-    ProcedurePanel,
-    ModesPanel,
-    SprintPanel,
-    GainsPanel,
-    LoopPanel,
-    PerformancePanel,
-    PsfPanel,
-    LatencyPanel,
-    LogPanel,
-)
+    DevicesPanel, CameraPanel, MirrorPanel, ProcedurePanel, ModesPanel, SprintPanel, GainsPanel, LoopPanel,
+    PerformancePanel, PsfPanel, LatencyPanel, LogPanel,
+)  # fmt: skip

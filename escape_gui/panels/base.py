@@ -1,4 +1,4 @@
-"""What all panels have in common."""
+"""Base class of the panels."""
 
 from __future__ import annotations
 
@@ -18,78 +18,56 @@ from escape_hw.remote.state import DeviceHealth, Phase, State
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Context:
-    """What a panel works with beside its data.
-
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
-    session
-        Requests go through ``session.requests``, which is ``None`` in replay.
-    """
+    """Theme and session of a window, shared by its panels."""
 
     theme: Theme
     session: Session
 
 
 class _PanelStack(QStackedLayout):
-    """Content, or the words that stand for it.
+    """Content or placeholder of a panel.
 
-    Where a line wraps, a scroll area would give all that it would like and scroll, though it could do
-    with less.
+    Ignores the preferred height of wrapped text: the scroll area around the panel would scroll to provide
+    it, although the minimum height is enough.
     """
 
     def hasHeightForWidth(self) -> bool:
-        """The least height counts."""
         return False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportArray:
-    """An array that a panel shows, for saving.
+    """An array that a panel shows, for export."""
 
-    Parameters
-    ----------
-    name
-        One word; becomes the extension's name and part of a file's.
-    data
-        One or two dimensions.
-    unit
-        Unit of the values.
-    columns
-        Headings, one for each column of a table; empty for pictures.
-    """
-
+    #: One word; name of the FITS extension and part of the file name.
     name: str
+    #: One or two dimensions.
     data: NDArray[Any]
+    #: Unit of the values.
     unit: str = ""
+    #: Headings of the columns of a table; empty for images.
     columns: tuple[str, ...] = ()
 
 
 class Panel(QWidget):
-    """One dock's content. The window's timer calls :meth:`refresh_from`, only while the panel can be seen.
+    """Content of a dock. The window's timer calls :meth:`refresh_from` while the panel is visible.
 
-    A subclass sets the class attributes, puts its widgets into :attr:`body` and overrides
+    A subclass sets the class attributes, adds its widgets to :attr:`body` and overrides
     :meth:`on_state`, :meth:`on_sample`, :meth:`clear` and :meth:`export_arrays`.
-
-    Parameters
-    ----------
-    context
-        Theme and session.
     """
 
-    #: One lower-case word: the dock's name, the help page's, the part of a file name.
+    #: One lower-case word: name of the dock, of the help page and of exported files.
     name: ClassVar[str]
     title: ClassVar[str]
-    #: What it shows and what to do with it, two or three sentences.
+    #: Two or three sentences on content and use.
     help: ClassVar[str]
-    #: Streams it reads; only entries not yet seen are handed on.
+    #: Streams to read; only new entries are passed to :meth:`on_sample`.
     streams: ClassVar[tuple[str, ...]] = ()
-    #: How often it looks.
+    #: Refresh rate.
     rate_hz: ClassVar[float] = 5.0
-    #: What stands in it before there is anything to show: why, and what to do next.
+    #: Text shown before there are data: the reason, and what to do.
     placeholder: ClassVar[str] = ""
-    #: Without a new entry for so long the data are stale; ``None``: they have no period.
+    #: Time without a new entry after which the data are stale; ``None``: never.
     stale_after_s: ClassVar[float | None] = None
 
     def __init__(self, context: Context) -> None:
@@ -99,31 +77,33 @@ class Panel(QWidget):
         self.setAccessibleName(self.title)
         self.setAccessibleDescription(self.help)
         self.setAttribute(Qt.WidgetAttribute.WA_StyledBackground)
-        #: The subclass's widgets go in here.
+        #: Layout for the widgets of the subclass.
         self.body = QVBoxLayout()
         self.body.setContentsMargins(8, 8, 8, 8)
         self.body.setSpacing(8)
         self._stack = _PanelStack(self)
-        holder = QWidget()
-        holder.setLayout(self.body)
+        content = QWidget()
+        content.setLayout(self.body)
         self._placeholder_label = QLabel(self.placeholder)
         self._placeholder_label.setObjectName("empty")
         self._placeholder_label.setWordWrap(True)
         self._placeholder_label.setAlignment(Qt.AlignmentFlag.AlignCenter)
         self._placeholder_label.setContentsMargins(24, 8, 24, 8)
-        self._stack.addWidget(holder)
+        self._stack.addWidget(content)
         self._stack.addWidget(self._placeholder_label)
         self._last_index: dict[str, int] = {}
         self._state_serial = self._engine_pid = -1
         self._last_sample_s = 0.0
         self.health = DeviceHealth.STALE
+        #: Set by subclasses: :meth:`redraw` is called at the end of the refresh.
+        self.dirty = False
         self.show_placeholder(bool(self.placeholder))
         context.theme.changed.connect(self.apply_theme)
         context.session.changed.connect(self.reset)
 
     # ------------------------------------------------------------ called by the window
     def refresh_from(self, source: DataSource) -> None:
-        """Take what is new; costs next to nothing when nothing is."""
+        """Process a new state and new entries of the streams."""
         state = source.state
         if state.engine_pid != self._engine_pid:
             self.reset()
@@ -139,6 +119,9 @@ class Panel(QWidget):
                 self.show_placeholder(False)
                 self.on_sample(stream, sample)
         self.tick(source)
+        if self.dirty:
+            self.dirty = False
+            self.redraw()
         self.health = self._assess_health(source, state)
 
     def _assess_health(self, source: DataSource, state: State) -> DeviceHealth:
@@ -153,7 +136,7 @@ class Panel(QWidget):
         return DeviceHealth.OK
 
     def reset(self) -> None:
-        """Forget what was seen: another engine counts from the beginning."""
+        """Discard all data: the source or its engine was replaced."""
         self._last_index.clear()
         self._state_serial = self._engine_pid = -1
         self._last_sample_s = 0.0
@@ -161,7 +144,7 @@ class Panel(QWidget):
         self.show_placeholder(bool(self.placeholder))
 
     def show_placeholder(self, placeholder: bool, why: str | None = None) -> None:
-        """Show the note of what to do next (``why`` instead of :attr:`placeholder`), or the content."""
+        """Show the placeholder (``why`` replaces its text) or the content."""
         if why is not None:
             self._placeholder_label.setText(why)
         elif placeholder:
@@ -170,25 +153,28 @@ class Panel(QWidget):
 
     @property
     def shows_placeholder(self) -> bool:
-        """Whether the note is shown instead of the content."""
+        """Whether the placeholder is shown."""
         return self._stack.currentIndex() == 1
 
     # ------------------------------------------------------------ for subclasses
     def on_state(self, state: State) -> None:
-        """The state has changed."""
+        """Process a new state."""
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """A stream has a new entry."""
+        """Process a new entry of a stream."""
 
     def tick(self, source: DataSource) -> None:
-        """Once per pull, after state and samples: for what is neither, such as the log."""
+        """Process everything else, such as geometry and log; called at each refresh, after the samples."""
+
+    def redraw(self) -> None:
+        """Draw data that have changed, see :attr:`dirty`."""
 
     def clear(self) -> None:
-        """Drop what belongs to the old source."""
+        """Discard the data of the previous source."""
 
     def apply_theme(self) -> None:
-        """Colours or fonts have changed."""
+        """Update colours and fonts."""
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """The arrays on the screen, for CSV and FITS; none: only PNG can be saved."""
+        """Arrays for CSV and FITS; empty: only PNG can be exported."""
         return ()

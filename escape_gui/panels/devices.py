@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QFrame, QHBoxLayout, QLabel, QScrollArea, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QFrame, QLabel, QVBoxLayout, QWidget
 
 from escape_gui.panels.base import Context, Panel
-from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.window.dock import HEALTH_LEVELS
+from escape_gui.widgets.controls.status_indicator import HEALTH_LEVELS, StatusIndicator
+from escape_gui.widgets.layouts import column, row, scroll_area, text_label
 from escape_hw.remote.state import DeviceState, State
 
-#: What the keys in ``[devices]`` stand for.
+#: Titles of the keys of ``[devices]``.
 ROLES = {
     "dm": "Deformable mirror",
     "wfs": "Sensor camera",
@@ -20,18 +19,12 @@ ROLES = {
     "screen": "Turbulence",
     "modulator": "Modulator",
 }
-#: A space at which no line is broken.
 _NO_BREAK_SPACE = "\u00a0"
-#: Endings of the keys of facts, with the unit they mean and digits after the point.
+#: Unit and digits after the decimal point by suffix of a fact's key.
 _UNITS = {
-    "_c": ("°C", 1),
-    "_hz": ("Hz", 1),
-    "_us": ("µs", 0),
-    "_ms": ("ms", 2),
-    "_s": ("s", 3),
-    "_mm": ("mm", 2),
+    "_c": ("°C", 1), "_hz": ("Hz", 1), "_us": ("µs", 0), "_ms": ("ms", 2), "_s": ("s", 3), "_mm": ("mm", 2),
     "_um": ("µm", 2),
-}
+}  # fmt: skip
 
 
 class DevicesPanel(Panel):
@@ -40,8 +33,8 @@ class DevicesPanel(Panel):
     name: ClassVar[str] = "devices"
     title: ClassVar[str] = "Devices"
     help: ClassVar[str] = (
-        "Every device of the system with its condition: ok, stale (silent for longer than its period), "
-        "lost, fault, closed. What it says of itself stands below."
+        "The devices of the system with their health: ok, stale (no data for longer than the period of the "
+        "device), lost, fault, closed. Model, serial number and readings are below each name."
     )
     placeholder: ClassVar[str] = (
         "No devices yet.\nStart a server with 'escape serve SYSTEM', or wait until it is ready."
@@ -50,37 +43,28 @@ class DevicesPanel(Panel):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self._rows: dict[str, _DeviceRow] = {}
-        self._column = QVBoxLayout()
-        self._column.setContentsMargins(0, 0, 0, 0)
-        self._column.setSpacing(4)
-        self._column.addStretch()
-        holder = QWidget()
-        holder.setLayout(self._column)
-        area = QScrollArea()
-        area.setWidgetResizable(True)
-        area.setFrameShape(QFrame.Shape.NoFrame)
-        area.setWidget(holder)
+        content = QWidget()
+        self._column: QVBoxLayout = column(None, parent=content, spacing=4)
+        area = scroll_area(content)
         area.setAccessibleName("List of devices")
         self.body.addWidget(area)
 
     def on_state(self, state: State) -> None:
-        """Bring the rows up to date."""
         names = [device.name for device in state.devices]
         if names != list(self._rows):
             self.clear()
-            for device in state.devices:
-                row = self._rows[device.name] = _DeviceRow(self.context)
-                self._column.insertWidget(self._column.count() - 1, row)
+            for name in names:
+                self._rows[name] = _DeviceRow(self.context)
+                self._column.insertWidget(self._column.count() - 1, self._rows[name])
         for device in state.devices:
             self._rows[device.name].show_device(device)
         self.show_placeholder(not names)
 
     def clear(self) -> None:
-        """Remove the rows."""
-        for row in self._rows.values():
-            self._column.removeWidget(row)
-            row.hide()
-            row.deleteLater()
+        for one in self._rows.values():
+            self._column.removeWidget(one)
+            one.hide()
+            one.deleteLater()
         self._rows.clear()
 
 
@@ -88,33 +72,21 @@ class _DeviceRow(QFrame):
     def __init__(self, context: Context) -> None:
         super().__init__()
         self._theme = context.theme
-        self._pill = StatusIndicator(context.theme, "closed")
-        self._name, self._model, self._facts = QLabel(), QLabel(), QLabel()
+        self._indicator = StatusIndicator(context.theme, "closed")
+        self._name, self._model, self._facts = QLabel(), text_label(), text_label()
         self._model.setObjectName("caption")
-        for label in (self._facts, self._model):
-            label.setWordWrap(True)
-            label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        head = QHBoxLayout()
-        head.addWidget(self._name)
-        head.addStretch()
-        head.addWidget(self._pill)
-        column = QVBoxLayout(self)
-        column.setContentsMargins(4, 4, 4, 4)
-        column.setSpacing(0)
-        column.addLayout(head)
-        column.addWidget(self._model)
-        column.addWidget(self._facts)
+        head = row(self._name, None, self._indicator)
+        column(head, self._model, self._facts, parent=self, spacing=0).setContentsMargins(4, 4, 4, 4)
         context.theme.changed.connect(self._apply_theme)
         self._apply_theme()
 
     def show_device(self, device: DeviceState) -> None:
-        """Bring the row up to date."""
         role = ROLES.get(device.name, device.name)
         self._name.setText(role)
-        self._pill.set_status(HEALTH_LEVELS.get(device.health, Level.NEUTRAL), device.health.value)
-        twin = "" if device.model.startswith("simulated") else "simulated" if device.simulated else "hardware"
+        self._indicator.set_status(HEALTH_LEVELS[device.health], device.health.value)
+        mode = "" if device.model.startswith("simulated") else "simulated" if device.simulated else "hardware"
         self._model.setText(
-            " · ".join(part for part in (device.model or device.kind, device.serial, twin) if part)
+            " · ".join(part for part in (device.model or device.kind, device.serial, mode) if part)
         )
         facts = "   ".join(
             format_fact(key, value).replace(" ", _NO_BREAK_SPACE) for key, value in device.facts.items()
@@ -129,9 +101,9 @@ class _DeviceRow(QFrame):
 
 
 def format_fact(key: str, value: float | str) -> str:
-    """A fact in words: ``temperature_c: 31.24`` becomes ``temperature 31.2 °C``."""
-    for ending, (unit, digits) in _UNITS.items():
-        if key.endswith(ending) and not isinstance(value, str):
-            return f"{key.removesuffix(ending).replace('_', ' ')} {value:.{digits}f} {unit}"
+    """A reading with its unit: ``temperature_c: 31.24`` becomes ``temperature 31.2 °C``."""
+    for suffix, (unit, digits) in _UNITS.items():
+        if key.endswith(suffix) and not isinstance(value, str):
+            return f"{key.removesuffix(suffix).replace('_', ' ')} {value:.{digits}f} {unit}"
     text = value if isinstance(value, str) else f"{value:g}"
     return f"{key.replace('_', ' ')} {text}"

@@ -1,4 +1,4 @@
-"""How long a frame takes to become a command, and how evenly frames come."""
+"""Histograms of the loop's latency and of the frame interval."""
 
 from __future__ import annotations
 
@@ -6,34 +6,32 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PySide6.QtWidgets import QGridLayout, QHBoxLayout
 
 from escape_gui.panels.base import Context, ExportArray, Panel
-from escape_gui.widgets.controls.readout import Readout
+from escape_gui.widgets.controls.readout import Readout, readout_grid
+from escape_gui.widgets.layouts import row
 from escape_gui.widgets.plots.plot import Plot
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
 from escape_hw.streams.timing import MIDDLES, percentiles_of
 
-#: Percentiles between which the axis runs; the largest stands above as a number.
+#: Percentiles at the ends of the axis; the largest value is shown as a number.
 _SHOWN_PERCENTILES = (0.0, 99.9)
 
 
 class LatencyPanel(Panel):
-    """Histograms of every frame since the loop was closed, counted by the loop itself."""
+    """Histograms of all frames since the loop was closed, counted by the loop."""
 
     name: ClassVar[str] = "latency"
     title: ClassVar[str] = "Latency"
     help: ClassVar[str] = (
-        "Time from a frame in hand to its command sent, and time between frames, of every frame since the "
-        "loop was closed. The numbers above are those of the last second. Jitter: how far the spacing of "
-        "frames strays from its median, 99th percentile."
+        "Latency from frame received to command sent, and interval between frames, of all frames since the "
+        "loop was closed. The numbers above the plots are for the last second. Jitter: deviation of the "
+        "frame interval from its median, 99th percentile."
     )
     streams: ClassVar[tuple[str, ...]] = ("latency_histogram",)
     rate_hz: ClassVar[float] = 2.0
-    placeholder: ClassVar[str] = (
-        "No frame has been timed yet.\nLatencies are counted while the loop is closed."
-    )
+    placeholder: ClassVar[str] = "No data yet.\nLatencies are recorded while the loop is closed."
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -44,33 +42,24 @@ class LatencyPanel(Panel):
             "largest": Readout(theme, "largest", "µs", 6),
             "jitter_p99": Readout(theme, "jitter p99", "µs", 6),
         }
-        row = QGridLayout()
-        row.setHorizontalSpacing(24)
-        for k, readout in enumerate(self.readouts.values()):
-            row.addWidget(readout, k // 2, k % 2)
-        row.setColumnStretch(2, 1)
         self.plots = (
             Plot(theme, "Histogram of latencies", "latency [µs]", "frames"),
-            Plot(theme, "Histogram of the spacing of frames", "spacing of frames [µs]", "frames"),
+            Plot(theme, "Histogram of frame intervals", "frame interval [µs]", "frames"),
         )
         self._curves = []
-        plots = QHBoxLayout()
-        self.body.addLayout(row)
-        self.body.addLayout(plots, 1)
         for number, plot in enumerate(self.plots):
             plot.setLogMode(x=False, y=True)
             self._curves.append(plot.curve(number, alone=True, stepMode="center", connect="finite"))
-            plots.addWidget(plot, 1)
+        self.body.addLayout(readout_grid(self.readouts))
+        self.body.addLayout(row(*((plot, 1) for plot in self.plots)), 1)
         self._counts: NDArray[Any] | None = None
 
     def on_state(self, state: State) -> None:
-        """Numbers of the last second."""
         for name, readout in self.readouts.items():
             value = getattr(state.latency, name)
             readout.show_value(f"{value:.0f}" if np.isfinite(value) else "–")
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """Counts of all frames since the loop was closed."""
         self._counts = sample.data
         for plot, curve, counts in zip(self.plots, self._curves, sample.data, strict=True):
             used = np.flatnonzero(counts)
@@ -80,17 +69,15 @@ class LatencyPanel(Panel):
             first, last = max(int(used[0]) - 1, 1), min(int(used[-1]) + 2, MIDDLES.size - 1)
             middles = MIDDLES[first - 1 : last + 1] / 1e3
             edges = (middles[:-1] + middles[1:]) / 2
-            # Half a frame stands for none on a logarithmic axis.
+            # 0.5 instead of zero, for the logarithmic axis.
             curve.setData(edges, np.maximum(counts[first:last], 0.5))
-            few = percentiles_of(counts, _SHOWN_PERCENTILES) / 1e3
-            plot.setXRange(float(few[0]) * 0.95, float(few[1]) * 1.05)
+            low, high = percentiles_of(counts, _SHOWN_PERCENTILES) / 1e3
+            plot.setXRange(float(low) * 0.95, float(high) * 1.05)
 
     def clear(self) -> None:
-        """Another loop."""
         self._counts = None
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """Counts by bin."""
         if self._counts is None:
             return ()
         used = np.flatnonzero(self._counts.sum(axis=0))

@@ -1,4 +1,4 @@
-"""The server's log, to be searched."""
+"""The server's log, with search and filter."""
 
 from __future__ import annotations
 
@@ -7,26 +7,27 @@ from html import escape
 from typing import ClassVar
 
 from PySide6.QtGui import QGuiApplication
-from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLineEdit, QPlainTextEdit, QPushButton
+from PySide6.QtWidgets import QComboBox, QLineEdit, QPlainTextEdit, QPushButton
 
 from escape_gui.panels.base import Context, Panel
+from escape_gui.widgets.layouts import row
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LogLine
 
-#: Lines kept; older ones are in the server's file.
+#: Number of lines kept; the server's log file has all of them.
 MAX_LINES = 5000
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 _COLOURS = {"WARNING": "warn", "ERROR": "bad", "CRITICAL": "bad", "DEBUG": "muted"}
 
 
 class LogPanel(Panel):
-    """Lines of the log, oldest first."""
+    """Log lines, oldest first."""
 
     name: ClassVar[str] = "log"
     title: ClassVar[str] = "Log"
     help: ClassVar[str] = (
-        "What the server has written, newest last. Type to see only lines with all of these words, choose "
-        "the least level, copy what is shown. It follows the newest line while it is scrolled to the end."
+        "The log of the server, newest line last. Type words to show the lines that contain all of them, "
+        "choose the minimum level, copy the lines shown. Follows the newest line while scrolled to the end."
     )
 
     def __init__(self, context: Context) -> None:
@@ -39,22 +40,18 @@ class LogPanel(Panel):
         self.level = QComboBox()
         self.level.addItems([level.title() for level in LEVELS])
         self.level.setCurrentIndex(1)
-        self.level.setAccessibleName("Least level")
+        self.level.setAccessibleName("Minimum level")
         self.level.setToolTip("Show lines of this level and above")
         self.level.currentIndexChanged.connect(self._refilter)
-        self.copy_button = QPushButton("Copy")
-        self.copy_button.setToolTip("Copy the lines shown")
-        self.copy_button.clicked.connect(self._copy)
         self.text = QPlainTextEdit()
         self.text.setReadOnly(True)
         self.text.setMaximumBlockCount(MAX_LINES)
         self.text.setAccessibleName("Lines of the log")
         self.text.setLineWrapMode(QPlainTextEdit.LineWrapMode.WidgetWidth)
-        row = QHBoxLayout()
-        row.addWidget(self.search, 1)
-        row.addWidget(self.level)
-        row.addWidget(self.copy_button)
-        self.body.addLayout(row)
+        self.copy_button = QPushButton("Copy")
+        self.copy_button.setToolTip("Copy the lines shown")
+        self.copy_button.clicked.connect(lambda: QGuiApplication.clipboard().setText(self.text.toPlainText()))
+        self.body.addLayout(row((self.search, 1), self.level, self.copy_button))
         self.body.addWidget(self.text, 1)
         self._lines: deque[LogLine] = deque(maxlen=MAX_LINES)
         self._number = -1
@@ -63,7 +60,6 @@ class LogPanel(Panel):
         self.apply_theme()
 
     def tick(self, source: DataSource) -> None:
-        """New lines, all at once."""
         new = source.log_after(self._number)
         if new:
             self._number = new[-1].number
@@ -74,7 +70,6 @@ class LogPanel(Panel):
             bar.setValue(bar.maximum())
 
     def _on_scroll(self) -> None:
-        """Whoever scrolls back reads; at the end the newest lines are followed again."""
         bar = self.text.verticalScrollBar()
         self._follow_newest = bar.sliderPosition() >= bar.maximum()
 
@@ -85,9 +80,8 @@ class LogPanel(Panel):
         return all(word in text for word in self.search.text().lower().split())
 
     def _append(self, lines: list[LogLine]) -> None:
-        if not lines:
-            return
-        self.text.appendHtml("<br>".join(self._html(line) for line in lines))
+        if lines:
+            self.text.appendHtml("<br>".join(self._html(line) for line in lines))
 
     def _html(self, line: LogLine) -> str:
         colours = self.context.theme.colours
@@ -103,16 +97,11 @@ class LogPanel(Panel):
         self.text.clear()
         self._append([line for line in self._lines if self._matches(line)])
 
-    def _copy(self) -> None:
-        QGuiApplication.clipboard().setText(self.text.toPlainText())
-
     def clear(self) -> None:
-        """Another server counts from the beginning."""
         self._lines.clear()
         self._number = -1
         self.text.clear()
 
     def apply_theme(self) -> None:
-        """Lines stand in columns and carry the theme's colours."""
         self.text.setFont(self.context.theme.font(0.9, mono=True))
         self._refilter()

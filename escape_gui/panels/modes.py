@@ -1,4 +1,4 @@
-"""Live mode maps of the interaction matrix, and one mode as every matrix sees it."""
+"""Live mode maps of the interaction matrix, and one mode in all matrices."""
 
 from __future__ import annotations
 
@@ -8,16 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QKeyEvent, QResizeEvent
-from PySide6.QtWidgets import (
-    QCheckBox,
-    QComboBox,
-    QHBoxLayout,
-    QLabel,
-    QPushButton,
-    QSizePolicy,
-    QSplitter,
-    QWidget,
-)
+from PySide6.QtWidgets import QCheckBox, QComboBox, QLabel, QPushButton, QSizePolicy, QSplitter, QWidget
 
 from escape_gui.client.product_library import LoadedProducts
 from escape_gui.panels.base import Context, ExportArray, Panel
@@ -26,29 +17,29 @@ from escape_gui.views.mode_mosaic import LIMIT
 from escape_gui.widgets.images.colour_scale import DIVERGING, ColourScale
 from escape_gui.widgets.images.map_tiles import MapTiles
 from escape_gui.widgets.images.mode_mosaic import ModeMosaic, MosaicPixel
+from escape_gui.widgets.layouts import row
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import State
 from escape_hw.report.tables import METHOD_LABELS
 
-#: How the matrix that is being measured is called in the list.
-LIVE_LABEL = "as measured now"
-#: What stands below the maps until something else is to be said.
-_USAGE_TEXT = "Pairs: x slopes, y slopes. Click a mode for every matrix."
-#: Matrices that the detail has room for.
+#: Label of the matrix that is being measured.
+LIVE_LABEL = "live"
+_USAGE_TEXT = "Pairs: x slopes, y slopes. Click a mode to compare all matrices."
+#: Maximum number of matrices in the detail of a mode.
 _MAX_MATRICES = 4
-#: Shares of mosaic and detail, and the width from which on they stand beside each other.
-_SPLITTER_SIZES, _SIDE_BY_SIDE_WIDTH = (550, 450), 900
+#: Sizes of mosaic and detail, and the panel width from which they are side by side; pixels.
+_SPLITTER_SIZES, _SIDE_BY_SIDE_WIDTH = [550, 450], 900
 
 
 class ModesPanel(Panel):
-    """The mosaic, with the chosen mode's detail beside it."""
+    """Mosaic of all modes, with the detail of the selected mode."""
 
     name = "modes"
     title = "Mode maps"
     help = (
-        "The x and y slopes of every mode of the interaction matrix, each mode divided by its rms slope. "
-        "Click a mode to see it in every matrix at hand, with difference, error and signal-to-noise ratio."
+        "The x and y slopes of each mode of the interaction matrix, divided by the rms slope of the mode. "
+        "Click a mode to show it in all matrices, with difference, standard error and signal-to-noise ratio."
     )
     streams: ClassVar[tuple[str, ...]] = ("valid", "matrix", "matrix_sigma")
     rate_hz = 4.0
@@ -63,39 +54,33 @@ class ModesPanel(Panel):
         self._live: dict[str, NDArray[np.float32]] = {}
         self._method = ""
         self._loaded = LoadedProducts()
-        self._dirty = self._running = False
-        self._user_selected = False
+        self._running = self._user_selected = False
         self._make_controls()
         self._make_maps()
 
-    # ------------------------------------------------------------ building
+    # ------------------------------------------------------------ construction
     def _make_controls(self) -> None:
         self.matrix_selector = QComboBox()
         self.matrix_selector.setAccessibleName("Matrix shown")
         self.matrix_selector.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
         self.matrix_selector.activated.connect(self._choose_matrix)
-        self.fade = QCheckBox("Fade noise")
-        self.fade.setChecked(True)
-        self.fade.setToolTip("Draw a mode as pale as it is uncertain, by SNR² / (1 + SNR²).")
-        self.fade.toggled.connect(self._redraw)
+        self.weight_by_snr = QCheckBox("Weight by SNR")
+        self.weight_by_snr.setChecked(True)
+        self.weight_by_snr.setToolTip("Scale the colours of a mode by SNR² / (1 + SNR²).")
+        self.weight_by_snr.toggled.connect(self._show_mosaic)
         self._previous_button, self._next_button = QPushButton("‹"), QPushButton("›")
-        for button, step, words in (
-            (self._previous_button, -1, "Page before"),
-            (self._next_button, 1, "Next page"),
+        for button, step, name, key in (
+            (self._previous_button, -1, "Previous page", "Page Up"),
+            (self._next_button, 1, "Next page", "Page Down"),
         ):
-            button.setToolTip(f"{words} (Page {'Up' if step < 0 else 'Down'})")
-            button.setAccessibleName(words)
+            button.setToolTip(f"{name} ({key})")
+            button.setAccessibleName(name)
             button.clicked.connect(
                 lambda _=False, step=step: self.mosaic.show_page(self.mosaic.page[0] + step)
             )
         self._page_label = QLabel()
-        row = QHBoxLayout()
-        row.addWidget(self.matrix_selector)
-        row.addWidget(self.fade)
-        row.addStretch()
-        for widget in (self._previous_button, self._page_label, self._next_button):
-            row.addWidget(widget)
-        self.body.addLayout(row)
+        self._page_controls = (self._previous_button, self._page_label, self._next_button)
+        self.body.addLayout(row(self.matrix_selector, self.weight_by_snr, None, *self._page_controls))
 
     def _make_maps(self) -> None:
         theme = self.context.theme
@@ -105,22 +90,19 @@ class ModesPanel(Panel):
         self.detail = MapTiles(theme)
         self.detail.hide()
         maps = QWidget()
-        row = QHBoxLayout(maps)
-        row.setContentsMargins(0, 0, 0, 0)
-        row.addWidget(self.mosaic, 1)
-        row.addWidget(self._scale)
+        row((self.mosaic, 1), self._scale, parent=maps)
         self.splitter = QSplitter(Qt.Orientation.Vertical)
         self.splitter.addWidget(maps)
         self.splitter.addWidget(self.detail)
-        self.splitter.setSizes([_SPLITTER_SIZES[0], _SPLITTER_SIZES[1]])
+        self.splitter.setSizes(_SPLITTER_SIZES)
         self.splitter.setChildrenCollapsible(False)
         self.body.addWidget(self.splitter, 1)
         self._status_label = QLabel(_USAGE_TEXT)
         self._status_label.setFont(theme.font(mono=True))
-        # It must not make the panel wider than its neighbours allow.
+        # The text must not widen the panel.
         self._status_label.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
         self._status_label.setWordWrap(True)
-        # Two lines always, so that the maps do not change their size under the pointer.
+        # Always two lines, so that the maps keep their size.
         self._status_label.setFixedHeight(2 * self._status_label.fontMetrics().lineSpacing())
         self.body.addWidget(self._status_label)
         self.setFocusProxy(self.mosaic)
@@ -130,15 +112,14 @@ class ModesPanel(Panel):
 
     # ------------------------------------------------------------ data
     def on_state(self, state: State) -> None:
-        """Follow what the server holds; once a measurement has ended, its product stands for it."""
-        running = state.procedure is not None
-        self._dirty |= running != self._running
+        """Request the products; at the end of a measurement its product replaces the live matrix."""
+        running = state.active_run is not None
+        self.dirty |= running != self._running
         self._running = running
         self.context.session.library.request(state.products)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """The matrix grows."""
-        self._dirty = True
+        self.dirty = True
         if stream == "valid":
             self._valid = sample.data > 0
             return
@@ -149,26 +130,24 @@ class ModesPanel(Panel):
             self._user_selected = False
 
     def tick(self, source: DataSource) -> None:
-        """Draw when anything is new."""
         loaded = self.context.session.library.loaded
         if loaded is not self._loaded:
-            self._loaded, self._dirty = loaded, True
-        if not self._dirty:
-            return
-        self._dirty = False
+            self._loaded, self.dirty = loaded, True
+
+    def redraw(self) -> None:
         self._update_selector()
         if self.matrices:
             self.show_placeholder(False)
-            self._redraw()
+            self._show_mosaic()
 
     @property
     def matrices(self) -> dict[str, InteractionMatrix]:
-        """All at hand by label; the one being measured first, while it is none of the others."""
-        found = dict(self._loaded.matrices)
+        """All matrices by label; the live one first, during a measurement or if there is no other."""
+        products = dict(self._loaded.matrices)
         live = self._live_matrix()
-        if live is None or (found and not self._running):
-            return found
-        return {LIVE_LABEL: live, **found}
+        if live is None or (products and not self._running):
+            return products
+        return {LIVE_LABEL: live, **products}
 
     def _live_matrix(self) -> InteractionMatrix | None:
         data = self._live.get("matrix")
@@ -184,93 +163,86 @@ class ModesPanel(Panel):
         names = list(self.matrices)
         if names == [self.matrix_selector.itemData(k) for k in range(self.matrix_selector.count())]:
             return
-        now = self.matrix_selector.currentData()
+        current = self.matrix_selector.currentData()
         self.matrix_selector.clear()
         for name in names:
             self.matrix_selector.addItem(
                 f"{self._method}, {LIVE_LABEL}" if name == LIVE_LABEL and self._method else name, name
             )
-        # What is being measured comes to the front, then the newest; what somebody chose stays.
-        wanted = LIVE_LABEL if LIVE_LABEL in names and self._running else (names[-1] if names else None)
-        if self._user_selected and now in names:
-            wanted = now
-        self.matrix_selector.setCurrentIndex(max(0, self.matrix_selector.findData(wanted)))
+        # Keep the user's choice, else the live matrix, else the newest.
+        if not (self._user_selected and current in names):
+            current = LIVE_LABEL if LIVE_LABEL in names and self._running else (names[-1] if names else None)
+        self.matrix_selector.setCurrentIndex(max(0, self.matrix_selector.findData(current)))
 
-    # ------------------------------------------------------------ showing
+    # ------------------------------------------------------------ display
     def _choose_matrix(self) -> None:
         self._user_selected = True
-        self._redraw()
+        self._show_mosaic()
 
-    def _redraw(self) -> None:
+    def _show_mosaic(self) -> None:
         matrix = self.matrices.get(str(self.matrix_selector.currentData()))
         if matrix is None:
             return
-        self.mosaic.show_matrix(matrix.valid, matrix.data, matrix.sigma, self.fade.isChecked())
+        self.mosaic.show_matrix(matrix.valid, matrix.data, matrix.sigma, self.weight_by_snr.isChecked())
         if self.detail.isVisible():
             self._show_detail(self.mosaic.mode)
 
     def _show_detail(self, mode: int) -> None:
         if mode < 0:
             return
-        found = self.matrices
+        matrices = self.matrices
         chosen = str(self.matrix_selector.currentData())
-        others = [name for name in found if name != chosen][: _MAX_MATRICES - 1]
-        self.detail.show_tiles(
-            tiles({name: found[name] for name in found if name in (*others, chosen)}, mode)
-        )
+        others = [name for name in matrices if name != chosen][: _MAX_MATRICES - 1]
+        shown = {name: one for name, one in matrices.items() if name in (*others, chosen)}
+        self.detail.show_tiles(tiles(shown, mode))
         self.detail.show()
         self._status_label.setText(self._describe_mode(mode))
 
     def _describe_mode(self, mode: int) -> str:
         rms, snr = self.mosaic.statistics(mode)
-        stated = f"SNR {snr:.3g}" if np.isfinite(snr) else "no error stated"
-        return f"mode {mode + 1}  rms slope {rms:.3g}  {stated}"
+        quality = f"SNR {snr:.3g}" if np.isfinite(snr) else "no standard error"
+        return f"mode {mode + 1}  rms slope {rms:.3g}  {quality}"
 
-    def _show_hover(self, spot: MosaicPixel | None) -> None:
-        if spot is None:
+    def _show_hover(self, pixel: MosaicPixel | None) -> None:
+        if pixel is None:
             self._status_label.setText(
                 self._describe_mode(self.mosaic.mode) if self.mosaic.mode >= 0 else _USAGE_TEXT
             )
             return
-        place = f"{spot.part} {spot.value:+.3g} at ({spot.column + 1}, {spot.row + 1})"
-        self._status_label.setText(f"{self._describe_mode(spot.mode)}  {place}")
+        value = f"{pixel.part} {pixel.value:+.3g} at ({pixel.column + 1}, {pixel.row + 1})"
+        self._status_label.setText(f"{self._describe_mode(pixel.mode)}  {value}")
 
     def _show_page(self, page: int, pages: int) -> None:
         self._page_label.setText(f"page {page + 1} of {pages}")
-        for widget in (self._previous_button, self._page_label, self._next_button):
+        for widget in self._page_controls:
             widget.setVisible(pages > 1)
         self._previous_button.setEnabled(page > 0)
         self._next_button.setEnabled(page + 1 < pages)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Escape closes the detail."""
         if event.key() == Qt.Key.Key_Escape and self.detail.isVisible():
             self.detail.hide()
         else:
             super().keyPressEvent(event)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Beside each other where there is room, else below each other."""
         super().resizeEvent(event)
         wide = self.width() >= self.context.theme.pixels(_SIDE_BY_SIDE_WIDTH)
-        way = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
-        if self.splitter.orientation() != way:
-            self.splitter.setOrientation(way)
-            self.splitter.setSizes([_SPLITTER_SIZES[0], _SPLITTER_SIZES[1]])
+        orientation = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
+        if self.splitter.orientation() != orientation:
+            self.splitter.setOrientation(orientation)
+            self.splitter.setSizes(_SPLITTER_SIZES)
 
     def clear(self) -> None:
-        """Forget the matrix of another source."""
         self._live.clear()
         self._user_selected = False
         self.matrix_selector.clear()
         self.detail.hide()
 
     def apply_theme(self) -> None:
-        """Numbers keep their own letters."""
         self._status_label.setFont(self.context.theme.font(mono=True))
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
-        """The matrix in the mosaic, and its errors."""
         matrix = self.matrices.get(str(self.matrix_selector.currentData()))
         if matrix is None:
             return ()

@@ -1,4 +1,4 @@
-"""Choose a procedure, see what it would do, start it, watch it, stop it, and read what came of it."""
+"""Procedures: arguments, plan, start, progress, result."""
 
 from __future__ import annotations
 
@@ -7,50 +7,40 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from numpy.typing import NDArray
-from PySide6.QtCore import Qt, QTimer, QUrl
+from PySide6.QtCore import QTimer, QUrl
 from PySide6.QtGui import QDesktopServices, QResizeEvent
-from PySide6.QtWidgets import (
-    QComboBox,
-    QFrame,
-    QGridLayout,
-    QHBoxLayout,
-    QLabel,
-    QProgressBar,
-    QPushButton,
-    QScrollArea,
-    QWidget,
-)
+from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QProgressBar, QPushButton, QWidget
 
 from escape_gui.client.availability import (
-    RequestContext,
     reason_no_abort,
     reason_no_pause,
     reason_no_request,
     reason_no_write,
+    tooltip,
 )
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views import procedure_form as form_text
 from escape_gui.views.mode_mosaic import ModeStatistics
 from escape_gui.widgets.controls.argument_form import ArgumentForm
+from escape_gui.widgets.layouts import row, scroll_area, text_label
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Arguments, FinishedRun, ProcedureEntry, ProcedurePlan, State
 
-#: Wait so long after the last edit before the server is asked what the procedure would do.
+#: Delay between the last edit and the request for a plan.
 _PLAN_DELAY_MS = 400
-#: What stands in the form of a recording.
-RECORDING_TEXT = "This is a recording: it can be looked at, nothing can be started. Its result stands below."
-
-NO_SERVER_TEXT = "No server has answered. Start one with 'escape serve SYSTEM', or open a recording (File)."
+REPLAY_TEXT = "Replay of a recorded run: no procedure can be started. The result of the run is shown below."
+NO_SERVER_TEXT = "No server connected. Start one with 'escape serve SYSTEM', or open a recorded run (File)."
 
 
 class ProcedurePanel(Panel):
-    """The form, the plan, four buttons, progress, and the last result."""
+    """Form, plan, four buttons, progress, and the last result."""
 
     name = "procedure"
     title = "Procedure"
     help = (
-        "Calibrations, loops, optical gains and tracking. Choose one and set its arguments; the plan below "
-        "says what it would take and how far the mirror would move. Start, Pause and Abort act at once."
+        "Calibrations, loops, optical gains and tracking. Choose a procedure and set its arguments; the plan "
+        "below the form gives the number of frames, the time and the largest poke. Start, Pause and Abort "
+        "act immediately."
     )
     streams: ClassVar[tuple[str, ...]] = ("matrix", "matrix_sigma")
     rate_hz = 5.0
@@ -75,15 +65,15 @@ class ProcedurePanel(Panel):
         self.setFocusProxy(self.choice)
         self.apply_theme()
 
-    # ------------------------------------------------------------ building
+    # ------------------------------------------------------------ construction
     def _make_form(self) -> None:
         self.choice = QComboBox()
         self.choice.setAccessibleName("Procedure")
         self.choice.currentIndexChanged.connect(self._on_procedure_selected)
-        self._description = _text_label()
+        self._description = text_label()
         self.form = ArgumentForm(self.context.theme)
         self.form.edited.connect(self._on_edit)
-        self.plan = _text_label()
+        self.plan = text_label()
         self.plan.setAccessibleName("Plan")
         for widget, stretch in ((self.choice, 0), (self._description, 0), (self.form, 100), (self.plan, 0)):
             self.body.addWidget(widget, stretch)
@@ -92,27 +82,28 @@ class ProcedurePanel(Panel):
         self.check, self.start = QPushButton("&Check"), QPushButton("&Start")
         self.pause, self.abort = QPushButton("Pause"), QPushButton("Abort")
         self.abort.setObjectName("stop")
-        row = QHBoxLayout()
-        asked: tuple[tuple[QPushButton, Callable[[], None]], ...] = (
+        session = self.context.session
+        handlers: tuple[tuple[QPushButton, Callable[[], None]], ...] = (
             (self.check, self.ask_plan), (self.start, self.ask_start),
-            (self.pause, self.ask_pause), (self.abort, self.ask_abort),
+            (self.pause, session.toggle_pause), (self.abort, session.abort),
         )  # fmt: skip
-        for button, ask in asked:
+        for button, ask in handlers:
             button.clicked.connect(lambda _=False, ask=ask: ask())
-            row.addWidget(button)
-        self.body.addLayout(row)
+        self.body.addLayout(row(*(button for button, _ in handlers)))
         self.bar = QProgressBar()
         self.bar.setTextVisible(False)
         self.bar.setFixedHeight(8)
-        self.progress, self._metrics = _text_label(), _text_label()
+        self.progress, self._metrics = text_label(), text_label()
         for widget in (self.progress, self.bar, self._metrics):
             self.body.addWidget(widget)
+        for label in (self._description, self.plan, self.progress, self._metrics):
+            label.hide()
 
     def _make_result(self) -> None:
-        self._result = QWidget()
-        grid = QGridLayout(self._result)
+        result = QWidget()
+        grid = QGridLayout(result)
         grid.setContentsMargins(0, 0, 0, 0)
-        self.outcome, self.numbers = _text_label(), _text_label()
+        self.outcome, self.numbers = text_label(), text_label()
         self.report, self.folder = QPushButton("Open report"), QPushButton("Open folder")
         self.report.clicked.connect(lambda: self._open(self._product("report")))
         self.folder.clicked.connect(lambda: self._open(self._ended.folder if self._ended else ""))
@@ -122,51 +113,45 @@ class ProcedurePanel(Panel):
         grid.addWidget(self.folder, 2, 1)
         grid.setColumnStretch(2, 1)
         grid.setRowStretch(3, 1)
-        self._result_area = QScrollArea()
-        self._result_area.setWidgetResizable(True)
-        self._result_area.setFrameShape(QFrame.Shape.NoFrame)
-        self._result_area.setWidget(self._result)
+        self._result_area = scroll_area(result)
         self.body.addWidget(self._result_area, 100)
         self.body.addStretch(1)
         self._result_area.hide()
 
     # ------------------------------------------------------------ data
     def tick(self, source: DataSource) -> None:
-        """Once the server says what it offers, make the list."""
-        if not self._entries and source.connected and (found := source.procedures()):
-            self._entries = {one.name: one for one in found}
-            for one in found:
+        if not self._entries and source.connected and (procedures := source.procedures()):
+            self._entries = {one.name: one for one in procedures}
+            for one in procedures:
                 self.choice.addItem(one.title, one.name)
             self._on_procedure_selected()
         self.form.setVisible(bool(self._entries))
         if not self._entries:
             replay = source.connected and self.context.session.requests is None
             _set_text(
-                self._description, RECORDING_TEXT if replay else "" if source.connected else NO_SERVER_TEXT
+                self._description, REPLAY_TEXT if replay else "" if source.connected else NO_SERVER_TEXT
             )
         self._enable()
 
     def on_state(self, state: State) -> None:
-        """Progress, products to choose from, and how the last one ended."""
         self._state = state
         self.form.set_matrix_choices(form_text.matrices(state.products))
-        running = state.procedure
+        running = state.active_run
         if running is None:
             self._matrix.clear()
-        share = 0.0 if running is None or not running.total else running.done / running.total
+        share = 0.0 if running is None or not running.total else running.completed / running.total
         self.bar.setVisible(running is not None)
         self.bar.setRange(0, 1000 if running is None or running.total else 0)
         self.bar.setValue(round(1000 * min(1.0, share)))
         _set_text(self.progress, "" if running is None else form_text.progress_line(running))
         _set_text(self._metrics, "" if running is None else self._metrics_text(running.metrics))
-        self.pause.setText("Go on" if running is not None and running.paused else "Pause")
-        # While something runs, what came of the last one only takes its room.
+        self.pause.setText("Resume" if running is not None and running.paused else "Pause")
+        # Hidden during a run, to leave more room for the form.
         self._result_area.setVisible(self._ended is not None and running is None)
-        if state.last is not None and (self._ended is None or state.last.id != self._ended.id):
-            self._show_ended(state.last)
+        if state.last_run is not None and (self._ended is None or state.last_run.id != self._ended.id):
+            self._show_ended(state.last_run)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
-        """The matrix that is being measured tells which mode is known worst."""
         self._matrix[stream] = sample.data
 
     def _metrics_text(self, metrics: Mapping[str, float]) -> str:
@@ -190,7 +175,6 @@ class ProcedurePanel(Panel):
         return self._ended.products.get(name, "") if self._ended is not None else ""
 
     def clear(self) -> None:
-        """Forget what another server offered."""
         self._entries, self._plan, self._ended = {}, None, None
         self._documents.clear()
         self._matrix.clear()
@@ -200,7 +184,6 @@ class ProcedurePanel(Panel):
     # ------------------------------------------------------------ form
     @property
     def chosen(self) -> str:
-        """Name of the chosen procedure."""
         return str(self.choice.currentData() or "")
 
     def _on_procedure_selected(self) -> None:
@@ -226,7 +209,7 @@ class ProcedurePanel(Panel):
 
     # ------------------------------------------------------------ requests
     def ask_plan(self) -> None:
-        """Ask what the procedure would do; nothing moves."""
+        """Request the plan for the arguments in the form; nothing moves."""
         requests, name = self.context.session.requests, self.chosen
         if requests is None or not name:
             return
@@ -238,7 +221,7 @@ class ProcedurePanel(Panel):
         self._checked_arguments = arguments
         requests.ask(
             "check the arguments",
-            lambda server: server.check(name, arguments),
+            lambda server: server.plan(name, arguments),
             lambda plan: self._on_plan(name, arguments, plan),
             lambda why: self._show_plan(f"⚠ {why}", "bad"),
             quiet=True,
@@ -253,42 +236,23 @@ class ProcedurePanel(Panel):
         self._enable()
 
     def ask_start(self) -> None:
-        """Start what was planned."""
         requests, name, arguments = self.context.session.requests, self.chosen, self._checked_arguments
         if requests is not None and self._plan is not None and arguments is not None:
             self.start.setEnabled(False)
             requests.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
 
-    def ask_pause(self) -> None:
-        """Halt, or go on."""
-        requests, running = self.context.session.requests, self._state.procedure
-        if requests is not None and running is not None:
-            paused = running.paused
-            requests.ask(
-                "go on" if paused else "pause", lambda server: server.resume() if paused else server.pause()
-            )
-
-    def ask_abort(self) -> None:
-        """Stop; what was measured is kept."""
-        requests = self.context.session.requests
-        if requests is not None:
-            requests.ask("abort the procedure", lambda server: server.abort(), urgent=True)
-
     def _enable(self) -> None:
-        """Buttons that are of no use now say why."""
-        session = self.context.session
-        source = session.source
-        now = RequestContext(source.state, source.connected, session.live, session.may_write)
-        busy = "a procedure runs" if now.state.procedure is not None else ""
-        unplanned = "" if self._plan is not None else "the arguments are not checked yet"
-        for button, tip, why in (
-            (self.check, "Ask what it would do; nothing moves.", reason_no_request(now)),
-            (self.start, "Start it.", reason_no_write(now) or busy or unplanned),
-            (self.pause, "Halt between two steps, or go on.", reason_no_pause(now)),
-            (self.abort, "Stop; what was measured is kept.", reason_no_abort(now)),
+        now = self.context.session.request_context
+        busy = "a procedure is running" if now.state.active_run is not None else ""
+        not_checked = "" if self._plan is not None else "the arguments are not checked yet"
+        for button, tip, reason in (
+            (self.check, "Check the arguments and show the plan; nothing moves.", reason_no_request(now)),
+            (self.start, "Start the procedure.", reason_no_write(now) or busy or not_checked),
+            (self.pause, "Pause between two steps, or resume.", reason_no_pause(now)),
+            (self.abort, "Stop and save the data acquired so far.", reason_no_abort(now)),
         ):
-            button.setEnabled(not why)
-            button.setToolTip(tip if not why else f"{tip} Not now: {why}.")
+            button.setEnabled(not reason)
+            button.setToolTip(tooltip(tip, reason))
         writable = not reason_no_request(now)
         self.form.setEnabled(writable)
         self.choice.setEnabled(writable and self.choice.count() > 0)
@@ -298,13 +262,11 @@ class ProcedurePanel(Panel):
             QDesktopServices.openUrl(QUrl.fromLocalFile(path))
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Words wrap anew."""
         super().resizeEvent(event)
         for label in (self._description, self.plan, self.progress, self._metrics):
             _fit_height(label)
 
     def apply_theme(self) -> None:
-        """Numbers in letters that do not jitter."""
         theme = self.context.theme
         for label in (self.progress, self._metrics, self.numbers):
             label.setFont(theme.font(0.95, mono=True))
@@ -313,21 +275,12 @@ class ProcedurePanel(Panel):
 
 
 def _set_text(label: QLabel, text: str) -> None:
-    """Words that take no room while there are none."""
+    """Set the text of a label, and hide the label if it is empty."""
     label.setText(text)
     label.setVisible(bool(text))
     _fit_height(label)
 
 
 def _fit_height(label: QLabel) -> None:
-    """Lines that wrap ask for their height only where somebody gives it to them."""
+    """Set the minimum height of wrapped text; the layout of the panel ignores its height for width."""
     label.setMinimumHeight(max(0, label.heightForWidth(label.width())) if label.text() else 0)
-
-
-def _text_label() -> QLabel:
-    """A line of words that wraps and can be copied."""
-    label = QLabel()
-    label.setWordWrap(True)
-    label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-    label.setVisible(False)
-    return label

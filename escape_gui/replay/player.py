@@ -1,4 +1,4 @@
-"""Moves through a recording: a slider over its steps, forward, back, and by itself."""
+"""Playback of a recorded run: a slider over its steps and a play button."""
 
 from __future__ import annotations
 
@@ -8,34 +8,28 @@ from PySide6.QtWidgets import QLabel, QSlider, QToolBar, QToolButton
 from escape_gui.client.session import Session
 from escape_gui.replay.source import ReplaySource
 
-#: A recording plays from beginning to end in so many steps, each this long.
+#: Number of steps of the slider, and duration of each in playback.
 _STEPS, _STEP_MS = 60, 150
 
 
 class PlaybackBar(QToolBar):
-    """Shown while a recording is open that has a course: iterations, rounds, a track.
-
-    Parameters
-    ----------
-    session
-        Its source is moved through when it is a recording.
-    """
+    """Tool bar that is visible while a recorded run with several steps is open."""
 
     def __init__(self, session: Session) -> None:
-        super().__init__("Recording")
+        super().__init__("Replay")
         self.setObjectName("transport")
         self.setMovable(False)
         self._session = session
-        self._name_label = QLabel("Recording")
+        self._name_label = QLabel()
         self.slider = QSlider(Qt.Orientation.Horizontal)
         self.slider.setRange(0, _STEPS)
-        self.slider.setAccessibleName("Place in the recording")
-        self.slider.setToolTip("How much of the run is shown: iterations, rounds, seconds of tracking.")
+        self.slider.setAccessibleName("Position in the recorded run")
+        self.slider.setToolTip("Position in the run: iterations, rounds, seconds of tracking.")
         self.slider.valueChanged.connect(self._seek)
         self.play = QToolButton()
         self.play.setText("▶ Play")
         self.play.setCheckable(True)
-        self.play.setToolTip("Show how the run went, step by step.")
+        self.play.setToolTip("Play the run step by step.")
         self.play.toggled.connect(self._on_play_toggled)
         for widget in (self._name_label, self.play, self.slider):
             self.addWidget(widget)
@@ -47,25 +41,24 @@ class PlaybackBar(QToolBar):
 
     @property
     def recording(self) -> ReplaySource | None:
-        """The recording that is open."""
+        """The recorded run that is open, if any."""
         source = self._session.source
         return source if isinstance(source, ReplaySource) else None
 
     def _on_source_changed(self) -> None:
-        """Another source was taken."""
-        found = self.recording
+        recording = self.recording
         self.play.setChecked(False)
-        self.setVisible(found is not None and found.steps > 1)
-        if found is not None:
-            self._name_label.setText(f"{found.path.name}  ")
+        self.setVisible(recording is not None and recording.steps > 1)
+        if recording is not None:
+            self._name_label.setText(f"{recording.path.name}  ")
             self.slider.setValue(_STEPS)
 
     def _seek(self, value: int) -> None:
-        if (found := self.recording) is not None:
-            found.seek(value / _STEPS)
+        if (recording := self.recording) is not None:
+            recording.seek(value / _STEPS)
 
     def _on_play_toggled(self, on: bool) -> None:
-        self.play.setText("⏸ Hold" if on else "▶ Play")
+        self.play.setText("⏸ Pause" if on else "▶ Play")
         if on and self.slider.value() == _STEPS:
             self.slider.setValue(0)
         (self._timer.start if on else self._timer.stop)()

@@ -1,4 +1,4 @@
-"""A run folder or product as a read-only source for panels, with its geometry."""
+"""A run folder or a product as a read-only data source for the panels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_gui.replay.streams import RecordedStream, main_calibration, recorded_streams
+from escape_gui.replay.streams import main_calibration, recorded_streams
+from escape_hw.api.outlines import outlines
 from escape_hw.errors import ConfigError
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
@@ -28,109 +29,65 @@ from escape_hw.remote.state import (
     State,
     StreamEntry,
 )
-from escape_hw.server.engine.bench_status import outlines
 
 if TYPE_CHECKING:
     from escape_hw.report.content import RunContent
 
 
-def run_geometry(run: RunContent) -> Geometry:
-    """The geometry of a run's main calibration; empty parts where the run tells nothing of them."""
-    main = main_calibration(run)
-    layout, places = run.layout, run.places_m
-    seen: dict[str, object] = {}
-    if main is not None:
-        grid = main[1].grid
-        seen = {
-            "valid": _rows(grid.valid),
-            "outlines_px": outlines(grid),
-            "n_modes": main[1].matrix.n_modes,
-        }
-    return Geometry.model_validate(
-        {
-            **seen,
-            "layout": () if layout is None else _rows(layout),
-            "places_m": () if places is None else tuple((float(x), float(y)) for x, y in places),
-        }
-    )
-
-
-def _rows(mask: NDArray[np.bool_]) -> tuple[str, ...]:
-    return tuple("".join("1" if spot else "0" for spot in row) for row in mask)
-
-
 #: Why nothing can be commanded.
-READ_ONLY_REASON = "This is a recording: it can be looked at, nothing in it can be moved."
+READ_ONLY_REASON = "replay of a recorded run: no procedure can be started"
 _LOG_LINE = re.compile(r"(\S+ \S+) ([A-Z]+) (\S+): (.*)")
 
 
 class ReplaySource:
-    """What a run left behind, as a :class:`~escape_hw.remote.source.Source`.
+    """Products and log of a run as a :class:`~escape_hw.remote.source.DataSource`.
 
     Parameters
     ----------
     path
         A FITS product or the folder of a run.
 
-    Attributes
-    ----------
-    run
-        Everything that was read.
-
     Raises
     ------
     ProductError
-        It is no run and no product, or it is damaged.
+        The path is neither a run nor a product, or a file is damaged.
     """
 
+    connected = True
+
     def __init__(self, path: Path | str) -> None:
-        # Reading FITS takes half a second to load, and live windows do without.
+        # Imported here: it takes half a second, and windows on a server do not need it.
         from escape_hw.report.content import read_product, read_run
 
         self.path = Path(path)
         self.run: RunContent = read_run(self.path) if self.path.is_dir() else read_product(self.path)
         self._streams = recorded_streams(self.run)
+        self._geometry = _geometry_of(self.run)
         self._position = 1.0
         self._serial = 1
         self._log = _log_lines(self.run.log_text)
         self._opened_ns = time.monotonic_ns()
-        self._state = self._make_state()
-
-    @property
-    def connected(self) -> bool:
-        """A recording is always there."""
-        return True
-
-    @property
-    def position(self) -> float:
-        """How much of the run is shown, 0 to 1."""
-        return self._position
+        #: The recorded run as the last run of a stopped server.
+        self.state = self._make_state()
 
     @property
     def steps(self) -> int:
-        """Steps of the longest course; 1 when nothing in it has one."""
-        return max((course.length for course in self._streams.values()), default=1)
+        """Number of steps of the longest stream; 1 if none has several."""
+        return max((stream.length for stream in self._streams.values()), default=1)
 
     def seek(self, position: float) -> None:
-        """Show the run as it was after this share of it."""
+        """Show the run as it was at a position from 0 to 1."""
         self._position = min(1.0, max(0.0, position))
         self._serial += 1
-        self._state = self._make_state()
+        self.state = self._make_state()
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
-        """See :class:`~escape_hw.remote.source.Source`."""
-        course = self._streams.get(stream)
-        if course is None or self._serial <= after:
+        recorded = self._streams.get(stream)
+        if recorded is None or self._serial <= after:
             return None
-        data = course.at(_step(course, self._position))
-        if data is None:
-            return None
-        return Sample(self._serial, self._opened_ns, self._opened_ns, np.asarray(data), course.meta)
-
-    @property
-    def state(self) -> State:
-        """What the run says of itself, in the words of a server."""
-        return self._state
+        step = max(1, min(recorded.length, int(np.ceil(self._position * recorded.length))))
+        data = np.asarray(recorded.at(step))
+        return Sample(self._serial, self._opened_ns, self._opened_ns, data, recorded.meta)
 
     def _make_state(self) -> State:
         run, document = self.run, self.run.document
@@ -145,7 +102,7 @@ class ReplaySource:
             seed=int(document.get("seed") or 0),
             phase=Phase.STOPPED,
             loop=_loop_state(run),
-            last=FinishedRun(
+            last_run=FinishedRun(
                 id=0,
                 name=name,
                 finish=finish,
@@ -160,30 +117,37 @@ class ReplaySource:
         )
 
     def geometry(self) -> Geometry:
-        """Where slopes and actuators stood."""
-        return run_geometry(self.run)
+        return self._geometry
 
     def log_after(self, number: int) -> Sequence[LogLine]:
-        """The run's own log."""
         return self._log[max(0, number + 1) :]
 
     def procedures(self) -> Sequence[ProcedureEntry]:
-        """Nothing can be started."""
         return ()
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
-        """Nothing can be started.
-
-        Raises
-        ------
-        ConfigError
-            Always.
-        """
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+        """Raise `ConfigError`: no procedure can be started in a replay."""
         raise ConfigError(READ_ONLY_REASON)
 
 
-def _step(course: RecordedStream, position: float) -> int:
-    return max(1, min(course.length, int(np.ceil(position * course.length))))
+def _geometry_of(run: RunContent) -> Geometry:
+    """Geometry of a run's main calibration and of its mirror; parts that were not recorded are empty."""
+    main = main_calibration(run)
+    parts: dict[str, object] = {}
+    if main is not None:
+        grid = main[1].grid
+        parts |= {
+            "valid": _rows(grid.valid), "outlines_px": outlines(grid), "n_modes": main[1].matrix.n_modes,
+        }  # fmt: skip
+    if run.layout is not None:
+        parts["layout"] = _rows(run.layout)
+    if run.places_m is not None:
+        parts["positions_m"] = tuple((float(x), float(y)) for x, y in run.places_m)
+    return Geometry.model_validate(parts)
+
+
+def _rows(mask: NDArray[np.bool_]) -> tuple[str, ...]:
+    return tuple("".join("1" if valid else "0" for valid in row) for row in mask)
 
 
 def _loop_state(run: RunContent) -> LoopState:
@@ -191,7 +155,6 @@ def _loop_state(run: RunContent) -> LoopState:
         return LoopState()
     label, loop = list(run.loops.items())[-1]
     peak = None if loop.strehl is None else loop.strehl.peak
-    known = peak is not None and np.isfinite(peak.sigma)
     return LoopState(
         closed=False,
         matrix=label,
@@ -200,12 +163,12 @@ def _loop_state(run: RunContent) -> LoopState:
         dropped_modes=loop.dropped_modes,
         residual_nm=loop.residual_rms_nm,
         strehl=None if peak is None else peak.value,
-        strehl_sigma=peak.sigma if peak is not None and known else None,
+        strehl_sigma=peak.sigma if peak is not None and np.isfinite(peak.sigma) else None,
     )
 
 
 def _products(run: RunContent) -> tuple[ProductEntry, ...]:
-    """Every FITS product by name, the run's main matrix last."""
+    """All FITS products, the run's main matrix last."""
     main = main_calibration(run)
     products = [
         ProductEntry(name=name, kind=_kind(run, name), path=str(path))
@@ -223,14 +186,14 @@ def _kind(run: RunContent, name: str) -> str:
     return {KIND_MATRIX: "matrix", KIND_GAINS: "gains"}.get(run.kinds.get(name, ""), "psf")
 
 
-def _log_lines(text: str) -> tuple[LogLine, ...]:
-    """Lines of ``run.log``; what follows a line without a head of its own belongs to it."""
+def _log_lines(content: str) -> tuple[LogLine, ...]:
+    """Entries of ``run.log``; a line without time and level continues the entry before."""
     lines: list[dict[str, Any]] = []
-    for raw in text.splitlines():
+    for raw in content.splitlines():
         head = _LOG_LINE.fullmatch(raw)
         if head is not None:
-            at, level, logger, words = head.groups()
-            lines.append({"at_utc": at.replace(",", "."), "level": level, "logger": logger, "text": words})
+            at, level, logger, text = head.groups()
+            lines.append({"at_utc": at.replace(",", "."), "level": level, "logger": logger, "text": text})
         elif lines:
             lines[-1]["text"] += "\n" + raw
     return tuple(LogLine(number=number, **line) for number, line in enumerate(lines))

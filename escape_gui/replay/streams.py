@@ -1,4 +1,4 @@
-"""The streams that a run would have sent, from what it left behind."""
+"""Streams of a server, reconstructed from the products of a run."""
 
 from __future__ import annotations
 
@@ -21,45 +21,38 @@ Meta = Mapping[str, float | str]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedStream:
-    """What a stream held at any time of the run.
+    """Entries of a stream during a run."""
 
-    Parameters
-    ----------
-    length
-        Steps it came in.
-    at
-        Its entry after so many steps, 1 to ``length``; ``None``: not there yet.
-    meta
-        What it says of itself.
-    """
-
+    #: Number of steps.
     length: int
-    at: Callable[[int], NDArray[Any] | None]
+    #: Returns the entry after a step, 1 to ``length``.
+    at: Callable[[int], NDArray[Any]]
+    #: Metadata of all entries.
     meta: Meta
 
 
 def recorded_streams(run: RunContent) -> dict[str, RecordedStream]:
-    """Every stream that a run can fill, by name."""
-    found: dict[str, RecordedStream] = {}
+    """All streams for which a run has data, by name."""
+    streams: dict[str, RecordedStream] = {}
     main = main_calibration(run)
     if main is not None:
-        found |= _calibration(*main)
+        streams |= _calibration(*main)
     for label, gains in run.gains.items():
-        found |= _gains(label, gains)
+        streams |= _gains(label, gains)
     if run.loops:
-        found |= _loop(*list(run.loops.items())[-1])
+        streams |= _loop(*list(run.loops.items())[-1])
     track = run.document.get("track")
     if track and track["seconds"]:
         table = _table(track)
-        found["registration_track"] = RecordedStream(len(table), lambda n: table[:n], {"stage": "tracking"})
-    return found
+        streams["registration_track"] = RecordedStream(len(table), lambda n: table[:n], {"stage": "tracking"})
+    return streams
 
 
 def main_calibration(run: RunContent) -> tuple[str, CalibrationResult] | None:
-    """The calibration that a run was made for: the last one with a registration, or else the last one."""
+    """Label and result of a run's last calibration with a registration, else of its last calibration."""
     fitted = [item for item in run.calibrations.items() if item[1].registration is not None]
-    every = fitted or list(run.calibrations.items())
-    return every[-1] if every else None
+    candidates = fitted or list(run.calibrations.items())
+    return candidates[-1] if candidates else None
 
 
 def _constant_stream(data: NDArray[Any], meta: Meta) -> RecordedStream:
@@ -69,16 +62,16 @@ def _constant_stream(data: NDArray[Any], meta: Meta) -> RecordedStream:
 def _calibration(label: str, result: CalibrationResult) -> dict[str, RecordedStream]:
     matrix = result.measured or result.matrix
     meta: Meta = {"stage": label, "method": matrix.method, "frames": float(result.frames)}
-    found = {
+    streams = {
         "valid": _constant_stream(matrix.valid, meta),
         "matrix": _constant_stream(matrix.data, meta),
         "matrix_sigma": _constant_stream(matrix.sigma, meta),
     }
     if result.mean_frame is not None:
-        found["frames"] = _constant_stream(result.mean_frame, {"stage": "mean frame"})
+        streams["frames"] = _constant_stream(result.mean_frame, {"stage": "mean frame"})
     if result.registration is not None:
-        found |= _sprint(result.registration)
-    return found
+        streams |= _sprint(result.registration)
+    return streams
 
 
 def _sprint(estimate: RegistrationEstimate) -> dict[str, RecordedStream]:
@@ -86,7 +79,7 @@ def _sprint(estimate: RegistrationEstimate) -> dict[str, RecordedStream]:
     if not steps:
         return {}
     path = np.array([step.registration.to_array() for step in steps]) * TO_STREAM_UNITS
-    # The steps tell how the fit went; what came of it, model errors included, is the last word.
+    # The result differs from the last step by the corrections for model errors.
     path[-1] = estimate.registration.to_array() * TO_STREAM_UNITS
     norm = np.array([step.step_norm for step in steps])
     sigma, unknown = estimate.sigma * TO_STREAM_UNITS, np.full(len(PARAMETERS), np.nan)
@@ -115,23 +108,23 @@ def _gains(label: str, result: GainsResult) -> dict[str, RecordedStream]:
 
 def _loop(label: str, loop: LoopResult) -> dict[str, RecordedStream]:
     meta: Meta = {"stage": label}
-    found: dict[str, RecordedStream] = {}
+    streams: dict[str, RecordedStream] = {}
     if loop.last_frame is not None:
-        found["frames"] = _constant_stream(loop.last_frame, meta)
+        streams["frames"] = _constant_stream(loop.last_frame, meta)
     if loop.last_command.size:
-        found["commands"] = _constant_stream(loop.last_command, meta)
+        streams["commands"] = _constant_stream(loop.last_command, meta)
     if loop.psf is not None:
-        found["psf"] = _constant_stream(loop.psf, meta)
+        streams["psf"] = _constant_stream(loop.psf, meta)
     if loop.model_psf is not None:
-        found["model_psf"] = _constant_stream(loop.model_psf, meta)
+        streams["model_psf"] = _constant_stream(loop.model_psf, meta)
     residual = loop.residual_nm
     if residual.size:
-        found["residual"] = RecordedStream(residual.size, lambda k: residual[:k], meta)
-    return found
+        streams["residual"] = RecordedStream(residual.size, lambda k: residual[:k], meta)
+    return streams
 
 
 def _table(track: Mapping[str, Any]) -> NDArray[np.float64]:
-    """Rows of the stream ``registration_track`` from the document's columns."""
+    """Stream ``registration_track`` ``(n, 11)`` from the columns of the document."""
     names = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS))
     table = np.array([track[name] for name in names], float).T
     table[:, 1:6] *= TO_STREAM_UNITS

@@ -1,4 +1,4 @@
-"""SPRINT's course and the registration's drift, in the units and the form that they are shown in."""
+"""Convergence of SPRINT and drift of the registration, in the units in which they are shown."""
 
 from __future__ import annotations
 
@@ -10,37 +10,29 @@ from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
 
-#: Names of the parameters for people, in the order of ``PARAMETERS``.
+#: Titles of the parameters, in the order of ``PARAMETERS``.
 NAMES = ("Shift x", "Shift y", "Rotation", "Radial scaling", "Tangential scaling")
-#: Parameters that share a unit, and the axis they are read on.
+#: Groups of parameters with a common axis: title, unit, indices.
 GROUPS: tuple[tuple[str, str, tuple[int, ...]], ...] = (
     ("Shift", "% of a sub-aperture", (0, 1)),
     ("Rotation", "deg", (2,)),
     ("Scaling", "% of the diameter", (3, 4)),
 )
-#: Unit of each parameter, in their order.
+#: Unit of each parameter.
 UNITS = tuple(next(unit for _, unit, members in GROUPS if k in members) for k in range(len(NAMES)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConvergenceHistory:
-    """SPRINT so far.
+    """Iterations of SPRINT."""
 
-    Parameters
-    ----------
-    values
-        Parameters by iteration ``(n_iterations, 5)`` in the paper's units.
-    sigma
-        Standard errors of the last iteration ``(5,)``; NaN where they are not known yet.
-    step_norm
-        Relative norm of each step ``(n_iterations,)``; NaN where there was none (the start).
-    converged
-        ``None`` while it runs.
-    """
-
+    #: Parameters by iteration ``(n_iterations, 5)`` in the paper's units.
     values: NDArray[np.float64]
+    #: Standard errors of the last iteration ``(5,)``; NaN if not known yet.
     sigma: NDArray[np.float64]
+    #: Relative norm of each step ``(n_iterations,)``; NaN for the starting point.
     step_norm: NDArray[np.float64]
+    #: ``None`` during the fit.
     converged: bool | None = None
 
     @classmethod
@@ -51,72 +43,54 @@ class ConvergenceHistory:
         step_norm: NDArray[np.floating] | None,
         converged: bool | None = None,
     ) -> ConvergenceHistory:
-        """From the streams ``registration``, ``registration_sigma`` and ``step_norm``."""
+        """Build from the streams ``registration``, ``registration_sigma`` and ``step_norm``."""
         values = np.asarray(registration, float).reshape(-1, len(PARAMETERS)) / TO_STREAM_UNITS
         errors = np.full(len(PARAMETERS), np.nan)
         if sigma is not None and np.size(sigma) == errors.size:
             errors = np.asarray(sigma, float).ravel() / TO_STREAM_UNITS
         norm = np.full(len(values), np.nan)
         if step_norm is not None:
-            # Read at another moment, it may be one iteration ahead or behind.
-            given = np.asarray(step_norm, float).ravel()[: len(values)]
-            norm[: given.size] = np.where(given > 0, given, np.nan)
+            # The streams are read one after another and may differ by an iteration.
+            known = np.asarray(step_norm, float).ravel()[: len(values)]
+            norm[: known.size] = np.where(known > 0, known, np.nan)
         return cls(values, errors, norm, converged)
 
     @property
     def iterations(self) -> NDArray[np.int_]:
-        """Numbers of the iterations, from 1."""
         return np.arange(1, len(self.values) + 1)
 
-    @property
-    def scale(self) -> NDArray[np.float64]:
-        """What each parameter is divided by to be normalised ``(5,)``: its largest size on the way."""
+    def normalise(self) -> ConvergenceHistory:
+        """Divide each parameter by its largest magnitude (paper: SPRINT figure)."""
         largest = np.max(np.abs(self.values), axis=0, initial=0.0)
-        return np.where(largest > 0, largest, 1.0)
-
-    def normalised(self) -> ConvergenceHistory:
-        """Every parameter divided by its largest size, so that one axis serves all (paper: SPRINT figure)."""
-        return ConvergenceHistory(
-            self.values / self.scale, self.sigma / self.scale, self.step_norm, self.converged
-        )
+        scale = np.where(largest > 0, largest, 1.0)
+        return ConvergenceHistory(self.values / scale, self.sigma / scale, self.step_norm, self.converged)
 
     def headline(self) -> str:
-        """Its state in a few words."""
         n = len(self.values)
-        turns = f"{n} iteration{'' if n == 1 else 's'}"
-        if self.converged is None:
-            return f"running, {turns}"
-        return f"{'converged' if self.converged else 'NOT converged'}, {turns}"
+        state = {None: "running", True: "converged", False: "NOT converged"}[self.converged]
+        return f"{state}, {n} iteration{'' if n == 1 else 's'}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegistrationDrift:
-    """The registration over time.
+    """The registration over time."""
 
-    Parameters
-    ----------
-    time
-        Since tracking began ``(n,)``, in ``unit``.
-    unit
-        ``s``, ``min`` or ``h``, as the length asks.
-    values, sigma
-        ``(n, 5)`` in the paper's units.
-    marks
-        Moments worth a line: time in ``unit``, and what happened.
-    """
-
+    #: Time since the start of tracking ``(n,)``, in ``unit``.
     time: NDArray[np.float64]
+    #: ``s``, ``min`` or ``h``, depending on the duration.
     unit: str
+    #: Parameters and standard errors ``(n, 5)`` in the paper's units.
     values: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    #: Exchanges and alarms: time in ``unit``, kind of event.
     marks: tuple[tuple[float, str], ...] = ()
 
     @classmethod
     def of(cls, track: NDArray[np.floating], marks: Sequence[tuple[float, str]] = ()) -> RegistrationDrift:
-        """From the stream ``registration_track`` ``(n, 11)`` and marks at seconds."""
+        """Build from the stream ``registration_track`` ``(n, 11)`` and marks at times in seconds."""
         table = np.asarray(track, float).reshape(-1, 11)
         seconds = table[:, 0]
-        unit, size = time_unit(float(seconds[-1]) if seconds.size else 0.0)
+        unit, size = _time_unit(float(seconds[-1]) if seconds.size else 0.0)
         return cls(
             seconds / size,
             unit,
@@ -126,7 +100,7 @@ class RegistrationDrift:
         )
 
     def since_start(self) -> NDArray[np.float64]:
-        """Change of every parameter since its first known value ``(n, 5)``."""
+        """Difference of each parameter to its first finite value ``(n, 5)``."""
         if not len(self.values):
             return self.values
         known = np.isfinite(self.values)
@@ -134,15 +108,14 @@ class RegistrationDrift:
         return np.asarray(self.values - self.values[first, np.arange(self.values.shape[1])])
 
 
-def time_unit(seconds: float) -> tuple[str, float]:
-    """Unit that suits a length of time, and its size in seconds."""
+def _time_unit(seconds: float) -> tuple[str, float]:
     if seconds < 300:
         return "s", 1.0
     return ("min", 60.0) if seconds < 3 * 3600 else ("h", 3600.0)
 
 
 def short_unit(unit: str) -> str:
-    """A unit as an axis or a narrow column has room for it."""
+    """Abbreviation of a unit for axes and narrow columns."""
     return _SHORT.get(unit.lower(), unit)
 
 

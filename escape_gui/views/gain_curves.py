@@ -1,4 +1,4 @@
-"""Optical gains by mode, on two axes as in the paper."""
+"""Optical gains by mode, assigned to two axes as in the paper."""
 
 from __future__ import annotations
 
@@ -13,30 +13,22 @@ from escape_hw.api.optical_gains import OpticalGains
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GainCurve:
-    """Gains of one matrix.
+    """Optical gains relative to one matrix."""
 
-    Parameters
-    ----------
-    label
-        The matrix that they are relative to.
-    value, sigma
-        As measured ``(n_modes,)``; modes without a measurement are NaN.
-    trend, trend_sigma
-        Smooth course ``(n_modes,)``.
-    rounds
-        Gains by round of the bootstrap ``(n_rounds, n_modes)``.
-    """
-
+    #: Label of the matrix.
     label: str
+    #: Measured gains and standard errors ``(n_modes,)``; NaN for modes that were not measured.
     value: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    #: Gains smoothed over the modes, and their standard errors ``(n_modes,)``.
     trend: NDArray[np.float64]
     trend_sigma: NDArray[np.float64]
+    #: Gains by round of the bootstrap ``(n_rounds, n_modes)``.
     rounds: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
     @classmethod
     def of(cls, label: str, gains: OpticalGains, rounds: Sequence[NDArray[np.float64]] = ()) -> GainCurve:
-        """From a result; ``rounds`` are the gains after each round of its bootstrap."""
+        """Build from a result and the gains after each round of its bootstrap."""
         measured = np.isfinite(gains.sigma)
         return cls(
             label,
@@ -49,12 +41,11 @@ class GainCurve:
 
     @property
     def modes(self) -> NDArray[np.int_]:
-        """Numbers of the modes, from 1."""
         return np.arange(1, self.value.size + 1)
 
     @property
     def median(self) -> float:
-        """Median of the smooth course; NaN when there is nothing yet."""
+        """Median of the trend; NaN if there is none yet."""
         known = self.trend[np.isfinite(self.trend)]
         return float(np.median(known)) if known.size else float("nan")
 
@@ -66,16 +57,16 @@ def live_curve(
     smooth: NDArray[np.floating] | None,
     rounds: NDArray[np.floating] | None,
 ) -> GainCurve:
-    """From the streams ``gains``, ``gains_sigma``, ``gains_smooth`` and ``gains_rounds``.
+    """Build a curve from the streams ``gains``, ``gains_sigma``, ``gains_smooth`` and ``gains_rounds``.
 
-    They are read one after another, so one of another number of modes is left out.
+    The streams are read one after another; those with another number of modes than ``gains`` are ignored.
     """
     value = np.asarray(gains, float).ravel()
     unknown = np.full(value.size, np.nan)
 
     def matching(data: NDArray[np.floating] | None) -> NDArray[np.float64]:
-        good = data is not None and np.size(data) == value.size
-        return np.asarray(data, float).ravel() if good else unknown
+        matches = data is not None and np.size(data) == value.size
+        return np.asarray(data, float).ravel() if matches else unknown
 
     errors = matching(sigma)
     errors = np.where(np.isfinite(errors), errors, np.nan)
@@ -86,10 +77,11 @@ def live_curve(
 
 
 def axis_sides(curves: Mapping[str, GainCurve]) -> dict[str, str]:
-    """Axis that each curve is read on, ``left`` or ``right``.
+    """Axis of each curve by its label, ``left`` or ``right``.
 
-    Below 1, measured on a calmer beam than the loop's, left; above 1, measured in open loop, right
-    (paper: optical gain vectors). All on the left when they lie on the same side.
+    Gains below 1 (matrix measured with less turbulence than in the loop) are on the left axis, gains above 1
+    (matrix measured in open loop) on the right one (paper: optical gain vectors). If all curves are on one
+    side of 1, all are on the left axis.
     """
     above = {label: curve.median > 1 for label, curve in curves.items()}
     both = any(above.values()) and not all(above.values())

@@ -1,4 +1,4 @@
-"""What an edit of the loop's parameters would change, and what is wrong with it. Knows no widgets."""
+"""Edited parameters of the loop: differences to the current ones, and validation. No widgets."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pydantic import ValidationError
 from escape_hw.remote.requests import SetLoop
 from escape_hw.remote.state import LoopState
 
-#: Fields in the order of the form, with their names in words.
+#: Labels of the fields, in the order of the form.
 FIELDS = {"matrix": "matrix", "gain": "gain", "leak": "leak", "dropped_modes": "dropped modes"}
-#: Any client's name does to check the values of a request.
+#: Any client identifier will do to validate the values of a request.
 _PLACEHOLDER_CLIENT = "00000000"
 
 
 @dataclass(frozen=True, slots=True)
 class LoopSettingsEdit:
-    """Values as they stand in the form."""
+    """Values of the form."""
 
     matrix: str
     gain: float
@@ -26,7 +26,7 @@ class LoopSettingsEdit:
     dropped_modes: int
 
     def changed(self, loop: LoopState) -> dict[str, Any]:
-        """The values that differ from the loop's, by field."""
+        """Values that differ from those of the loop, by field."""
         values = {name: getattr(self, name) for name in FIELDS}
         return {
             name: value
@@ -35,24 +35,24 @@ class LoopSettingsEdit:
         }
 
     def describe_changes(self, loop: LoopState) -> str:
-        """What would change: ``gain 0.425 → 0.5``."""
+        """The changes, as in ``gain 0.425 → 0.5``."""
         changes = self.changed(loop)
         parts = (
             f"{FIELDS[name]} {_text(getattr(loop, name))} → {_text(new)}" for name, new in changes.items()
         )
-        return ", ".join(parts) or "nothing changes"
+        return ", ".join(parts) or "no changes"
 
     def validation_errors(self, loop: LoopState) -> tuple[str, ...]:
-        """Why the server would refuse it; empty when it would not."""
-        found = []
+        """Reasons why the server would reject the values; empty if valid."""
+        errors = []
         try:
             SetLoop(client=_PLACEHOLDER_CLIENT, **self.changed(loop))
         except ValidationError as error:
-            found += [f"{FIELDS[str(one['loc'][0])]}: {one['msg']}" for one in error.errors()]
-        all_modes = loop.modes + loop.dropped_modes
-        if loop.modes and self.dropped_modes >= all_modes:
-            found.append(f"dropped modes: {self.dropped_modes} of {all_modes} leaves none to control")
-        return tuple(found)
+            errors += [f"{FIELDS[str(one['loc'][0])]}: {one['msg']}" for one in error.errors()]
+        all_modes = loop.n_modes + loop.dropped_modes
+        if loop.n_modes and self.dropped_modes >= all_modes:
+            errors.append(f"dropped modes: {self.dropped_modes} of {all_modes} leaves none to control")
+        return tuple(errors)
 
 
 def _text(value: object) -> str:

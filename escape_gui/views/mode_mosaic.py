@@ -1,4 +1,4 @@
-"""Many slope maps as one picture: x and y of each mode side by side, modes row by row."""
+"""Mosaic of slope maps: x and y of each mode side by side, modes row by row in one image."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from escape_hw.api.interaction_matrix import snr_per_mode
 
-#: Ends of the colour scale, in units of the mode's rms slope (as in the report's figure).
+#: Limits of the colour scale, in units of the mode's rms slope (as in the report's figure).
 LIMIT = 2.5
-#: Index of what lies outside the pupil; values take the indices 1 to 255, zero is :data:`ZERO`.
+#: Colour index outside the pupil; values have the indices 1 to 255, a value of zero :data:`ZERO`.
 OUTSIDE, ZERO = 0, 128
 #: Pixels between the two maps of a mode and between modes.
 _GAP, _MARGIN = 1, 3
@@ -19,48 +19,38 @@ _GAP, _MARGIN = 1, 3
 
 @dataclass(frozen=True, slots=True)
 class MosaicLayout:
-    """Where the maps of a page stand in its picture.
+    """Positions of the maps in the image of a page. All lengths are in sub-apertures, one pixel each."""
 
-    Parameters
-    ----------
-    shape
-        Rows and columns of one map, in sub-apertures.
-    columns
-        Modes beside each other.
-    rows
-        Modes below each other.
-    head
-        Room above each map for its number, in sub-apertures.
-    """
-
+    #: Rows and columns of one map.
     shape: tuple[int, int]
+    #: Number of modes per row and per column of the page.
     columns: int
     rows: int
+    #: Space above each map for the number of the mode.
     head: int = 0
 
     @property
     def per_page(self) -> int:
-        """Modes on a page."""
         return self.columns * self.rows
 
     @property
     def cell(self) -> tuple[int, int]:
-        """Height and width of a mode's place with its margin, in sub-apertures."""
+        """Height and width of the cell of a mode with its margin."""
         return self.shape[0] + _MARGIN + self.head, 2 * self.shape[1] + _GAP + _MARGIN
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the picture, in sub-apertures."""
         height, width = self.cell
         return self.rows * height + _MARGIN, self.columns * width + _MARGIN
 
-    def corner(self, place: int) -> tuple[int, int]:
-        """Row and column of the first pixel of the map at a place of the page."""
+    def corner(self, position: int) -> tuple[int, int]:
+        """Row and column of the first pixel of the map at a position on the page."""
         height, width = self.cell
-        return _MARGIN + self.head + place // self.columns * height, _MARGIN + place % self.columns * width
+        line, place = divmod(position, self.columns)
+        return _MARGIN + self.head + line * height, _MARGIN + place * width
 
     def at(self, row: float, column: float) -> tuple[int, str, int, int] | None:
-        """What lies at a point of the picture: place on the page, ``x`` or ``y``, row and column there."""
+        """Position on the page, ``x`` or ``y``, row and column in the map at a point; ``None`` outside."""
         height, width = self.cell
         down, into_row = divmod(int(np.floor(row)) - _MARGIN - self.head, height)
         right, into_column = divmod(int(np.floor(column)) - _MARGIN, width)
@@ -75,20 +65,10 @@ class MosaicLayout:
 def fit_layout(
     shape: tuple[int, int], n_modes: int, size: tuple[float, float], min_width: float, head: float
 ) -> MosaicLayout:
-    """The layout that shows most modes in a window without making any smaller than wanted.
+    """The layout with the most modes per page, for a widget of ``size`` (width, height).
 
-    Parameters
-    ----------
-    shape
-        Rows and columns of one map.
-    n_modes
-        How many modes there are.
-    size
-        Width and height of the window, in screen pixels.
-    least
-        Least width of a mode's pair of maps, in screen pixels.
-    head
-        Height of the number above a map, in screen pixels.
+    ``min_width`` is the minimum width of a mode's pair of maps, ``head`` the height of the number above it,
+    all in screen pixels.
     """
     width, height = size
     best = MosaicLayout(shape, 1, 1)
@@ -105,90 +85,84 @@ def fit_layout(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeStatistics:
-    """What is said of every mode.
+    """Statistics of each mode."""
 
-    Parameters
-    ----------
-    rms
-        Rms slope per unit mode ``(n_modes,)``.
-    snr
-        Signal-to-noise ratio ``(n_modes,)``; infinite where no error is stated.
-    """
-
+    #: Rms slope per unit mode ``(n_modes,)``.
     rms: NDArray[np.float64]
+    #: Signal-to-noise ratio ``(n_modes,)``; infinite without standard errors.
     snr: NDArray[np.float64]
 
     @classmethod
     def of(cls, data: NDArray[np.floating], sigma: NDArray[np.floating] | None) -> ModeStatistics:
-        """Of a matrix ``(n_slopes, n_modes)`` and its standard errors, if they are known."""
+        """Compute from a matrix ``(n_slopes, n_modes)`` and its standard errors, if known."""
         rms = np.sqrt(np.mean(np.square(data, dtype=float), axis=0))
         if sigma is None or sigma.shape != data.shape:
             return cls(rms, np.full(rms.shape, np.inf))
         return cls(rms, np.asarray(snr_per_mode(data, np.nan_to_num(sigma, nan=0.0, posinf=0.0))))
 
     def wiener_weight(self) -> NDArray[np.float64]:
-        """Share of each mode's power that is signal, 0 to 1: the Wiener weight SNR² / (1 + SNR²)."""
+        """Fraction of each mode's power that is signal, SNR² / (1 + SNR²), from 0 to 1."""
         with np.errstate(invalid="ignore"):
             power = np.square(self.snr)
             return np.asarray(np.where(np.isinf(power), 1.0, power / (1.0 + power)))
 
 
-def normalised(data: NDArray[np.floating], statistics: ModeStatistics, fade: bool) -> NDArray[np.float32]:
-    """Every mode divided by its rms slope, so that all share one symmetric scale (paper: IM figures).
+def normalise_modes(
+    data: NDArray[np.floating], statistics: ModeStatistics, weight_by_snr: bool
+) -> NDArray[np.float32]:
+    """Divide each mode by its rms slope, for a common symmetric scale (paper: IM figures).
 
     Parameters
     ----------
     data
-        ``(n_slopes, n_modes)``.
-    fade
-        Draw a mode as pale as it is uncertain: noise alone would look like a strong mode otherwise.
+        Matrix ``(n_slopes, n_modes)``.
+    weight_by_snr
+        Multiply by the Wiener weight; otherwise noise looks like a strong mode.
     """
     scale = np.divide(1.0, statistics.rms, out=np.zeros_like(statistics.rms), where=statistics.rms > 0)
-    if fade:
+    if weight_by_snr:
         scale = scale * statistics.wiener_weight()
     return np.asarray(data * scale, dtype=np.float32)
 
 
 def colour_indices(values: NDArray[np.floating], limit: float = LIMIT) -> NDArray[np.uint8]:
-    """Colour indices of signed values: 1 to 255, zero at 128; what is not finite lies outside."""
+    """Colour indices of signed values, 1 to 255 with zero at 128; :data:`OUTSIDE` for NaN."""
     scaled = np.clip(np.nan_to_num(values, nan=0.0, posinf=limit, neginf=-limit) * (127 / limit), -127, 127)
-    painted = (np.rint(scaled) + ZERO).astype(np.uint8)
-    return np.where(np.isnan(values), np.uint8(OUTSIDE), painted)
+    indices = (np.rint(scaled) + ZERO).astype(np.uint8)
+    return np.where(np.isnan(values), np.uint8(OUTSIDE), indices)
 
 
 def page_modes(layout: MosaicLayout, n_modes: int, page: int) -> range:
-    """Modes on a page; an earlier page when there are not so many."""
+    """Modes on a page; ``page`` is limited to the pages there are."""
     page = max(0, min(page, pages(layout, n_modes) - 1))
     return range(page * layout.per_page, min(n_modes, (page + 1) * layout.per_page))
 
 
 def pages(layout: MosaicLayout, n_modes: int) -> int:
-    """How many pages the modes fill."""
+    """Number of pages."""
     return max(1, -(-n_modes // layout.per_page))
 
 
 def render_page(
     layout: MosaicLayout, valid: NDArray[np.bool_], values: NDArray[np.float32], modes: range
 ) -> NDArray[np.uint8]:
-    """The picture of a page, colour indices as of :func:`colour_indices`.
+    """Image of a page: colour indices as of :func:`colour_indices`.
 
     Parameters
     ----------
     valid
         Valid sub-apertures ``(rows, columns)``.
     values
-        ``(n_slopes, n_modes)``, see :func:`normalised`.
+        Normalised matrix ``(n_slopes, n_modes)``, see :func:`normalise_modes`.
     modes
         Modes of the page.
     """
-    picture = np.full(layout.size, OUTSIDE, np.uint8)
-    n, (rows, columns) = int(valid.sum()), layout.shape
-    painted = colour_indices(values[:, modes.start : modes.stop])
-    for place in range(len(modes)):
-        top, left = layout.corner(place)
-        for part in (0, 1):
+    image = np.full(layout.size, OUTSIDE, np.uint8)
+    rows, columns = layout.shape
+    indices = colour_indices(values[:, modes.start : modes.stop])
+    for position in range(len(modes)):
+        top, left = layout.corner(position)
+        for part, slopes in enumerate(np.split(indices[:, position], 2)):
             start = left + part * (columns + _GAP)
-            picture[top : top + rows, start : start + columns][valid] = painted[
-                part * n : (part + 1) * n, place
-            ]
-    return picture
+            image[top : top + rows, start : start + columns][valid] = slopes
+    return image

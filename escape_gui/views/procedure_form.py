@@ -1,4 +1,4 @@
-"""Arguments as text in a form, plans and progress as words."""
+"""Texts of the procedure panel: arguments, plan, progress, result."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from escape_hw.remote.state import (
 )
 from escape_hw.report.tables import TITLES, format_with_error
 
-#: What an argument without a value is called in a list of choices.
+#: Entry of a list of choices for an argument without a value.
 NO_CHOICE = "–"
 
 
@@ -103,20 +103,20 @@ def format_duration(seconds: float) -> str:
 
 def plan_lines(plan: ProcedurePlan) -> list[str]:
     """A plan in two lines: what it takes, and how far the mirror moves."""
-    stroke = f"pokes reach {100 * plan.stroke:.3g} % of the stroke" if plan.stroke else "no pokes"
+    stroke = f"poke amplitude up to {100 * plan.stroke:.3g} % of stroke" if plan.stroke else "no pokes"
     if not plan.frames:
-        return ["no frames, nothing moves: it computes with what was measured", ""]
-    return [f"{plan.frames} frames, {format_duration(plan.seconds)} at the camera's rate", stroke]
+        return ["no frames needed: computed from existing data", ""]
+    return [f"{plan.frames} frames, {format_duration(plan.seconds)} at the camera's frame rate", stroke]
 
 
 def progress_line(running: ActiveRun) -> str:
     """How far a procedure is."""
-    many = "s" if (running.total or running.done) != 1 else ""
+    many = "s" if (running.total or running.completed) != 1 else ""
     # What goes on until it is stopped has no total.
     whole = f" of {running.total}" if running.total else ""
-    line = f"{running.stage or running.name}: {running.done}{whole} {running.unit}{many}"
+    line = f"{running.stage or running.name}: {running.completed}{whole} {running.unit}{many}"
     if running.paused:
-        return f"{line}, paused"
+        return f"Paused. {line}"
     if running.remaining_s is not None and math.isfinite(running.remaining_s):
         line += f", {format_duration(running.remaining_s)} left"
     return line
@@ -138,11 +138,7 @@ def worst_mode(snr: np.ndarray[Any, np.dtype[np.float64]]) -> str:
 
 def result_line(ended: FinishedRun) -> str:
     """How a procedure ended, in one line."""
-    word = {
-        Finish.DONE: "Done",
-        Finish.ABORTED: "Aborted, what was measured is kept",
-        Finish.FAILED: "Failed",
-    }
+    word = {Finish.DONE: "Done", Finish.ABORTED: "Aborted, acquired data saved", Finish.FAILED: "Failed"}
     return f"{word[ended.finish]}: {ended.name}" + (f". {ended.message}" if ended.message else "")
 
 
@@ -176,7 +172,8 @@ def _registration_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None
         if not one or one.get("value") is None:
             continue
         title, unit = TITLES[name]
-        line = f"{title}: {format_with_error(Estimate(one['value'], one.get('sigma') or 0.0))} {short_unit(unit)}"
+        value = format_with_error(Estimate(one["value"], one.get("sigma") or 0.0))
+        line = f"{title}: {value} {short_unit(unit)}"
         last = old.get(name)
         if last and last.get("value") is not None:
             error = math.hypot(one.get("sigma") or 0.0, last.get("sigma") or 0.0)

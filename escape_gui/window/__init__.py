@@ -1,1 +1,1 @@
-"""Parts of the main window around the panels: actions, header, docks, workspaces, notifications, export, help, update timer."""
+"""Parts of the main window around the panels: actions, header, docks, notifications, export, help, timer."""

@@ -6,35 +6,26 @@ import io
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QBuffer, QIODevice
 from PySide6.QtWidgets import QFileDialog, QWidget
 
+from escape_gui.client.session import Session
 from escape_gui.panels.base import ExportArray, Panel
 from escape_gui.widgets.controls.status_indicator import Level
+from escape_gui.window.notifications import NotificationBar
 from escape_hw.errors import EscapeError
 from escape_hw.io.provenance import Provenance
 from escape_hw.io.storage import write_atomic
 from escape_hw.remote.state import State
 
-if TYPE_CHECKING:
-    from escape_gui.main_window import MainWindow
-
-
-#: Kind of the FITS files: what a screen showed, no calibration product.
+#: Kind of the FITS files: content of a panel, not a calibration product.
 KIND_SCREEN = "SCREEN"
 
 
 def save_png(path: Path, widget: QWidget) -> tuple[Path, ...]:
-    """Save a widget as it looks now.
-
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
-    """
+    """Save an image of a widget and return the path; raise `StorageError` if it cannot be written."""
     buffer = QBuffer()
     buffer.open(QIODevice.OpenModeFlag.WriteOnly)
     widget.grab().save(buffer, "PNG")
@@ -43,14 +34,9 @@ def save_png(path: Path, widget: QWidget) -> tuple[Path, ...]:
 
 
 def save_csv(path: Path, panel: Panel) -> tuple[Path, ...]:
-    """Save a panel's arrays as text, one file each when there are several.
+    """Save a panel's arrays as text and return the paths: one file per array.
 
-    Raises
-    ------
-    EscapeError
-        The panel shows no arrays now.
-    StorageError
-        A file cannot be written.
+    Raises `EscapeError` if the panel has no arrays yet, `StorageError` if a file cannot be written.
     """
     arrays = _arrays(panel)
     written = []
@@ -62,14 +48,9 @@ def save_csv(path: Path, panel: Panel) -> tuple[Path, ...]:
 
 
 def save_fits(path: Path, panel: Panel, state: State) -> tuple[Path, ...]:
-    """Save a panel's arrays as extensions of one FITS file with checksums.
+    """Save a panel's arrays as extensions of one FITS file with checksums, and return the path.
 
-    Raises
-    ------
-    EscapeError
-        The panel shows no arrays now.
-    StorageError
-        The file cannot be written.
+    Raises `EscapeError` if the panel has no arrays yet, `StorageError` if the file cannot be written.
     """
     from escape_hw.io.fits import file as fits_file
 
@@ -88,7 +69,7 @@ def save_fits(path: Path, panel: Panel, state: State) -> tuple[Path, ...]:
 def _arrays(panel: Panel) -> Sequence[ExportArray]:
     arrays = panel.export_arrays()
     if not arrays:
-        raise EscapeError(f"{panel.title} shows no numbers now; save its picture, or wait until it does")
+        raise EscapeError(f"{panel.title} has no data to export yet; save an image instead")
     return arrays
 
 
@@ -105,52 +86,47 @@ def _csv(one: ExportArray) -> str:
 
 
 class Exporter:
-    """Saves panels, and the window.
+    """Saves panels and the window into files that the user chooses, and reports it in a notification."""
 
-    Parameters
-    ----------
-    window
-        Whose panels.
-    """
+    def __init__(
+        self,
+        window: QWidget,
+        session: Session,
+        notifications: NotificationBar,
+        on_saved: Callable[[Path], None],
+    ) -> None:
+        self._window, self._session = window, session
+        self._notifications, self._on_saved = notifications, on_saved
 
-    def __init__(self, window: MainWindow) -> None:
-        self._window = window
-
-    def panel(self, kind: str, panel: Panel | None = None) -> None:
-        """Ask where, then save a panel as ``png``, ``csv`` or ``fits``; the one in focus by default."""
-        panel = panel or self._window.focused_panel()
+    def panel(self, kind: str, panel: Panel | None) -> None:
+        """Ask for a path and save a panel, if one has the focus, as ``png``, ``csv`` or ``fits``."""
         if panel is None:
             why = "Click a panel first, or use the ⤓ in its title."
-            self._window.notifications.show_message(Level.WARNING, "Which panel?", why)
-            return
-        path = self._ask_path(panel.name, kind)
-        if path is not None:
+            self._notifications.show_message(Level.WARNING, "Which panel?", why)
+        elif path := self._ask_path(panel.name, kind):
             self.save_panel_to(path, kind, panel)
 
     def window(self) -> None:
-        """Ask where, then save the whole window as a picture."""
-        path = self._ask_path("window", "png")
-        if path is not None:
+        """Ask for a path and save an image of the whole window."""
+        if path := self._ask_path("window", "png"):
             self._save(lambda: save_png(path, self._window))
 
     def save_panel_to(self, path: Path, kind: str, panel: Panel) -> None:
-        """Save a panel into this file."""
         if kind == "png":
             self._save(lambda: save_png(path, panel))
         elif kind == "csv":
             self._save(lambda: save_csv(path, panel))
         else:
-            state = self._window.context.session.source.state
-            self._save(lambda: save_fits(path, panel, state))
+            self._save(lambda: save_fits(path, panel, self._session.source.state))
 
     def _save(self, save: Callable[[], tuple[Path, ...]]) -> None:
         try:
             written = save()
         except EscapeError as error:
-            self._window.notifications.show_message(Level.ERROR, "Not saved", str(error))
+            self._notifications.show_message(Level.ERROR, "Not saved", str(error))
             return
-        self._window.set_status_text("saved", f"saved {written[-1].name}")
-        self._window.notifications.show_message(Level.GOOD, "Saved", "\n".join(str(path) for path in written))
+        self._on_saved(written[-1])
+        self._notifications.show_message(Level.GOOD, "Saved", "\n".join(str(path) for path in written))
 
     def _ask_path(self, name: str, kind: str) -> Path | None:
         moment = datetime.now().strftime("%Y-%m-%d_%H%M%S")

@@ -10,41 +10,47 @@ from PySide6.QtGui import QKeySequence
 from escape_gui.panels.base import Panel
 from escape_gui.window.actions import ACTIONS, MENUS
 
-#: Keys of the pictures, which work while one of them has the focus.
+#: Keys of an image that has the focus.
 IMAGE_KEYS = (
-    ("A", "levels once from what is shown now"),
+    ("A", "autoscale once"),
     ("L", "logarithmic or linear"),
-    ("R", "whole picture again"),
+    ("R", "reset view"),
     ("M", "next colour map"),
     ("arrows", "move the cursor by a pixel"),
 )
 
 
 def keyboard_table() -> str:
-    """HTML of the page."""
-    parts = ["<table cellspacing='6'>"]
+    """Table of all keyboard shortcuts, as HTML."""
+    lines = []
     for menu in MENUS:
-        rows = [(one, format_shortcuts(one.keys)) for one in ACTIONS if one.menu == menu and one.keys]
-        parts.append(f"<tr><td colspan='3'><b>{menu.replace('&', '')}</b></td></tr>")
-        for one, keys in rows:
-            parts.append(_row(keys, one.text.replace("&", "").rstrip("…"), one.tip))
-    parts.append("<tr><td colspan='3'><b>Pictures (click one first)</b></td></tr>")
-    parts += [_row(key, text, "") for key, text in IMAGE_KEYS]
-    parts.append(_row("Tab, Space, Enter", "go on, press", "Hold Space on a button that says so."))
-    return "".join([*parts, "</table>"])
+        lines.append(_heading(menu.replace("&", "")))
+        lines += [
+            _line(format_shortcuts(one.keys), one.text.replace("&", "").rstrip("…"), one.tip)
+            for one in ACTIONS
+            if one.menu == menu and one.keys
+        ]
+    lines.append(_heading("Images (click one first)"))
+    lines += [_line(key, text) for key, text in IMAGE_KEYS]
+    lines.append(_line("Tab, Space, Enter", "next, press", "Hold Space on a button labelled 'Hold to'."))
+    return f"<table cellspacing='6'>{''.join(lines)}</table>"
 
 
 def format_shortcuts(keys: tuple[str, ...]) -> str:
-    """Shortcuts as the system writes them."""
+    """Shortcuts in the notation of the operating system."""
     form = QKeySequence.SequenceFormat.NativeText
     return " or ".join(QKeySequence(key).toString(form) for key in keys)
 
 
-def _row(keys: str, text: str, tip: str) -> str:
+def _heading(text: str) -> str:
+    return f"<tr><td colspan='3'><b>{text}</b></td></tr>"
+
+
+def _line(keys: str, text: str, tip: str = "") -> str:
     return f"<tr><td><code>{escape(keys)}</code></td><td>{escape(text)}</td><td>{escape(tip)}</td></tr>"
 
 
 def help_page(panel: Panel) -> str:
-    """The page of a panel; its own two sentences where no page was written."""
+    """Help page of a panel in Markdown; its short help if there is no page."""
     path = files("escape_gui") / "help" / f"{panel.name}.md"
     return path.read_text(encoding="utf-8") if path.is_file() else panel.help

@@ -4,157 +4,117 @@ from __future__ import annotations
 
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QResizeEvent
-from PySide6.QtWidgets import QFrame, QHBoxLayout, QLabel, QSizePolicy, QToolButton, QWidget
+from PySide6.QtWidgets import QFrame, QLabel, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
 from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
+from escape_gui.widgets.layouts import caption, flat_button, row
 from escape_hw.remote.state import Finish, State
 
-#: How long a note stays; one about something bad stays until it is closed.
+#: Display time of a notification; errors stay until they are closed.
 DISPLAY_MS = 6000
 _MAX_NOTIFICATIONS = 4
 
 
 class Notification(QFrame):
-    """One note in one line; what does not fit stands in the tooltip.
-
-    Parameters
-    ----------
-    theme
-        Look.
-    level, title, text
-        What it says.
-    """
+    """A notification in one line; the tooltip has the whole text."""
 
     def __init__(self, theme: Theme, level: Level, title: str, text: str) -> None:
         super().__init__()
         self.title, self.text, self.level = title, text, level
         self._line = " · ".join(line.strip() for line in text.splitlines() if line.strip())
-        pill = StatusIndicator(theme)
-        pill.set_status(level, title)
-        self.close_button = QToolButton()
-        self.close_button.setObjectName("quiet")
-        self.close_button.setText("×")
-        self.close_button.setAccessibleName("Close this note")
-        self._words = QLabel(self._line)
-        self._words.setTextFormat(Qt.TextFormat.PlainText)
-        self._words.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        # It takes what room there is and asks for none: a long reason must not make the window wider.
-        self._words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
-        row = QHBoxLayout(self)
-        row.setContentsMargins(0, 0, 0, 0)
-        row.setSpacing(8)
-        row.addWidget(pill)
-        row.addWidget(self._words, 1)
-        row.addWidget(self.close_button)
+        indicator = StatusIndicator(theme)
+        indicator.set_status(level, title)
+        self.close_button = flat_button("×", "Close this notification")
+        self._label = QLabel(self._line)
+        self._label.setTextFormat(Qt.TextFormat.PlainText)
+        self._label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        # A long text must not widen the window.
+        self._label.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
+        row(indicator, (self._label, 1), self.close_button, parent=self)
         self.setToolTip(f"{title}\n{text}".strip())
         self.setAccessibleName(f"{title}: {text}")
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Cut the words where the room ends."""
         super().resizeEvent(event)
-        metrics = self._words.fontMetrics()
-        self._words.setText(metrics.elidedText(self._line, Qt.TextElideMode.ElideRight, self._words.width()))
+        metrics = self._label.fontMetrics()
+        self._label.setText(metrics.elidedText(self._line, Qt.TextElideMode.ElideRight, self._label.width()))
 
 
 class NotificationBar(QWidget):
-    """The notes of a window: the newest is seen, the others come back when it goes.
-
-    Parameters
-    ----------
-    theme
-        Look.
-    """
+    """The notifications of a window; only the newest is visible."""
 
     def __init__(self, theme: Theme) -> None:
         super().__init__()
         self._theme = theme
-        self._row = QHBoxLayout(self)
+        self._more = caption()
+        self._row = row(self._more, parent=self)
         self._row.setContentsMargins(8, 0, 8, 0)
-        self._row.setSpacing(8)
-        self._more = QLabel()
-        self._more.setObjectName("caption")
-        self._row.addWidget(self._more)
-        self.notes: list[Notification] = []
-        # Room for a note is always kept, so that no panel moves when one comes.
-        self.setMinimumHeight(self._height())
-        theme.changed.connect(lambda: self.setMinimumHeight(self._height()))
+        self.notifications: list[Notification] = []
+        # Fixed, so that panels do not move when a notification appears.
+        self.setMinimumHeight(theme.pixels(26))
+        theme.changed.connect(lambda: self.setMinimumHeight(theme.pixels(26)))
         self._show_newest()
 
     def show_message(self, level: Level, title: str, text: str, *, persistent: bool | None = None) -> None:
-        """Show a note until its time is over, or until it is closed; the oldest goes when there are many."""
-        while len(self.notes) >= _MAX_NOTIFICATIONS:
-            self._remove(self.notes[0])
-        note = Notification(self._theme, level, title, text)
-        note.close_button.clicked.connect(lambda: self._remove(note))
-        self.notes.append(note)
-        self._row.insertWidget(0, note, 1)
+        """Show a notification for :data:`DISPLAY_MS`; if ``persistent`` (default: errors), until closed."""
+        while len(self.notifications) >= _MAX_NOTIFICATIONS:
+            self._remove(self.notifications[0])
+        new = Notification(self._theme, level, title, text)
+        new.close_button.clicked.connect(lambda: self._remove(new))
+        self.notifications.append(new)
+        self._row.insertWidget(0, new, 1)
         if not (level is Level.ERROR if persistent is None else persistent):
-            timer = QTimer(note)
+            timer = QTimer(new)
             timer.setSingleShot(True)
-            timer.timeout.connect(lambda: self._remove(note))
+            timer.timeout.connect(lambda: self._remove(new))
             timer.start(DISPLAY_MS)
         self._show_newest()
 
-    def _remove(self, note: Notification) -> None:
-        if note in self.notes:
-            self.notes.remove(note)
-            self._row.removeWidget(note)
-            note.hide()
-            note.deleteLater()
+    def _remove(self, one: Notification) -> None:
+        if one in self.notifications:
+            self.notifications.remove(one)
+            self._row.removeWidget(one)
+            one.hide()
+            one.deleteLater()
             self._show_newest()
 
     def _show_newest(self) -> None:
-        for note in self.notes:
-            note.setVisible(note is self.notes[-1])
-        others = len(self.notes) - 1
+        for one in self.notifications:
+            one.setVisible(one is self.notifications[-1])
+        others = len(self.notifications) - 1
         self._more.setText(f"+{others}" if others > 0 else "")
-        self._more.setToolTip("Notes behind this one" if others > 0 else "")
-
-    def _height(self) -> int:
-        return self._theme.pixels(26)
+        self._more.setToolTip("Older notifications" if others > 0 else "")
 
 
 _LEVELS = {Finish.DONE: Level.GOOD, Finish.ABORTED: Level.WARNING, Finish.FAILED: Level.ERROR}
 
 
 class StateNotifier:
-    """Compares each state with the one before.
+    """Shows notifications for the changes from one state to the next."""
 
-    Parameters
-    ----------
-    toasts
-        Where notes are shown.
-    """
-
-    def __init__(self, notifications: NotificationBar) -> None:
-        self._toasts = notifications
+    def __init__(self, bar: NotificationBar) -> None:
+        self._bar = bar
         self._state: State | None = None
         self._connected = False
 
     def update(self, state: State, *, connected: bool) -> None:
-        """Tell what is new."""
+        """Report a lost server, start-up notices, a fault, and the end of a procedure."""
         before, was_connected = self._state, self._connected
         self._state, self._connected = state, connected
         if was_connected and not connected:
-            self._toasts.show_message(
-                Level.ERROR,
-                "Server lost",
-                "No word from the server. The window tries again by itself.",
-                persistent=False,
-            )
+            why = "Connection lost; reconnecting automatically."
+            self._bar.show_message(Level.ERROR, "Server lost", why, persistent=False)
         if not connected:
             return
         if before is None or not was_connected:
-            for note in state.notes:
-                self._toasts.show_message(Level.WARNING, "Found at start", note)
+            for notice in state.notes:
+                self._bar.show_message(Level.WARNING, "Startup notice", notice)
         if before is None:
             return
         if state.fault is not None and state.fault != before.fault:
-            self._toasts.show_message(Level.ERROR, "Fault, mirror made safe", state.fault.reason)
-        if state.last is not None and state.last != before.last:
-            last = state.last
-            where = f"\n{last.folder}" if last.folder else ""
-            self._toasts.show_message(
-                _LEVELS[last.finish], f"{last.name} {last.finish.value}", f"{last.message}{where}".strip()
-            )
+            self._bar.show_message(Level.ERROR, "Fault, mirror made safe", state.fault.reason)
+        if state.last_run is not None and state.last_run != before.last_run:
+            last = state.last_run
+            text = "\n".join(part for part in (last.message, last.folder) if part)
+            self._bar.show_message(_LEVELS[last.finish], f"{last.name} {last.finish.value}", text)

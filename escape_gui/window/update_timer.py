@@ -1,4 +1,4 @@
-"""The window's one timer: every panel that can be seen looks for news at its own rate."""
+"""The timer of a window, which refreshes each visible panel at the panel's rate."""
 
 from __future__ import annotations
 
@@ -13,19 +13,13 @@ from escape_gui.panels.base import Panel
 
 log = logging.getLogger(__name__)
 TICK_MS = 33
+_SLOW_TICK_S = 0.2
 
 
 class UpdateTimer(QObject):
-    """Pulls panels; a panel that fails is set aside with the reason on it, the others go on.
+    """Refreshes visible panels, and calls ``on_slow_tick`` five times a second.
 
-    Parameters
-    ----------
-    session
-        Where the data come from.
-    panels
-        All panels, seen or not.
-    chores
-        What the window itself does at 5 Hz.
+    A panel that raises is disabled and shows the reason.
     """
 
     def __init__(self, session: Session, panels: Iterable[Panel], on_slow_tick: Callable[[], None]) -> None:
@@ -34,6 +28,7 @@ class UpdateTimer(QObject):
         self._due = {panel.name: 0.0 for panel in self._panels}
         self._slow_tick_due = 0.0
         self.frozen = False
+        #: Reason by name of the panel; cleared when the source changes.
         self.failed_panels: dict[str, str] = {}
         session.changed.connect(self._reset_failures)
         self._timer = QTimer(self)
@@ -41,30 +36,24 @@ class UpdateTimer(QObject):
         self._timer.timeout.connect(self.tick)
 
     def start(self) -> None:
-        """Begin."""
         self._timer.start(TICK_MS)
 
     def stop(self) -> None:
-        """End."""
         self._timer.stop()
 
     def tick(self, *, force: bool = False) -> None:
-        """One round; ``force`` pulls each visible panel whether its time has come or not."""
+        """Refresh the visible panels that are due; ``force``: all visible panels."""
         now = time.monotonic()
         if not self.frozen:
             for panel in self._panels:
-                if force or now >= self._due[panel.name]:
-                    self._refresh_if_due(panel, now)
+                due = force or now >= self._due[panel.name]
+                if due and panel.name not in self.failed_panels and is_on_screen(panel):
+                    # Half a tick less: otherwise rates that divide the timer's would skip every second tick.
+                    self._due[panel.name] = now + 1 / panel.rate_hz - TICK_MS / 2000
+                    self._refresh_panel(panel)
         if force or now >= self._slow_tick_due:
-            self._slow_tick_due = now + 0.2
+            self._slow_tick_due = now + _SLOW_TICK_S
             self._on_slow_tick()
-
-    def _refresh_if_due(self, panel: Panel, now: float) -> None:
-        if panel.name in self.failed_panels or not is_on_screen(panel):
-            return
-        # Half a tick less, or rates that divide the timer's would lose every second turn.
-        self._due[panel.name] = now + 1 / panel.rate_hz - TICK_MS / 2000
-        self._refresh_panel(panel)
 
     def _refresh_panel(self, panel: Panel) -> None:
         try:
@@ -74,14 +63,13 @@ class UpdateTimer(QObject):
             reason = str(error) or type(error).__name__
             self.failed_panels[panel.name] = reason
             panel.show_placeholder(
-                True, f"This panel has stopped: {reason}\n\nThe log has the details. The rest goes on."
+                True, f"Panel failed: {reason}\n\nThe log has the details. Other panels are not affected."
             )
 
     def _reset_failures(self) -> None:
-        """With another source a panel gets another chance."""
         self.failed_panels.clear()
 
 
 def is_on_screen(panel: Panel) -> bool:
-    """Whether any of it is on the screen: not hidden, not behind another tab, not minimised."""
+    """Whether any part of a panel is visible: not hidden, behind another tab or minimised."""
     return panel.isVisible() and not panel.window().isMinimized() and not panel.visibleRegion().isEmpty()

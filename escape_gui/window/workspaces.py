@@ -1,4 +1,4 @@
-"""Which panels stand where: one arrangement for each kind of work."""
+"""Workspaces: the arrangement of the panels for alignment, calibration and operation."""
 
 from __future__ import annotations
 
@@ -7,21 +7,13 @@ from dataclasses import dataclass
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QDockWidget, QMainWindow, QTabBar
 
-#: Between docks, as the style sheet says.
+#: Width of the separator between docks in the style sheet.
 SEPARATOR_PX = 6
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Panels in one place, behind each other as tabs, the first in front.
-
-    Parameters
-    ----------
-    names
-        Panels' names.
-    share
-        Height relative to the other cells of the column.
-    """
+    """Panels as tabs, the first in front; ``share`` is the height relative to the other cells of a column."""
 
     names: tuple[str, ...]
     share: float = 1.0
@@ -29,7 +21,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Cells on top of each other; ``share`` is the width relative to the other columns."""
+    """Cells from top to bottom; ``share`` is the width relative to the other columns."""
 
     cells: tuple[Cell, ...]
     share: float = 1.0
@@ -37,7 +29,7 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Workspace:
-    """An arrangement with a name."""
+    """A named arrangement of panels."""
 
     name: str
     title: str
@@ -46,7 +38,6 @@ class Workspace:
 
     @property
     def panels(self) -> tuple[str, ...]:
-        """Names of all its panels."""
         return tuple(name for column in self.columns for cell in column.cells for name in cell.names)
 
 
@@ -66,9 +57,9 @@ WORKSPACES: tuple[Workspace, ...] = (
         "Calibrate",
         "Interaction matrix, registration, optical gains",
         (
-            # The form with its plan and its result takes a whole column of a small screen.
+            # Form, plan and result fill a column of a small screen.
             Column((Cell(("procedure",)),), 0.95),
-            # Mosaic and the chosen mode in all matrices are seen together.
+            # The mosaic and the detail of a mode share a column.
             Column((Cell(("modes",)),), 1.3),
             Column((Cell(("sprint",), 1.3), Cell(("gains", "camera", "devices", "log"), 1.0)), 1.15),
         ),
@@ -87,12 +78,12 @@ WORKSPACES: tuple[Workspace, ...] = (
 
 
 def workspace(name: str) -> Workspace:
-    """A workspace by name; the last one when there is none of that name."""
+    """A workspace by name; the last one if there is none of that name."""
     return next((one for one in WORKSPACES if one.name == name), WORKSPACES[-1])
 
 
 def arrange_docks(window: QMainWindow, docks: dict[str, QDockWidget], plan: Workspace) -> None:
-    """Put the docks of a workspace into their places and hide the others."""
+    """Arrange the docks of a workspace and hide the others."""
     for dock in docks.values():
         dock.setFloating(False)
         window.removeDockWidget(dock)
@@ -118,13 +109,13 @@ def arrange_docks(window: QMainWindow, docks: dict[str, QDockWidget], plan: Work
     if columns:
         _resize_docks(window, docks, columns, column_docks)
     for name in docks.keys() - set(plan.panels):
-        # Where the View menu will show it.
+        # Position if the View menu shows it.
         window.addDockWidget(Qt.DockWidgetArea.RightDockWidgetArea, docks[name])
         docks[name].hide()
 
 
 def hide_orphan_tab_bars(window: QMainWindow, docks: dict[str, QDockWidget]) -> None:
-    """Hide the tab bars of the arrangement before, which Qt leaves where they were."""
+    """Hide the tab bars of the previous arrangement, which Qt does not remove."""
     groups = [
         {one.windowTitle() for one in (dock, *window.tabifiedDockWidgets(dock)) if not one.isHidden()}
         for dock in docks.values()
@@ -156,9 +147,9 @@ def _resize_docks(
     columns: list[tuple[Column, list[Cell]]],
     column_docks: list[QDockWidget],
 ) -> None:
-    # Docks that together want more than the window has make it larger.
-    between = (len(columns) - 1) * SEPARATOR_PX
-    width = (window.width() - between) / sum(column.share for column, _ in columns)
+    # The sum must not exceed the window's width, or the window grows.
+    separators = (len(columns) - 1) * SEPARATOR_PX
+    width = (window.width() - separators) / sum(column.share for column, _ in columns)
     window.resizeDocks(
         column_docks, [round(column.share * width) for column, _ in columns], Qt.Orientation.Horizontal
     )

@@ -1,4 +1,4 @@
-"""Adaptive secondary mirrors: a thin shell that floats, knows where it is, and may fall asleep."""
+"""Interface of adaptive secondary mirrors: a floating thin shell with position sensors and states."""
 
 from __future__ import annotations
 
@@ -11,39 +11,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.mirror import DeformableMirror
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import DeviceError
 from escape_hw.safety.limits import MirrorLimits
 
 
 class ShellState(enum.StrEnum):
-    """Where an adaptive secondary stands, from off to running; a fault is latched."""
+    """State of an adaptive secondary. ``FAULT`` is latched."""
 
     #: Coils without power.
     OFF = "off"
-    #: Power on, the shell lies on its reference body.
+    #: Coils powered, shell on its reference body.
     RESTED = "rested"
-    #: The shell floats, flat.
+    #: Shell floating and flat.
     SET = "set"
-    #: The shell floats and follows commands.
+    #: Shell floating and following commands.
     RUNNING = "running"
-    #: Stopped by itself; stays so until somebody asks for recovery.
+    #: Stopped by the mirror itself until :meth:`AdaptiveSecondary.recover` is called.
     FAULT = "fault"
 
 
-#: The states that ``go_to`` moves through, one after the other.
+#: Order of the states that ``go_to`` steps through.
 STATE_ORDER = (ShellState.OFF, ShellState.RESTED, ShellState.SET, ShellState.RUNNING)
 
 
 @dataclass(frozen=True, slots=True)
 class ShellHealth:
-    """What the mirror says of itself.
+    """Health record of an adaptive secondary.
 
     Parameters
     ----------
     time_ns
-        When, on the device's clock.
+        Time on the device's clock.
     state
-        Where it stands.
+        State of the mirror.
     gap_m
         Mean gap between shell and reference body in metres.
     current_a
@@ -51,13 +52,13 @@ class ShellHealth:
     temperature_c
         Highest temperature in degrees Celsius.
     skipped
-        Commands that the mirror itself did not execute since it was opened.
+        Number of commands since ``open`` that the mirror did not execute.
     fault
-        Why it is in ``FAULT``, empty otherwise.
+        Cause of a fault, empty otherwise.
     contaminated
-        Actuators that the mirror itself took out of service.
+        Actuators that the mirror has disabled.
     owner
-        Who controls it, where it can tell.
+        Client that has control, if the mirror reports it.
     """
 
     time_ns: int
@@ -71,28 +72,28 @@ class ShellHealth:
     owner: str = ""
 
 
+@renamed_members(go="go_to", glance="observe_health")
 class AdaptiveSecondary(DeformableMirror):
-    """A deformable mirror with positions, health and states of its own.
+    """A deformable mirror with measured positions, a health record and states.
 
-    Commands are followed in the state ``RUNNING`` only. ``open`` leads there unless ``lift`` is
-    false; ``close`` flattens and rests the shell. A fault is latched: nothing but :meth:`recover`
-    ends it, and no command, no closing and no opening does. Drivers fill in ``_state``, ``_step``,
-    ``_recover``, ``_measure_positions``, ``_health`` and, where it can be watched without control, ``_observe_health``
-    beside those of a mirror.
+    The mirror follows commands in the state ``RUNNING`` only. ``open`` goes to that state unless ``lift``
+    is false; ``close`` flattens and rests the shell. Only :meth:`recover` ends a fault. In addition to the
+    hooks of a mirror, drivers implement ``_state``, ``_step``, ``_recover``, ``_measure_positions``,
+    ``_health`` and, if the mirror can be observed without control, ``_observe_health``.
 
     Parameters
     ----------
     name, limits
-        As for every mirror.
+        As for :class:`~escape_hw.api.mirror.DeformableMirror`.
     lift
-        Lead the mirror to ``RUNNING`` when it is opened.
+        Go to ``RUNNING`` on opening.
 
     Attributes
     ----------
     lift
-        As above; may be changed while it is closed.
+        As above; may be changed while the mirror is closed.
     leave_set
-        ``close`` leaves a floating shell afloat and flat instead of resting it.
+        ``close`` leaves a floating shell floating and flat instead of resting it.
     """
 
     def __init__(self, name: str, limits: MirrorLimits, *, lift: bool = True) -> None:
@@ -102,71 +103,65 @@ class AdaptiveSecondary(DeformableMirror):
 
     @property
     def state(self) -> ShellState:
-        """Where the mirror stands.
-
-        Raises
-        ------
-        NotOpen
-            The mirror is not connected.
-        """
+        """Present state. Raises :class:`NotOpen` if the mirror is not connected."""
         self.require_open()
         return self._state()
 
     @property
     def health(self) -> ShellHealth:
-        """What the mirror says of itself, now.
+        """Present health record.
 
         Raises
         ------
         NotOpen, DeviceError
-            The mirror is not connected, or does not answer.
+            The mirror is not connected or does not answer.
         """
         self.require_open()
         return self._health()
 
     @final
     def observe_health(self) -> ShellHealth:
-        """What the mirror says of itself, without taking control of it; works open or not.
+        """Health record without taking control of the mirror; works open or closed.
 
         Raises
         ------
         DeviceError
-            It does not answer, or can only be watched by who controls it.
+            The mirror does not answer, or reports its health only to the client in control.
         """
         return self._health() if self.is_open else self._observe_health()
 
     @final
     def measured_positions(self) -> NDArray[np.float64]:
-        """Where the actuators really are ``(n_act,)``, fractions of full stroke; NaN where unreadable.
+        """Measured actuator positions ``(n_act,)``, fractions of full stroke; NaN where unreadable.
 
         Raises
         ------
         NotOpen, DeviceError
-            The mirror is not connected, or did not deliver a position for each actuator.
+            The mirror is not connected, or did not return one position per actuator.
         """
         self.require_open()
-        places = np.array(self._measure_positions(), dtype=np.float64)
-        if places.shape != (self.info.n_act,):
+        positions = np.array(self._measure_positions(), dtype=np.float64)
+        if positions.shape != (self.info.n_act,):
             raise DeviceError(
-                self.name, f"reported positions of shape {places.shape} for {self.info.n_act} actuators"
+                self.name, f"reported positions of shape {positions.shape} for {self.info.n_act} actuators"
             )
-        return places
+        return positions
 
     @final
     def go_to(self, state: ShellState) -> None:
-        """Lead the mirror to a state, one step of the ladder after the other.
+        """Go to a state, stepping through the states in between (:data:`STATE_ORDER`).
 
         Raises
         ------
         NotOpen
             The mirror is not connected.
         DeviceError
-            A fault is latched, or the mirror did not follow.
+            A fault is latched, or the mirror did not reach a state.
         ValueError
-            ``FAULT`` is asked for.
+            ``state`` is ``FAULT``.
         """
         if state is ShellState.FAULT:
-            raise ValueError("nobody goes to a fault; choose off, rested, set or running")
+            raise ValueError("state is fault, which cannot be requested; choose off, rested, set or running")
         with self._lock:
             self.require_open()
             while (now := self._healthy_state()) is not state:
@@ -181,12 +176,12 @@ class AdaptiveSecondary(DeformableMirror):
                         f"is {self._state()}, not {next_state}, after a step from {now}; see its health",
                     )
                 if next_state is ShellState.SET:
-                    # A shell that floats anew is flat, whatever was sent before it was rested.
+                    # Lifting the shell makes it flat, regardless of the last command.
                     self._guard_when_open().reset(self.flat)
 
     @final
     def recover(self) -> None:
-        """End a fault: the shell is at rest afterwards. Does nothing when there is none.
+        """End a fault; the shell is at rest afterwards. Does nothing without a fault.
 
         Raises
         ------
@@ -208,12 +203,12 @@ class AdaptiveSecondary(DeformableMirror):
         return state
 
     def _fault_error(self, fault: str) -> DeviceError:
-        """The error of a mirror that stopped itself."""
-        return DeviceError(self.name, f"fault latched: {fault}; see to the cause, then call recover()")
+        return DeviceError(self.name, f"fault latched: {fault}; remove the cause, then call recover()")
 
     def _not_running_error(self, state: ShellState, why: str = "") -> DeviceError:
-        """The error of a mirror that is not running."""
-        return DeviceError(self.name, f"is {state} and follows no commands{why}; call go(ShellState.RUNNING)")
+        return DeviceError(
+            self.name, f"is {state} and follows no commands{why}; call go_to(ShellState.RUNNING)"
+        )
 
     def _accepts_commands(self) -> bool:
         return self._state() is ShellState.RUNNING
@@ -228,14 +223,14 @@ class AdaptiveSecondary(DeformableMirror):
         try:
             super()._before_close()
         except DeviceError as error:
-            # A shell that cannot be flattened is better at rest than afloat with nobody there.
+            # An unattended shell that cannot be flattened must not stay floating.
             self._clean_up(lambda: self._step_down(end), error)
             raise
         if self._state() in (ShellState.SET, ShellState.RUNNING):
             self.go_to(end)
 
     def _step_down(self, end: ShellState) -> None:
-        """Step down to a state without asking for a shape."""
+        """Step down to a state without flattening."""
         for state in reversed(STATE_ORDER[STATE_ORDER.index(end) : -1]):
             if self._state() in STATE_ORDER[STATE_ORDER.index(state) + 1 :]:
                 self._step(state)
@@ -250,12 +245,12 @@ class AdaptiveSecondary(DeformableMirror):
         return self._send_to_shell(command)
 
     def _known_state(self) -> ShellState:
-        """Where the mirror stood when it last spoke: asked before every command, so it must be cheap."""
+        """Last reported state; called before every command, so it must be fast."""
         return self._state()
 
     def _observe_health(self) -> ShellHealth:
-        """Ask for the health over a way that needs no control; the mirror is not open."""
-        raise DeviceError(self.name, "tells its health only to who controls it; open it first")
+        """Read the health record without control; called while the mirror is not open."""
+        raise DeviceError(self.name, "reports its health only to the client in control; open it first")
 
     @abc.abstractmethod
     def _send_to_shell(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -264,25 +259,25 @@ class AdaptiveSecondary(DeformableMirror):
         Returns
         -------
         ndarray or None
-            The shape it has now where it refused this one and kept another; ``None``: as commanded.
+            The present shape if the mirror skipped the command; ``None`` if it executed it.
         """
 
     @abc.abstractmethod
     def _state(self) -> ShellState:
-        """Where the mirror stands."""
+        """Present state."""
 
     @abc.abstractmethod
     def _step(self, state: ShellState) -> None:
-        """Go one step of the ladder, up or down, to ``state``."""
+        """Go to ``state``, which is adjacent to the present state in :data:`STATE_ORDER`."""
 
     @abc.abstractmethod
     def _recover(self) -> None:
-        """End a fault; leads to ``RESTED`` or ``OFF``."""
+        """End a fault; the state is ``RESTED`` or ``OFF`` afterwards."""
 
     @abc.abstractmethod
     def _measure_positions(self) -> NDArray[np.float64]:
-        """Positions ``(n_act,)``, fractions of full stroke."""
+        """Measured positions ``(n_act,)``, fractions of full stroke."""
 
     @abc.abstractmethod
     def _health(self) -> ShellHealth:
-        """Ask the mirror for its health."""
+        """Read the health record."""

@@ -1,42 +1,39 @@
-"""Benchmarks against other packages: what a stage returns and how two codes are timed fairly."""
+"""Benchmarks against other packages: result rows and timing of two functions in turn."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import DTypeLike
 
-from escape_hw.api.concurrency import limit_to_one_thread
-
 Preference = Literal["higher", "lower"]
 
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkRow:
-    """One measurement of ours beside a peer's, made in the same run on the same machine.
+    """One measurement of ESCAPE and of another package, in the same run on the same machine.
 
     Parameters
     ----------
     stage
-        Stage and measurement, such as ``optics: twin frames``.
+        Stage and measurement, for example ``optics: twin frames``.
     ours, peer
-        The two figures, in ``unit``; ``peer`` is ``None`` where it could not be measured.
+        Values of ESCAPE and of the other package, in ``unit``; ``peer`` is ``None`` if not measured.
     peer_name
-        Package, version and function that stand against us.
+        Package, version and function of the peer.
     unit
-        Unit of both figures.
+        Unit of both values.
     better
-        Which way is better.
+        Whether a higher or a lower value is better.
     note
         Agreement of the results, or why there is no peer.
     floor
-        What this machine could do at best, in ``unit``: the arithmetic that cannot be avoided at the
-        speed of its fastest matrix products, or the memory traffic; ``None`` where not counted.
+        Best possible value on this machine, in ``unit``, from the minimum number of operations at the
+        speed of its matrix products, or from the memory traffic; ``None`` if not computed.
     """
 
     stage: str
@@ -50,43 +47,43 @@ class BenchmarkRow:
 
     @property
     def reached(self) -> float | None:
-        """Share of the floor that ours reaches, at most 1."""
+        """Ratio of ``ours`` to the floor, in (0, 1]; ``None`` without a floor."""
         if self.floor is None or self.floor == 0 or self.ours == 0:
             return None
         return self.ours / self.floor if self.better == "higher" else self.floor / self.ours
 
     @property
     def ratio(self) -> float | None:
-        """How many times better ours is; below 1 it is worse."""
+        """Factor by which ``ours`` is better than ``peer``; below 1 it is worse."""
         if self.peer is None or self.peer == 0 or self.ours == 0:
             return None
         return self.ours / self.peer if self.better == "higher" else self.peer / self.ours
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, the ratio and the share of the floor included."""
+        """Plain values for JSON, with ``ratio`` and ``reached``."""
         return {**asdict(self), "ratio": self.ratio, "reached": self.reached}
 
 
-#: What an entry point of the group ``escape.benchmarks`` is: a function that measures.
+#: Type of an entry point of the group ``escape.benchmarks``.
 Benchmark = Callable[[], list[BenchmarkRow]]
 
 
 def time_alternately(
     ours: Callable[[], object], peer: Callable[[], object] | None, *, seconds: float = 1.0, rounds: int = 7
 ) -> tuple[float, float | None]:
-    """Median seconds per call of two functions timed in turn.
+    """Median seconds per call of two functions, timed in turn.
 
-    Both are called once beforehand, so that compilation and caches do not count. Turns are short and
-    alternate, so that what else the machine does falls on both alike.
+    Both are called once before timing, to exclude compilation. Short alternating rounds distribute other
+    load of the machine evenly.
 
     Parameters
     ----------
     ours, peer
-        The two functions; without a peer only ours is timed.
+        The two functions; without a peer only ``ours`` is timed.
     seconds
-        Wall-clock time to spend on each, about.
+        Approximate wall-clock time per function.
     rounds
-        Turns of each.
+        Number of rounds per function.
     """
     both = [f for f in (ours, peer) if f is not None]
     repeats = []
@@ -104,15 +101,7 @@ def time_alternately(
 
 
 def product_rate(dtype: DTypeLike = np.float32, size: int = 512) -> float:
-    """Floating-point operations per second of a large matrix product, for floors.
-
-    Parameters
-    ----------
-    dtype
-        Precision.
-    size
-        Rows and columns of the square factors.
-    """
+    """Floating-point operations per second of a product of two ``(size, size)`` matrices, for floors."""
     a = np.ones((size, size), dtype)
     times = [_elapsed(lambda: a @ a, 1) for _ in range(9)]
     return 2 * size**3 / min(times)
@@ -123,10 +112,3 @@ def _elapsed(call: Callable[[], object], repeats: int) -> float:
     for _ in range(repeats):
         call()
     return time.perf_counter() - start
-
-
-@contextmanager
-def single_thread() -> Iterator[None]:
-    """Hold the linear-algebra libraries to one thread, for thread pools fight and hide the cost."""
-    with limit_to_one_thread():
-        yield

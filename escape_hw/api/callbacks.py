@@ -1,4 +1,4 @@
-"""Taps: where a server looks at frames, slopes and commands that pass."""
+"""Callbacks for frames, slopes, commands and residuals of a bench; the server publishes them."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ P = ParamSpec("P")
 
 @dataclass(frozen=True, slots=True)
 class Callbacks:
-    """Who is told what passes through a bench; set them as ``Bench.taps`` before anything runs.
+    """Optional callbacks, called for every frame. Set them as ``Bench.callbacks`` before a procedure runs.
 
-    A tap is called in the thread of the loop and must take microseconds. What it gets is overwritten by
-    the next frame: it copies what it keeps. Where none is set, nothing is called.
+    A callback runs in the thread of the loop and must take microseconds. Its arrays are overwritten by the
+    next frame, so it copies what it needs later.
 
     Parameters
     ----------
     frame, science
-        Every frame of the sensor's and of the science camera.
+        Each frame of the wavefront sensor and of the science camera.
     slopes
-        Index of the sensor's newest frame, and slopes ``(n_slopes,)``, float32.
+        Index of the latest sensor frame, and slopes ``(n_slopes,)``, float32.
     command
-        What the mirror got ``(n_act,)``, float64, fraction of full stroke.
+        Command sent to the mirror ``(n_act,)``, float64, fraction of full stroke.
     geometry
-        The sensor's geometry, whenever slopes are about to be made on it.
+        Sensor geometry, before slopes are computed with it.
     residual
-        Of a closed loop: index of the frame, reconstructed residual ``(n_modes,)``, float32, and its rms,
-        both nm rms wavefront.
+        In closed loop: frame index, reconstructed residual ``(n_modes,)``, float32, and its rms, both in
+        nm rms wavefront.
     """
 
     frame: Callable[[Frame], object] | None = None
@@ -49,14 +49,14 @@ class Callbacks:
 
 
 def guarded_callback(name: str, callback: Callable[P, object] | None) -> Callable[P, None] | None:
-    """A tap that is dropped when it raises, instead of opening a loop.
+    """Wrap a callback so that an exception is logged and disables it instead of opening the loop.
 
     Parameters
     ----------
     name
-        What it is called in the log.
-    tap
-        ``None`` stays ``None``.
+        Name for the log.
+    callback
+        The callback; ``None`` is returned unchanged.
     """
     if callback is None:
         return None
@@ -67,7 +67,7 @@ def guarded_callback(name: str, callback: Callable[P, object] | None) -> Callabl
             try:
                 call(*args, **options)
             except Exception:
-                log.exception("the tap of %s failed and is dropped", name)
+                log.exception("the callback for %s failed and is disabled", name)
                 calls.clear()
 
     return call_until_failure

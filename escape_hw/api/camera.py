@@ -1,4 +1,4 @@
-"""Interface of cameras, with their frames, settings and counters."""
+"""Interface of cameras, and their frames, settings and counters."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.device import Device
 from escape_hw.api.representation import short_repr
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import DeviceError, FrameTimeout, SettingRejected
 
 
@@ -23,13 +24,13 @@ class Frame:
     Parameters
     ----------
     data
-        Counts ``(rows, columns)``, uint16, read-only, and not overwritten by later frames.
+        Counts ``(rows, columns)``, uint16, read-only, not overwritten by later frames.
     index
-        The device's own frame counter; a step larger than one is a lost frame.
+        Frame counter of the device; a step larger than one means lost frames.
     exposed_ns, arrived_ns
-        Monotonic time of the end of the exposure and of the arrival in this computer.
+        Monotonic time of the end of the exposure and of the arrival in this computer, nanoseconds.
     n_saturated
-        Number of pixels at the top of the scale.
+        Number of pixels at full scale.
     """
 
     data: NDArray[np.uint16]
@@ -52,7 +53,7 @@ class Region:
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Settings of a camera; ``check`` and ``configure`` answer with the achievable ones.
+    """Settings of a camera.
 
     Parameters
     ----------
@@ -84,29 +85,30 @@ class CameraInfo:
 
     @property
     def full_scale(self) -> int:
-        """Highest count a pixel can report."""
+        """Highest count of a pixel."""
         return int(2**self.bit_depth - 1)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameStatus:
-    """Counters of a camera since ``start``: delivered, lost (gaps of the index), time-outs."""
+    """Counters since ``start``: delivered frames, lost frames (gaps of the index), time-outs."""
 
     delivered: int = 0
     lost: int = 0
     timeouts: int = 0
 
 
+@renamed_members(tap="callback")
 class Camera(Device):
     """A camera. ``start`` and ``stop`` may be repeated; ``next_frame`` starts it when needed.
 
-    Drivers fill in ``_open``, ``_close``, ``_check``, ``_configure``, ``_start``, ``_stop`` and
+    Drivers implement ``_open``, ``_close``, ``_check``, ``_configure``, ``_start``, ``_stop`` and
     ``_next_frame``.
 
     Attributes
     ----------
-    tap
-        Told of every frame, see :class:`~escape_hw.api.callbacks.Callbacks`.
+    callback
+        Called with every frame, see :class:`~escape_hw.api.callbacks.Callbacks`.
     """
 
     def __init__(self, name: str) -> None:
@@ -133,12 +135,12 @@ class Camera(Device):
 
     @final
     def check(self, want: CameraSettings) -> CameraSettings:
-        """The nearest settings the device can do; changes nothing.
+        """Nearest achievable settings. Changes nothing.
 
         Raises
         ------
         SettingRejected
-            Nothing near ``want`` is possible; the message gives the allowed range.
+            The settings are outside the range of the device; the message gives the range.
         """
         self.require_open()
         rows, columns = self.info.sensor_shape
@@ -165,19 +167,19 @@ class Camera(Device):
 
     @final
     def configure(self, want: CameraSettings) -> CameraSettings:
-        """Set the camera; acquisition stops and restarts around it.
+        """Apply settings. Acquisition is stopped meanwhile.
 
         Returns
         -------
         CameraSettings
-            What the hardware really does, never what was asked.
+            The settings read back from the hardware.
 
         Raises
         ------
         SettingRejected
-            See :meth:`check`; the camera goes on as it was.
+            See :meth:`check`; the camera is unchanged.
         DeviceError
-            The device failed on the way; acquisition is stopped.
+            The device failed; acquisition is stopped.
         """
         achievable = self.check(want)
         running = self._running
@@ -211,16 +213,16 @@ class Camera(Device):
         Parameters
         ----------
         timeout_s
-            Longest wait in seconds, counted on the device's own clock.
+            Longest wait in seconds, on the device's clock.
 
         Raises
         ------
         FrameTimeout
-            No frame in time.
+            No frame arrived in time.
         DeviceLost
-            The camera has gone.
+            The camera was disconnected.
         DeviceError
-            The frame counter did not rise.
+            The frame counter did not increase.
         """
         self.require_open()
         if not 0 < timeout_s < math.inf:
@@ -235,15 +237,14 @@ class Camera(Device):
 
     @final
     def poll(self) -> Frame | None:
-        """The next frame if one has arrived already, else ``None``; starts acquisition when needed.
+        """The next frame if one has arrived, else ``None``; starts acquisition when needed.
 
-        This is how a loop reads a slower camera on its way without waiting for it. An empty poll
-        counts as no time-out.
+        A loop reads a slower camera this way without waiting. ``None`` does not count as a time-out.
 
         Raises
         ------
         DeviceLost
-            The camera has gone.
+            The camera was disconnected.
         """
         self.require_open()
         self.start()
@@ -260,7 +261,7 @@ class Camera(Device):
                 raise DeviceError(
                     self.name,
                     f"frame index went from {self._last_index} to {frame.index}; "
-                    "the counter must rise (was the camera reset?)",
+                    "the counter must increase (was the camera reset?)",
                 )
             self._lost += frame.index - self._last_index - 1
         self._last_index = frame.index
@@ -271,7 +272,7 @@ class Camera(Device):
 
     @property
     def last_index(self) -> int:
-        """Index of the newest frame since ``start``; -1 before the first."""
+        """Index of the latest frame since ``start``; -1 before the first."""
         return -1 if self._last_index is None else self._last_index
 
     def status(self) -> FrameStatus:
@@ -287,7 +288,7 @@ class Camera(Device):
 
     @abc.abstractmethod
     def _configure(self, settings: CameraSettings) -> None:
-        """Apply settings that came from ``_check``."""
+        """Apply settings returned by ``_check``."""
 
     @abc.abstractmethod
     def _start(self) -> None:
@@ -299,14 +300,13 @@ class Camera(Device):
 
     @abc.abstractmethod
     def _next_frame(self, timeout_s: float) -> Frame:
-        """Deliver the next frame or raise :class:`FrameTimeout`.
+        """Return the next frame or raise :class:`FrameTimeout`.
 
-        The frame's array is never written to again: a buffer that the driver will reuse must be
-        copied first.
+        The array of the frame must not change afterwards: copy a buffer that the driver reuses.
         """
 
     def _poll(self) -> Frame | None:
-        """Deliver a frame that has already arrived, or ``None``; by default a very short wait."""
+        """Return a frame that has arrived, or ``None``; by default waits for 1 us."""
         try:
             return self._next_frame(1e-6)
         except FrameTimeout:

@@ -1,4 +1,4 @@
-"""A flag that signal handlers may set, and limits on the threads of numerical libraries. Standard library only at import."""
+"""Signal-safe flag, and limits on the threads of numerical libraries. Imports only the standard library."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 class SignalSafeFlag:
     """A flag that a signal handler may set.
 
-    It takes no lock, unlike :class:`threading.Event`: a handler that interrupts itself in the midst
-    of setting an event waits for itself for ever.
+    It takes no lock. A handler that interrupts itself while it sets a :class:`threading.Event` would
+    deadlock.
     """
 
     __slots__ = ("_set",)
@@ -21,11 +21,11 @@ class SignalSafeFlag:
         self._set = False
 
     def set(self) -> None:
-        """Raise the flag."""
+        """Set the flag."""
         self._set = True
 
     def is_set(self) -> bool:
-        """Whether it was raised."""
+        """Whether the flag is set."""
         return self._set
 
 
@@ -33,31 +33,30 @@ _helper_threads_allowed = True
 
 
 def disable_helper_threads() -> None:
-    """Say that this process is one of as many as there are cores: helper threads would only be in the way.
+    """Use no helper threads in this process from now on, because one process per core is running.
 
-    Holds for the rest of the process. What was built before keeps its threads.
+    Existing objects keep their threads.
     """
     global _helper_threads_allowed
     _helper_threads_allowed = False
 
 
 def helper_threads_allowed() -> bool:
-    """Whether threads beside the calling one are welcome; see :func:`disable_helper_threads`."""
+    """Whether helper threads may be used; see :func:`disable_helper_threads`."""
     return _helper_threads_allowed
 
 
 def limit_to_one_thread() -> threadpool_limits:
-    """Hold the linear-algebra libraries to one thread.
+    """Limit the linear-algebra libraries to one thread.
 
-    Small products, as a loop makes them, are slower on many threads, and pools that spin for each
-    other can make them a hundred times slower.
+    Small matrix products are slower on several threads, up to a hundred times when spinning thread pools
+    compete for the cores.
 
     Returns
     -------
     threadpool_limits
-        Usable in a ``with`` statement; its ``restore_original_limits`` ends the hold.
+        Context manager; its ``restore_original_limits`` removes the limit.
     """
-    # Compiled code calls the library that SciPy brings, and only loaded libraries can be held.
     from threadpoolctl import threadpool_limits
 
     return threadpool_limits(limits=1)

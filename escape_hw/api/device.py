@@ -1,4 +1,4 @@
-"""What every device has: a name, open and close, and nothing that happens by itself."""
+"""Base class of all devices: name, opening and closing."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ log = logging.getLogger(__name__)
 class Device(abc.ABC):
     """A device that is opened, used and closed; usable as a context manager.
 
-    ``open`` and ``close`` may be called any number of times, from any thread. Nothing happens on
-    garbage collection, and no vendor library is loaded before ``open``. Drivers fill in ``_open``
-    and ``_close``.
+    ``open`` and ``close`` are idempotent and thread-safe. Nothing happens on garbage collection, and no
+    vendor library is loaded before ``open``. Drivers implement ``_open`` and ``_close``.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
         self._is_open = False
-        #: Held while the connection changes, and by the kinds that must not be closed mid-transfer.
+        #: Held while the connection changes, and during transfers that closing must not interrupt.
         self._lock = threading.RLock()
 
     @property
@@ -41,7 +40,7 @@ class Device(abc.ABC):
         Raises
         ------
         DeviceError
-            The device cannot be reached; nothing is left half open.
+            The device cannot be reached; everything opened so far is closed.
         """
         with self._lock:
             if self._is_open:
@@ -62,15 +61,15 @@ class Device(abc.ABC):
 
     @final
     def close(self) -> None:
-        """Leave the device safe and disconnect; does nothing when already closed.
+        """Make the device safe and disconnect; does nothing when already closed.
 
-        The connection is closed even when the device cannot be left safe any more.
+        The connection is closed even if the device cannot be made safe.
 
         Raises
         ------
         DeviceError
-            The device could not be left safe (a mirror that was lost is not flat), or did not
-            disconnect. It counts as closed all the same.
+            The device could not be made safe (for example, a mirror could not be flattened) or did not
+            disconnect. It counts as closed.
         """
         with self._lock:
             if not self._is_open:
@@ -101,20 +100,20 @@ class Device(abc.ABC):
             raise NotOpen(self.name, "not open; call open() first, or use it in a 'with' statement")
 
     def now_ns(self) -> int:
-        """The device's monotonic clock in nanoseconds (a twin's clock is simulated)."""
+        """Monotonic clock of the device in nanoseconds; the clock of a twin is simulated."""
         return time.monotonic_ns()
 
     def _clean_up(self, step: Callable[[], None], cause: BaseException) -> None:
-        """Take a last step after a failure; if it fails too, the first cause stays the news."""
+        """Run a clean-up step after a failure; its own failure is added to the first one as a note."""
         try:
             step()
         except Exception as second:
             if type(second) is type(cause) and str(second) == str(cause):
-                # A device that is gone says the same of every further step.
-                log.debug("again while clearing up: %s", second)
+                # A lost device fails in the same way at every step.
+                log.debug("same failure during clean-up: %s", second)
                 return
-            log.warning("further failure while clearing up: %s: %s", type(second).__name__, second)
-            cause.add_note(f"and then, while clearing up: {type(second).__name__}: {second}")
+            log.warning("further failure during clean-up: %s: %s", type(second).__name__, second)
+            cause.add_note(f"then, during clean-up: {type(second).__name__}: {second}")
 
     @abc.abstractmethod
     def _open(self) -> None:
@@ -122,13 +121,13 @@ class Device(abc.ABC):
 
     @abc.abstractmethod
     def _close(self) -> None:
-        """Disconnect; must not raise when the device has already gone."""
+        """Disconnect; must not raise when the device is already disconnected."""
 
-    def _release_after_failed_open(self) -> None:
-        """Release whatever a failed ``_open`` left behind."""
+    def _release_after_failed_open(self) -> None:  # noqa: B027 - an optional hook
+        """Release resources that a failed ``_open`` has acquired."""
 
-    def _after_open(self) -> None:
-        """Work of the kind's base class once connected."""
+    def _after_open(self) -> None:  # noqa: B027 - an optional hook
+        """Hook for the base class of a kind of device, called after ``_open``."""
 
-    def _before_close(self) -> None:
-        """Work of the kind's base class before disconnecting, such as flattening a mirror."""
+    def _before_close(self) -> None:  # noqa: B027 - an optional hook
+        """Hook for the base class of a kind of device, called before ``_close``: flattens a mirror."""

@@ -1,4 +1,4 @@
-"""What packages tell about devices and libraries that are there, for ``escape discover`` and ``doctor``."""
+"""Interfaces for finding devices and vendor libraries (``escape discover``, ``escape doctor``)."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ class DiscoveredDevice:
     Parameters
     ----------
     kind
-        What it is: ``deformable mirror``, ``camera``, ``modulator``, ``adaptive secondary``.
+        ``deformable mirror``, ``camera``, ``modulator`` or ``adaptive secondary``.
     model, serial
-        As it tells them; may be empty.
+        As reported by the device; may be empty.
     where
         File, address or folder.
     driver
-        Which driver drives it.
+        Name of its driver.
     in_use_by
-        Who has it open now, as far as can be seen.
+        Processes that have it open, as far as known.
     toml
-        Lines to paste into the system's file.
+        Lines for the system file.
     """
 
     kind: str
@@ -36,25 +36,25 @@ class DiscoveredDevice:
     toml: str
 
 
-#: What an entry point of the group ``escape.discover`` is: looks at hosts (``name`` or ``name:port``).
+#: Type of an entry point of the group ``escape.discover``: searches hosts (``name`` or ``name:port``).
 Discoverer = Callable[[Sequence[str]], list[DiscoveredDevice]]
 
 
 class NativeLibrary(Protocol):
-    """What an entry point of the group ``escape.libraries`` is, by the name of the driver that loads it."""
+    """Type of an entry point of the group ``escape.libraries``, named after the driver that loads it."""
 
     @property
     def title(self) -> str:
-        """Name for people."""
+        """Display name."""
 
     @property
     def default(self) -> tuple[str, ...]:
-        """File names that the system's loader is asked for, the preferred one first."""
+        """File names for the system's loader, in order of preference."""
 
     @property
     def variable(self) -> str:
-        """Environment variable that may hold a path."""
+        """Environment variable with the path of the library."""
 
     @property
     def source(self) -> str:
-        """How to come by it."""
+        """Where to obtain the library."""

@@ -1,4 +1,4 @@
-"""Interfaces of device emulators and of the simulated bench behind stand-ins of vendor libraries."""
+"""Interfaces of device emulators and of the simulated bench behind the vendor-library stand-ins."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ from typing import Any, Protocol, Self
 
 @dataclass(frozen=True, slots=True)
 class EmulatorRequest:
-    """How an emulator is wanted.
+    """Settings of an emulator.
 
     Parameters
     ----------
     host
-        Address of the network interface that it listens on.
+        Address to listen on.
     port
-        TCP port; ``None``: the one that the real device has, 0: any that is free.
+        TCP port; ``None``: the port of the real device, 0: any free port.
     pty
-        Answer on a pseudo-terminal (a serial line) instead of on the network.
+        Use a pseudo-terminal (a serial line) instead of the network.
     options
-        Further settings that only this emulator understands, as text.
+        Settings specific to this emulator, as text.
     shared
-        Dictionary of an opened system, through which the emulator finds the twins that it belongs to;
-        ``None``: it stands alone.
+        Dictionary shared by the twins of an opened system; ``None`` for an emulator without a system.
     config
-        Configuration of that system (a :class:`~escape_hw.config.system.SystemConfig`).
+        Configuration of that system (:class:`~escape_hw.config.system.SystemConfig`).
     """
 
     host: str = "127.0.0.1"
@@ -39,34 +38,39 @@ class EmulatorRequest:
 
 
 class Emulator(abc.ABC):
-    """A device that answers on its own wire; usable as a context manager.
+    """An emulated device behind its real interface; usable as a context manager.
 
-    It is strict: whatever a careless driver gets away with on the bench for a while (a wrong order, an
-    error never asked for, a value out of range, a second owner) is written down in ``complaints``.
+    ``violations`` lists violations of the protocol that real hardware may tolerate: commands in the wrong
+    order, unread errors, values out of range, a second client.
     """
 
     @abc.abstractmethod
     def start(self) -> str:
-        """Begin to listen; returns where, such as ``tcp 127.0.0.1:50000`` or ``pty /dev/pts/4``.
+        """Start listening.
+
+        Returns
+        -------
+        str
+            The address, for example ``tcp 127.0.0.1:50000`` or ``pty /dev/pts/4``.
 
         Raises
         ------
         ConfigError
-            The address cannot be listened on.
+            The address is not available.
         """
 
     @abc.abstractmethod
     def stop(self) -> None:
-        """Hang up and stop listening; may be repeated."""
+        """Close all connections and stop listening; may be repeated."""
 
     @property
     @abc.abstractmethod
-    def complaints(self) -> tuple[str, ...]:
-        """What clients did that a careful driver would not, in order."""
+    def violations(self) -> tuple[str, ...]:
+        """Protocol violations of clients, in order."""
 
     @abc.abstractmethod
     def report(self) -> dict[str, Any]:
-        """Counters and the device's present state, as plain values."""
+        """Counters and present state of the device, as plain values."""
 
     def __enter__(self) -> Self:
         self.start()
@@ -78,30 +82,30 @@ class Emulator(abc.ABC):
         self.stop()
 
 
-#: What an entry point of the group ``escape.emulators`` is. Raises ``ConfigError`` on an unknown option.
+#: Type of an entry point of the group ``escape.emulators``; raises ``ConfigError`` on an unknown option.
 EmulatorFactory = Callable[[EmulatorRequest], Emulator]
 
 
 class StandInBench(Protocol):
-    """A simulated bench that real drivers reach, each through its own library."""
+    """A simulated bench that real drivers access through stand-ins of their vendor libraries."""
 
     @property
     def environment(self) -> Mapping[str, str]:
-        """What a process needs in its environment for its drivers to find the bench."""
+        """Environment variables with which the drivers of a process find the bench."""
 
     def start(self) -> str:
-        """Begin to serve; returns where.
+        """Start serving; returns the address.
 
         Raises
         ------
         EscapeError
-            This machine cannot: it has no C compiler, for instance.
+            The bench cannot run on this machine, for example for lack of a C compiler.
         """
 
     def stop(self) -> None:
-        """Hang up on everybody; may be repeated."""
+        """Close all connections; may be repeated."""
 
 
-#: What an entry point of the group ``escape.rehearsals`` is: takes the configuration of the system
+#: Type of an entry point of the group ``escape.stand_ins``; called with the configuration of the system
 #: (:class:`~escape_hw.config.system.SystemConfig`).
 StandInBenchFactory = Callable[[Any], StandInBench]

@@ -1,4 +1,4 @@
-"""Interaction matrices that carry what they mean."""
+"""Interaction matrix with mask, basis, standard errors and provenance."""
 
 from __future__ import annotations
 
@@ -20,21 +20,23 @@ class InteractionMatrix:
     data
         ``(n_slopes, n_modes)``, slopes per unit mode (paper Eq. s = D c).
     sigma
-        Standard error of every element, same shape, beside what a common gain adds: a matrix that rests
-        on DO-CRIME gives the relative standard error of that as ``metrics["gain_sigma"]``.
+        Standard error of every element, same shape, without the error of the common gain. For DO-CRIME the
+        relative standard error of that gain is ``metrics["gain_sigma"]``.
     m2c
         Mode-to-command matrix ``(n_act, n_modes)``; columns have unit rms surface over the pupil.
     valid
         Valid sub-apertures, boolean ``(n_rows, n_columns)``.
     system
-        Name of the system it was measured on.
+        Name of the system.
     method
         ``push-pull``, ``push-pull-fast``, ``modulated``, ``docrime``, ``docrime-whitened`` or ``escape``;
         ``docrime-closed`` and ``push-pull-fast-closed`` were measured in closed loop.
     simulated
-        True when any device that took part was simulated.
+        True when any device was simulated.
     metrics
-        Scalars that describe the measurement (frames, poke, delay, lost frames, ...).
+        Scalars of the measurement (frames, poke, delay, lost frames, ...).
+    slope_unit
+        Unit of the slopes.
     """
 
     data: NDArray[np.float32]
@@ -71,8 +73,8 @@ class InteractionMatrix:
     def snr(self) -> NDArray[np.float64]:
         """Signal-to-noise ratio per mode ``(n_modes,)``: rms of the column over rms of its errors.
 
-        The noise power is subtracted from the column's power, so pure noise gives 0, not 1.
-        Infinite where no error is stated.
+        The noise power is subtracted from the power of the column, so pure noise gives 0. Infinite where
+        the standard errors are zero.
         """
         return snr_per_mode(self.data, self.sigma)
 
@@ -91,7 +93,7 @@ class InteractionMatrix:
         return f"<{type(self).__name__} {self.method} of {system}: {size}; signal to noise {quality}>"
 
     def _summary(self) -> tuple[str, str, str]:
-        """Where it is from, how large it is, and how good."""
+        """System, size and signal-to-noise ratio as text."""
         snr = self.snr()
         all_finite = np.isfinite(snr).all()
         return (
@@ -101,7 +103,7 @@ class InteractionMatrix:
         )
 
     def _repr_html_(self) -> str:
-        """For notebooks: the matrix in small, what it is of, and how good it is."""
+        """Thumbnail and summary for notebooks."""
         system, size, quality = self._summary()
         rows: dict[str, object] = {
             "method": self.method,

@@ -1,4 +1,4 @@
-"""Deformable mirrors: one checked way in, for twins and metal alike."""
+"""Interface of deformable mirrors; the guard limits every command, of twins and hardware."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from escape_hw.api.device import Device
 from escape_hw.api.representation import short_repr
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import CommandRejected, DeviceError, SettingRejected
 from escape_hw.safety.guard import CommandGuard, GuardReport
 from escape_hw.safety.limits import MirrorLimits, nearest_pairs, neighbour_pairs
@@ -25,11 +26,11 @@ class DMInfo:
     Parameters
     ----------
     layout
-        Boolean map ``(rows, columns)``, true where an actuator stands (numbered row by row), or
-        ``None`` when the actuators do not stand on a grid.
+        Boolean map ``(rows, columns)``, true where there is an actuator (numbered in row-major order), or
+        ``None`` if the actuators are not on a grid.
     positions_m
-        Actuator positions ``(n_act, 2)`` as (x, y) in metres on the mirror, from its centre; x
-        rises along the columns of the layout, y along its rows.
+        Actuator positions ``(n_act, 2)`` as (x, y) in metres on the mirror, from its centre; x increases
+        along the columns of the layout, y along its rows.
     stroke_m
         Metres of surface at the actuator for a command of 1.
     """
@@ -46,18 +47,18 @@ class DMInfo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SendReport:
-    """What became of one command.
+    """Result of one command.
 
     Parameters
     ----------
     sent
-        The shape that the mirror has now ``(n_act,)``, read-only.
+        Present shape of the mirror ``(n_act,)``, read-only.
     sent_ns
-        When, on the mirror's clock.
+        Time on the mirror's clock, nanoseconds.
     guard
-        What the guard did to the command.
+        Changes made by the guard.
     skipped
-        The mirror itself did not execute it and kept ``sent``, its last shape.
+        True if the mirror did not execute the command and kept ``sent``, its last shape.
     """
 
     sent: NDArray[np.float64]
@@ -67,22 +68,26 @@ class SendReport:
     __repr__ = short_repr
 
 
+@renamed_members(
+    allowed_share="largest_legal_scale", obeys="is_legal", tap="callback", flattened_count="flatten_count"
+)
 class DeformableMirror(Device):
     """A deformable mirror. Commands are float64 ``(n_act,)``, fractions of full stroke.
 
     ``send`` is final: every command passes the :class:`~escape_hw.safety.guard.CommandGuard`.
-    Drivers fill in ``_open``, ``_close``, ``_send`` and set ``info`` in ``_open``. Closing ramps
-    to the flat shape first. The counters count from ``open``.
+    Drivers implement ``_open``, ``_close``, ``_send`` and set ``info`` in ``_open``. Closing first ramps
+    to the flat shape.
 
     Attributes
     ----------
-    flattened_count
-        How often it was flattened; every loop begins with that.
-    tap
-        Told of every shape that was sent, see :class:`~escape_hw.api.callbacks.Callbacks`.
+    sent_count, clipped_count, rejected_count, flatten_count
+        Numbers since ``open`` of commands sent, actuator commands clipped, commands rejected, and calls of
+        ``flatten``.
+    callback
+        Called with every shape sent, see :class:`~escape_hw.api.callbacks.Callbacks`.
     """
 
-    #: Largest step of the ramp that ``flatten`` uses, fraction of full stroke.
+    #: Largest step of the ramp of ``flatten``, fraction of full stroke.
     RAMP_STEP = 0.1
 
     def __init__(self, name: str, limits: MirrorLimits) -> None:
@@ -109,29 +114,29 @@ class DeformableMirror(Device):
 
     @property
     def flat(self) -> NDArray[np.float64]:
-        """The command that ``flatten`` ends at, ``(n_act,)`` (a copy); zeros unless set."""
+        """The command of the flat shape, ``(n_act,)`` (a copy); zeros unless set."""
         n_act = self._guard_when_open().n_act
         return np.zeros(n_act) if self._flat is None else self._flat.copy()
 
     @final
     def set_flat(self, command: ArrayLike) -> None:
-        """Choose the command that stands for a flat mirror; nothing moves before ``flatten``.
+        """Set the command of the flat shape; the mirror does not move.
 
         Raises
         ------
         CommandRejected
-            The command is malformed or breaks a limit by itself.
+            The command is malformed or breaks a limit other than slew.
         """
         guard = self._guard_when_open()
         wanted = guard.validate(command)
-        find_violation = guard.find_violation(wanted)
-        if find_violation is not None:
-            raise CommandRejected(self.name, f"flat refused: {find_violation}")
+        violation = guard.find_violation(wanted)
+        if violation is not None:
+            raise CommandRejected(self.name, f"flat command rejected: {violation}")
         self._flat = wanted
 
     @final
     def send(self, command: ArrayLike) -> SendReport:
-        """Send one shape through the guard.
+        """Send one command through the guard.
 
         Parameters
         ----------
@@ -141,16 +146,16 @@ class DeformableMirror(Device):
         Returns
         -------
         SendReport
-            The shape that was really sent (read-only) and what the guard changed.
+            The shape that was sent (read-only) and what the guard changed.
 
         Raises
         ------
         CommandRejected
-            Malformed or not finite: nothing is sent and the last shape stays.
+            Malformed or not finite; nothing is sent.
         NotOpen, DeviceError
-            The mirror is not connected or the transfer failed; the last shape stays.
+            The mirror is not connected or the transfer failed.
         """
-        # The slew rule holds between what reached the mirror, so no other command may slip in.
+        # Locked because the slew rule refers to the previous command that reached the mirror.
         with self._lock:
             guard = self._guard_when_open()
             try:
@@ -170,61 +175,36 @@ class DeformableMirror(Device):
 
     @final
     def check(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
-        """What :meth:`send` would make of a shape now; sends nothing.
+        """The shape that :meth:`send` would send now, and the guard's changes; sends nothing.
 
-        Parameters
-        ----------
-        command
-            ``(n_act,)`` real numbers, fractions of full stroke.
-
-        Returns
-        -------
-        shape : ndarray of float64, ``(n_act,)``
-            Read-only: what would reach the mirror.
-        report : GuardReport
-            What the guard would change.
-
-        Raises
-        ------
-        CommandRejected
-            Malformed or not finite.
+        See :meth:`CommandGuard.limit <escape_hw.safety.guard.CommandGuard.limit>`.
         """
         return self._guard_when_open().limit(command)
 
     @final
     def is_legal(self, command: NDArray[np.float64]) -> bool:
-        """Whether a shape ``(n_act,)`` would pass :meth:`send` as it is; sends nothing."""
+        """Whether :meth:`send` would send a shape ``(n_act,)`` unchanged; sends nothing."""
         return self._guard_when_open().is_legal(command)
 
     @final
     def largest_legal_scale(self, command: ArrayLike) -> float:
-        """Largest factor, at most 1, with which a shape breaks no limit by itself (slew apart).
+        """Largest factor up to 1 at which a scaled shape ``(n_act,)`` obeys every limit except slew.
 
-        A measurement that must know the form of what it sends scales by it, instead of having
-        single actuators cut off. Sends nothing.
-
-        Parameters
-        ----------
-        command
-            ``(n_act,)`` real numbers, fractions of full stroke.
-
-        Raises
-        ------
-        CommandRejected
-            Malformed or not finite.
+        A measurement scales its pokes by it so that no actuator is clipped. Sends nothing. See
+        :meth:`CommandGuard.largest_legal_scale <escape_hw.safety.guard.CommandGuard.largest_legal_scale>`.
         """
         return self._guard_when_open().largest_legal_scale(command)
 
     @final
     def flatten(self) -> None:
-        """Ramp to the flat shape in steps of at most :data:`RAMP_STEP`; legal whenever open.
+        """Ramp to the flat shape in steps of at most :data:`RAMP_STEP`.
 
-        A mirror that lies at rest has no shape, and is left alone.
+        Legal in every connected state. Does nothing while the mirror accepts no commands (at rest).
 
         Raises
         ------
         NotOpen, DeviceError
-            The mirror is not connected, or did not arrive.
+            The mirror is not connected, or did not reach the flat shape.
         """
         with self._lock:
             guard = self._guard_when_open()
@@ -234,7 +214,7 @@ class DeformableMirror(Device):
             target = self.flat
             step = min(self.RAMP_STEP, self.limits.max_slew or self.RAMP_STEP)
             distance = float(np.abs(target - guard.last).max(initial=0.0))
-            # Twice the straight way: a mirror found in an illegal shape takes detours.
+            # Twice the direct number of steps, because the way out of an illegal shape is longer.
             for _ in range(2 + 2 * math.ceil(distance / step)):
                 move = target - guard.last
                 largest = float(np.abs(move).max(initial=0.0))
@@ -256,13 +236,13 @@ class DeformableMirror(Device):
         info = self.info
         if info.layout is not None and int(info.layout.sum()) != info.n_act:
             raise DeviceError(
-                self.name, f"its layout has {int(info.layout.sum())} places for {info.n_act} actuators"
+                self.name, f"its layout has {int(info.layout.sum())} positions for {info.n_act} actuators"
             )
         try:
-            pairs = _neighbour_pairs(info)
+            pairs = nearest_pairs(info.positions_m) if info.layout is None else neighbour_pairs(info.layout)
             guard = CommandGuard(self.name, info.n_act, self.limits, pairs)
         except ValueError as error:
-            raise SettingRejected(self.name, f"its limits do not fit it: {error}") from error
+            raise SettingRejected(self.name, f"its limits do not fit: {error}") from error
         present = self._present_shape()
         guard.reset(present)
         self._guard, self._shape_known = guard, present is not None
@@ -272,14 +252,14 @@ class DeformableMirror(Device):
         self.flatten()
 
     def _present_shape(self) -> NDArray[np.float64] | None:
-        """The shape ``(n_act,)`` that the mirror has when opened, if it can tell.
+        """Shape ``(n_act,)`` of the mirror on opening, if it can be read.
 
-        ``None`` means unknown: it is taken for zeros, and ``flatten`` always sends.
+        ``None``: unknown; the guard assumes zeros, and ``flatten`` always sends.
         """
         return None
 
     def _accepts_commands(self) -> bool:
-        """False while the mirror lies at rest and follows no commands."""
+        """False while the mirror is at rest and follows no commands."""
         return True
 
     @abc.abstractmethod
@@ -289,11 +269,6 @@ class DeformableMirror(Device):
         Returns
         -------
         ndarray or None
-            ``None``: the mirror takes the command. A mirror that may skip a command without harm
-            returns the shape that it keeps, read-only.
+            ``None``: the command was accepted. A mirror that skipped it returns the shape that it kept,
+            read-only.
         """
-
-
-def _neighbour_pairs(info: DMInfo) -> NDArray[np.intp]:
-    """Pairs of adjacent actuators ``(n_pairs, 2)``, on the grid or, where there is none, by distance."""
-    return nearest_pairs(info.positions_m) if info.layout is None else neighbour_pairs(info.layout)

@@ -1,4 +1,4 @@
-"""Tip-tilt modulators for pyramid sensors."""
+"""Interface of tip-tilt modulators for pyramid sensors."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ class ModulatorInfo:
 
 @dataclass(frozen=True, slots=True)
 class ModulatorStatus:
-    """What a modulator does at a moment.
+    """Present status of a modulator.
 
     Parameters
     ----------
     info
-        Which modulator.
+        Identity of the modulator.
     modulation
-        The modulation in force; ``None``: it does not turn.
+        The modulation in force; ``None`` when parked.
     position_rad
-        Where it points (x, y) from its centre, where it can tell.
+        Tilt (x, y) from the centre in radians, if the stage reports it.
     details
-        What else this stage tells of itself (servos, connection, corrections), plain values.
+        Further values reported by the stage (servos, connection, corrections), plain values.
     """
 
     info: ModulatorInfo
@@ -53,11 +53,10 @@ class ModulatorStatus:
 
 
 class TipTiltModulator(Device):
-    """A tip-tilt stage that turns the beam in a circle; parks at its centre when stopped.
+    """A tip-tilt stage that moves the beam in a circle; when stopped or closed it parks at its centre.
 
-    Drivers fill in ``_open``, ``_close``, ``_check``, ``_modulate``, ``_park``,
-    ``info`` and ``modulation``; where they can, ``_status``, ``_status_when_closed`` and ``_release`` too. Closing
-    parks first.
+    Drivers implement ``_open``, ``_close``, ``_check``, ``_modulate``, ``_park``, ``info`` and
+    ``modulation``, and optionally ``_status``, ``_status_when_closed`` and ``_release``.
     """
 
     @property
@@ -72,12 +71,12 @@ class TipTiltModulator(Device):
 
     @final
     def check(self, want: Modulation) -> Modulation:
-        """The nearest modulation the stage can do (its clock quantises the frequency); changes nothing.
+        """Nearest achievable modulation (the clock quantises the frequency). Changes nothing.
 
         Raises
         ------
         SettingRejected
-            Nothing near ``want`` is possible; the message gives the allowed range.
+            The modulation is outside the range of the stage; the message gives the range.
         """
         self.require_open()
         if not (0 <= want.radius_rad < math.inf and 0 < want.frequency_hz < math.inf):
@@ -90,7 +89,7 @@ class TipTiltModulator(Device):
         if largest_tilt > self.info.max_tilt_rad:
             raise SettingRejected(
                 self.name,
-                f"{want}: tilts by {largest_tilt:.4g} rad; it does 0 to {self.info.max_tilt_rad:g} rad",
+                f"{want}: tilts by {largest_tilt:.4g} rad; the range is 0 to {self.info.max_tilt_rad:g} rad",
             )
         return self._check(want)
 
@@ -101,12 +100,12 @@ class TipTiltModulator(Device):
         Returns
         -------
         Modulation
-            What the stage really does, never what was asked.
+            The modulation read back from the stage.
 
         Raises
         ------
         SettingRejected
-            See :meth:`check`; the stage goes on as it was.
+            See :meth:`check`; the stage is unchanged.
         DeviceError
             The stage did not start.
         """
@@ -114,7 +113,7 @@ class TipTiltModulator(Device):
         self._modulate(achievable)
         achieved = self.modulation
         if achieved is None:
-            raise DeviceError(self.name, f"does not move although it was told to do {achievable}")
+            raise DeviceError(self.name, f"does not move after the start of {achievable}")
         return achieved
 
     @final
@@ -125,26 +124,24 @@ class TipTiltModulator(Device):
 
     @final
     def status(self) -> ModulatorStatus:
-        """What the stage does now. Moves nothing; one that is not open is connected for the question.
+        """Present status. Moves nothing; a closed stage is connected for the query.
 
         Raises
         ------
         DeviceError
-            It cannot be asked.
+            The stage does not answer.
         """
         with self._lock:
             return self._status() if self.is_open else self._status_when_closed()
 
     @final
     def release(self) -> bool:
-        """Disconnect without parking: a stage with a clock of its own goes on turning.
-
-        Everything else parks on closing; this is for a person who adjusts the beam.
+        """Disconnect without parking, for aligning the beam; the controller keeps modulating.
 
         Returns
         -------
         bool
-            True when the stage goes on; false when it cannot, and was closed as usual.
+            True if the stage keeps modulating; false if it cannot and was closed as usual.
         """
         with self._lock:
             self.require_open()
@@ -167,7 +164,7 @@ class TipTiltModulator(Device):
             return self._status()
 
     def _release(self) -> bool:
-        """Disconnect and leave the stage turning; false where that is impossible."""
+        """Disconnect while the stage keeps modulating; false if that is impossible."""
         return False
 
     @abc.abstractmethod
@@ -176,8 +173,8 @@ class TipTiltModulator(Device):
 
     @abc.abstractmethod
     def _modulate(self, modulation: Modulation) -> None:
-        """Start a modulation that came from ``_check``."""
+        """Start a modulation returned by ``_check``."""
 
     @abc.abstractmethod
     def _park(self) -> None:
-        """Stop and centre."""
+        """Stop and go to the centre."""

@@ -1,4 +1,4 @@
-"""The bench's turbulence: a rotating phase screen that can be put into the beam."""
+"""Interface of rotating phase screens, the turbulence of a bench."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from escape_hw.errors import SettingRejected
 
 @dataclass(frozen=True, slots=True)
 class ScreenState:
-    """State of the phase screen: number of the screen, in or out of the beam, speed.
+    """State of a phase screen: number from 0, whether it is in the beam, speed across the pupil.
 
-    Screens are counted from 0. ``speed_m_s`` is the speed of the screen across the pupil in metres
-    per second. ``blocked`` is true while a beam stop is in place, for dark frames.
+    ``blocked`` is true while a beam stop is inserted, for dark frames.
     """
 
     screen: int
@@ -39,9 +38,8 @@ class ScreenInfo:
 class PhaseScreen(Device):
     """A changer with one or more rotating phase screens.
 
-    With the screen out, the bench has a calibration source: that is what the push-pull baseline
-    is measured on. A telescope has no such device, and neither the open-loop DO-CRIME nor the
-    ESCAPE procedure ever asks for it.
+    Without a screen in the beam the bench has a calibration source, which push-pull uses. A telescope has
+    no such device, and open-loop DO-CRIME and ESCAPE do not use it.
     """
 
     @property
@@ -57,7 +55,7 @@ class PhaseScreen(Device):
     @property
     @abc.abstractmethod
     def n_screens(self) -> int:
-        """How many screens the changer holds."""
+        """Number of screens."""
 
     @final
     def set(
@@ -68,18 +66,18 @@ class PhaseScreen(Device):
         speed_m_s: float | None = None,
         blocked: bool | None = None,
     ) -> ScreenState:
-        """Change what is given, keep the rest.
+        """Change the given values and keep the others.
 
         Parameters
         ----------
         screen
             Number of the screen, counted from 0.
         inserted
-            Into the beam, or out of it.
+            Whether the screen is in the beam.
         speed_m_s
             Speed across the pupil in metres per second, 0 to stop it.
         blocked
-            Put the beam stop in, or take it out.
+            Whether the beam stop is inserted.
 
         Returns
         -------
@@ -89,7 +87,7 @@ class PhaseScreen(Device):
         Raises
         ------
         SettingRejected
-            No such screen, or a value out of range; nothing is changed.
+            A value is out of range; nothing is changed.
         """
         self.require_open()
         now = self.state
@@ -116,4 +114,4 @@ class PhaseScreen(Device):
 
     @abc.abstractmethod
     def _set(self, want: ScreenState) -> None:
-        """Go to a checked state."""
+        """Apply a checked state."""

@@ -1,4 +1,4 @@
-"""Procedures are generators; one runner drives them for the command line, the GUI and scripts."""
+"""Procedures (generators of progress) and the function that runs them."""
 
 from __future__ import annotations
 
@@ -23,29 +23,28 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-#: How long a procedure may clear up after it was aborted, in wall-clock seconds.
+#: Time for clean-up after an abort, wall-clock seconds.
 ABORT_GRACE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Progress:
-    """A procedure's word on how far it is.
+    """Progress of a procedure.
 
     Parameters
     ----------
     stage
-        What is being done, in words an operator uses.
+        Name of the stage, for the operator.
     done, total
-        Steps done and to do in this stage, in ``unit``.
+        Completed and total number of steps of this stage, in ``unit``.
     elapsed_s
-        Wall-clock seconds since the stage began.
+        Wall-clock seconds since the start of the stage.
     metrics
-        Scalars worth watching.
+        Scalars to display.
     arrays
-        Arrays worth plotting that change a few times a second at most: ``matrix``, ``matrix_sigma``,
-        ``valid``, ``registration``, ``registration_sigma``, ``step_norm``, ``registration_track``, ``gains``,
-        ``gains_sigma``, ``gains_smooth``, ``gains_rounds``, ``residual``. In a matrix, modes that were
-        not measured yet are NaN.
+        Arrays to plot: ``matrix``, ``matrix_sigma``, ``valid``, ``registration``, ``registration_sigma``,
+        ``step_norm``, ``registration_track``, ``gains``, ``gains_sigma``, ``gains_smooth``,
+        ``gains_rounds``, ``residual``. In a matrix, modes not measured yet are NaN.
     """
 
     stage: str
@@ -59,7 +58,7 @@ class Progress:
 
     @property
     def fraction(self) -> float:
-        """Share done, 0 to 1."""
+        """Completed fraction, 0 to 1."""
         return min(1.0, self.done / self.total) if self.total else 1.0
 
     @property
@@ -71,10 +70,10 @@ class Progress:
 
 
 class StopSignal(Protocol):
-    """What tells a procedure to stop: a :class:`SignalSafeFlag`, or a :class:`threading.Event`."""
+    """Request to stop: a :class:`SignalSafeFlag` or a :class:`threading.Event`."""
 
     def is_set(self) -> bool:
-        """Whether to stop."""
+        """Whether stopping was requested."""
 
 
 Procedure = Generator[Progress, None, T]
@@ -82,9 +81,9 @@ Observer = Callable[[Progress], None]
 
 
 class Reporter:
-    """Makes a stage's :class:`Progress`, at most 20 times a second.
+    """Creates the :class:`Progress` of a stage, at most 20 times a second.
 
-    ``due`` is cheap enough to be asked for every frame.
+    ``step`` and ``due`` are fast enough to be called for every frame.
     """
 
     PERIOD_S = 0.05
@@ -96,16 +95,16 @@ class Reporter:
         self._done = 0
 
     def step(self, **metrics: float) -> Progress | None:
-        """Count one step; the progress to yield when one is due, else ``None``."""
+        """Count one step; returns a progress to yield if one is due, else ``None``."""
         self._done += 1
         return self(self._done, **metrics) if self.due() else None
 
     def due(self) -> bool:
-        """True when the next progress may be yielded."""
+        """Whether the next progress is due."""
         return time.monotonic() >= self._next
 
     def now(self, arrays: Mapping[str, NDArray[np.float32]], **metrics: float) -> Progress:
-        """The progress after the steps counted so far, with arrays to show."""
+        """The progress after the steps counted so far, with arrays."""
         return self(self._done, arrays, **metrics)
 
     def __call__(
@@ -124,30 +123,29 @@ def run(
     observers: tuple[Observer, ...] = (),
     abort: StopSignal | None = None,
 ) -> T:
-    """Drive a procedure to its end and return its result.
+    """Run a procedure to its end and return its result.
 
-    The procedure is responsible for leaving the mirror flat (``finally``); the runner makes sure
-    that it gets the chance. To stop it, :class:`Aborted` is thrown into it **once**, between two
-    steps, so that no transfer to a device is cut in half. It may return what it has, raise, or
-    yield a little longer while it clears up; after :data:`ABORT_GRACE_S` it is closed whether it likes
-    it or not, its ``finally`` clauses included.
+    The procedure flattens the mirror in its ``finally`` clauses. To stop it, :class:`Aborted` is thrown
+    into it **once**, between two steps, so that no transfer to a device is interrupted. It may then return
+    a partial result, raise, or yield further progress during its clean-up; after :data:`ABORT_GRACE_S` it
+    is closed, which runs its ``finally`` clauses.
 
-    Ctrl-C stops it in the same way when this is the main thread and nobody has installed another
-    handler. A second Ctrl-C interrupts at once, for a procedure that hangs inside a step.
+    In the main thread the first Ctrl-C stops the procedure in the same way, unless another handler is
+    installed. A second Ctrl-C interrupts at once, also within a step.
 
     Parameters
     ----------
     procedure
-        The generator to drive.
+        The generator.
     observers
-        Called with every :class:`Progress`; one that raises is dropped and logged.
+        Called with every :class:`Progress`. An observer that raises is logged and removed.
     abort
         Set it from any thread to stop the procedure at its next step.
 
     Raises
     ------
     Aborted
-        Stopped by ``abort`` or Ctrl-C; carries the partial result when the procedure made one.
+        Stopped by ``abort`` or Ctrl-C; has the partial result if the procedure returned one.
     """
     interrupted = SignalSafeFlag()
     try:
@@ -180,7 +178,7 @@ def _advance_until_done(
                 raise _aborted_error(interrupted, partial=result) from None
             return result
         if deadline is not None and time.monotonic() > deadline:
-            log.error("the procedure went on for %g s after it was aborted; it is closed", ABORT_GRACE_S)
+            log.error("the procedure did not end within %g s after the abort and is closed", ABORT_GRACE_S)
             raise _aborted_error(interrupted)
         try:
             _notify_observers(observers_left, progress)
@@ -193,7 +191,7 @@ def _notify_observers(observers_left: list[Observer], progress: Progress) -> Non
         try:
             observer(progress)
         except Exception:
-            log.exception("observer %r failed and is dropped", observer)
+            log.exception("observer %r failed and is removed", observer)
             observers_left.remove(observer)
 
 
@@ -204,18 +202,18 @@ def _aborted_error(interrupted: SignalSafeFlag, partial: object = None) -> Abort
 
 
 def _close(procedure: Procedure[T]) -> None:
-    """Run what is left of the procedure's clean-up; does nothing when it has ended."""
+    """Run the remaining clean-up of a procedure; does nothing if it has ended."""
     try:
         procedure.close()
     except RuntimeError:
-        log.exception("the procedure refuses to be closed; is the mirror flat?")
+        log.exception("the procedure did not close; check whether the mirror is flat")
 
 
 @contextmanager
 def _set_on_ctrl_c(flag: SignalSafeFlag) -> Iterator[None]:
-    """Let the first Ctrl-C set ``flag``, and the next one interrupt as usual.
+    """Let the first Ctrl-C set ``flag`` and the next one interrupt as usual.
 
-    Leaves alone what another thread or the application has arranged.
+    Does nothing outside the main thread or if the application has its own handler.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:

@@ -1,4 +1,4 @@
-"""Geometry of a pyramid sensor as found on its camera."""
+"""Measured geometry of a pyramid sensor on its camera."""
 
 from __future__ import annotations
 
@@ -10,70 +10,72 @@ from numpy.typing import NDArray
 
 from escape_hw.api.representation import short_repr
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.deprecation import renamed_members
 
-#: Names of the four pupil images in the order used everywhere: ``2 * lower + right``.
+#: Names of the four pupil images in order of their index, ``2 * lower + right``.
 IMAGES = ("upper left", "upper right", "lower left", "lower right")
 
-#: Share of the radius inside which no pixel is cut by the rim of an image.
+#: Pixels within this fraction of the radius are not cut by the rim of an image.
 _INNER_RADIUS = 0.9
 
 
+@renamed_members(looks="n_effective", steady="persistent_fraction")
 @dataclass(frozen=True, slots=True, eq=False)
 class PyramidPupils(SensorGeometry):
     """The four pupil images on the camera.
 
-    The slopes of a pixel of the pupil are, with the light U (upper) or L (lower), left L or right R
-    at the same pixel of the four images, minus references (Ragazzoni 1996),
+    The slopes of a pupil pixel (Ragazzoni 1996), before the references are subtracted, are
 
         sx = (UR + LR - UL - LL) / norm        sy = (LL + LR - UL - UR) / norm
 
-    where ``norm`` is the mean over all valid pixels of the sum of the four (``global``), or that
-    pixel's own sum (``local``).
+    where UL, UR, LL and LR are the counts at this pixel in the upper left, upper right, lower left and
+    lower right image, and ``norm`` is the sum of the four, averaged over all valid pixels (``global``) or
+    of this pixel (``local``).
 
     Parameters
     ----------
     centres_px
-        Centres of the images ``(4, 2)`` as (x, y) in pixels of the region read, pixel centres at
-        whole numbers, in the order of :data:`IMAGES`.
+        Centres of the images ``(4, 2)`` as (x, y) in pixels of the region, pixel centres at integers, in
+        the order of :data:`IMAGES`.
     diameter_px
         Diameter of an image in pixels.
     corners_px
-        First pixel ``(4, 2)`` as (x, y) of the box of n x n pixels around each image; the centre of
-        a box lies within half a pixel of the centre of its image.
+        First pixel ``(4, 2)`` as (x, y) of the n x n box around each image. The centre of a box is within
+        half a pixel of the centre of its image.
     valid
         Valid pixels, boolean ``(n, n)``.
     references
         Slopes of the flat wavefront ``(n_valid, 2)`` as (x, y).
     flux
-        Light of every pixel, summed over the images, relative to a bright one ``(n, n)``.
+        Flux of every pixel, summed over the images, relative to a bright one ``(n, n)``.
     counts
         Counts per frame of a bright pixel, summed over the images; 0 if unknown.
     motion
-        Rms of the slopes over time during the measurement that a model of this sensor is to match.
+        Temporal rms of the slopes during the measurement that a model of this sensor describes.
     background
-        Level of the dark pixels in counts that was subtracted when no dark frame was at hand.
+        Background level in counts that was subtracted in the absence of a dark frame.
     normalisation
         ``"global"`` or ``"local"``.
     modulation
-        Radius of the modulation in lambda/D during the measurement.
+        Modulation radius in lambda/D during the measurement.
     centre_sigma_px
-        Standard error of the mean of the four centres along an axis; 0 if unknown. A mirror's shift
-        counts from there.
+        Standard error per axis of the mean of the four centres, pixels; 0 if unknown. The shift of the
+        mirror refers to this mean.
     pokes
-        Rms surface over the pupil of the random pokes during the measurement, all modes together, as
-        fraction of full stroke: what the sensor answers depends on them as it does on the turbulence.
-    looks
-        Independent states of the air that the measurement saw; 0 if unknown.
-    steady
-        Share of the slopes' variance that is still there two frames later: the air's, not the pokes'.
+        Rms surface over the pupil of the random pokes during the measurement, all modes, as fraction of
+        full stroke. Like the turbulence, the pokes change the sensitivity of the sensor.
+    n_effective
+        Number of independent realisations of the turbulence in the measurement; 0 if unknown.
+    persistent_fraction
+        Fraction of the slope variance that is correlated over two frames: turbulence, not pokes.
     """
 
     kind: ClassVar[str] = "pyramid"
     slope_unit: ClassVar[str] = "1"
     elements: ClassVar[str] = "pupil pixels"
     short_run_note: ClassVar[str] = (
-        "the centres of the pupil images were found in {seconds:.1f} s of turbulence, which may leave them "
-        "some hundredths of a pixel off; the shifts of the registration, which refer to them, are so too"
+        "the centres of the pupil images were measured in {seconds:.1f} s of turbulence and may be off by "
+        "some hundredths of a pixel; so may the shifts of the registration, which refer to them"
     )
 
     centres_px: NDArray[np.float64]
@@ -106,7 +108,7 @@ class PyramidPupils(SensorGeometry):
         )
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> PyramidPupils:
-        """See :meth:`SensorGeometry.with_mean_slopes`; of the mean only what is not smooth counts."""
+        """See :meth:`SensorGeometry.with_mean_slopes`; only the part that is not smooth is added."""
         new_references = self.references + remove_low_orders(mean.reshape(2, -1).T, self.valid, self.flux)
         return replace(self, references=new_references.astype(np.float32))
 
@@ -114,20 +116,19 @@ class PyramidPupils(SensorGeometry):
 def remove_low_orders(
     slopes: NDArray[np.float64], valid: NDArray[np.bool_], flux: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Mean slopes under turbulence, less the smooth part that may be the turbulence's own.
+    """Mean slopes under turbulence without their smooth part, which may be due to the turbulence.
 
-    What a mean over seconds still holds of the turbulence is tilt, focus, astigmatism and coma: its
-    slopes are polynomials of the second degree over the pupil, which are fitted where the light is
-    full and taken off everywhere. What remains belongs to the instrument: unequal faces and pixels,
-    and above all the rims of the four images, which fall on the pixels differently. A flat wavefront
-    has no smooth slopes on a pyramid whose tip is on the beam's axis, so nothing is lost.
+    The mean turbulence over seconds consists of tilt, focus, astigmatism and coma. Their slopes are
+    second-degree polynomials over the pupil, which are fitted in the inner pupil and subtracted everywhere.
+    The remainder is instrumental: unequal faces and pixels, and the rims of the four images, which are
+    sampled differently. A flat wavefront has no smooth slopes on a pyramid whose tip is on the axis.
 
     Parameters
     ----------
     slopes
         ``(n_valid, 2)`` as (x, y).
     valid, flux
-        Of the pupils, ``(n, n)``.
+        As in :class:`PyramidPupils`, ``(n, n)``.
     """
     n = valid.shape[0]
     rows, columns = np.nonzero(valid)
@@ -140,5 +141,5 @@ def remove_low_orders(
 
 
 def pupil_boxes(centres_px: NDArray[np.float64], n: int) -> NDArray[np.intp]:
-    """First pixels ``(4, 2)`` as (x, y) of boxes of n x n pixels whose centres come nearest."""
+    """First pixels ``(4, 2)`` as (x, y) of the n x n boxes centred closest to ``centres_px`` ``(4, 2)``."""
     return np.rint(np.asarray(centres_px) - (n - 1) / 2).astype(np.intp)

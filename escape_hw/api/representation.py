@@ -1,4 +1,4 @@
-"""Short text and HTML representations of results for the prompt, logs and notebooks; no plotting library needed."""
+"""Short text and HTML representations of results for logs and notebooks, without a plotting library."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-#: Characters of a text, and values of a series, that are shown as they are.
+#: Longest text, in characters, and longest series, in values, that are shown in full.
 _MAX_TEXT, _MAX_ITEMS = 60, 6
 
 
 def short_repr(one: Any) -> str:
-    """A dataclass in one line: short values as they are, arrays by kind and shape, long ones by length.
+    """A dataclass in one line: short values in full, arrays as type and shape, long values as their length.
 
-    For classes that hold arrays: ``__repr__ = short_repr``.
+    For dataclasses with arrays: ``__repr__ = short_repr``.
     """
     parts = (
         f"{field.name}={describe_value(getattr(one, field.name))}" for field in fields(one) if field.repr
@@ -29,7 +29,7 @@ def short_repr(one: Any) -> str:
 
 
 def describe_value(value: object) -> str:
-    """A value in a few words."""
+    """A value as short text."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{list(value.shape)}"
     if isinstance(value, float):
@@ -45,7 +45,7 @@ def describe_value(value: object) -> str:
     return repr(value)
 
 
-#: Blue, white and red of a symmetric map, safe for colour-blind eyes (the ends of Moreland's cool-warm).
+#: Blue, white and red of a symmetric colour map (ends of Moreland's cool-warm), colour-blind safe.
 _COLOUR_STOPS = np.array([[59, 76, 192], [242, 242, 242], [180, 4, 38]], float)
 
 
@@ -55,20 +55,20 @@ def image_html(values: ArrayLike, width: int = 240) -> str:
     Parameters
     ----------
     values
-        ``(rows, columns)``; thinned out where it is larger than the picture.
+        ``(rows, columns)``; subsampled if larger than the image.
     width
-        Width on the page in pixels.
+        Width in pixels.
     """
     image = np.atleast_2d(np.asarray(values, float))
     image = image[:: max(1, image.shape[0] // width), :: max(1, image.shape[1] // width)]
-    known = np.isfinite(image)
-    top = float(np.percentile(np.abs(image[known]), 99)) if known.any() else 0.0
-    share = np.clip(np.where(known, image, 0.0) / (top or 1.0), -1, 1) + 1
-    low = np.minimum(share.astype(int), 1)
-    colours = _COLOUR_STOPS[low] + (_COLOUR_STOPS[low + 1] - _COLOUR_STOPS[low]) * (share - low)[..., None]
-    colours[~known] = 160
+    finite = np.isfinite(image)
+    top = float(np.percentile(np.abs(image[finite]), 99)) if finite.any() else 0.0
+    level = np.clip(np.where(finite, image, 0.0) / (top or 1.0), -1, 1) + 1
+    low = np.minimum(level.astype(int), 1)
+    colours = _COLOUR_STOPS[low] + (_COLOUR_STOPS[low + 1] - _COLOUR_STOPS[low]) * (level - low)[..., None]
+    colours[~finite] = 160
     data = base64.b64encode(_png(colours.astype(np.uint8))).decode()
-    # A tall matrix is pressed into a square: it is to be seen at one glance.
+    # A tall matrix is compressed to a square to fit on the page.
     height = min(round(width * image.shape[0] / image.shape[1]), width)
     return (
         f'<img src="data:image/png;base64,{data}" width="{width}" height="{height}" '
@@ -77,7 +77,7 @@ def image_html(values: ArrayLike, width: int = 240) -> str:
 
 
 def line_html(values: ArrayLike, width: int = 240, height: int = 48) -> str:
-    """Values in a row as an ``<svg>`` line, its range filling the height."""
+    """A series as an ``<svg>`` line scaled to the height."""
     y = np.asarray(values, float).ravel()
     y = y[np.isfinite(y)]
     if y.size < 2:
@@ -95,7 +95,7 @@ def line_html(values: ArrayLike, width: int = 240, height: int = 48) -> str:
 def table_html(
     rows: Mapping[str, object] | Sequence[Sequence[object]], title: str = "", left_html: str = ""
 ) -> str:
-    """Rows of plain text as a table, with a heading, beside a picture.
+    """Rows of plain text as an HTML table with a heading.
 
     Parameters
     ----------
@@ -103,8 +103,8 @@ def table_html(
         Names and values, or rows of cells.
     title
         Heading.
-    beside
-        HTML to the left.
+    left_html
+        HTML to the left of the table.
     """
     cells = [(key, value) for key, value in rows.items()] if isinstance(rows, Mapping) else rows
     body = "".join(
@@ -119,7 +119,7 @@ def table_html(
 
 
 def _png(pixels: NDArray[np.uint8]) -> bytes:
-    """A picture ``(rows, columns, 3)`` as PNG (ISO/IEC 15948)."""
+    """Encode an image ``(rows, columns, 3)`` as PNG (ISO/IEC 15948)."""
     rows, columns = pixels.shape[:2]
     lines = np.concatenate([np.zeros((rows, 1), np.uint8), pixels.reshape(rows, -1)], axis=1)
     parts = (

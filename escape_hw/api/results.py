@@ -96,7 +96,7 @@ class RegistrationEstimate:
     notes
         What to know of it that is no reason to distrust it, such as parameters that go together.
     extras
-        What was fitted beside the registration, by name (``calibration.also``).
+        What was fitted beside the registration, by name (``calibration.extra_parameters``).
     departures
         How the mirror differs from the model's; ``None`` where SPRINT did not look.
     """

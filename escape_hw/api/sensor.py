@@ -1,4 +1,4 @@
-"""Geometry of a wavefront sensor as found on its camera, and what turns frames into slopes with it."""
+"""Measured geometry of a wavefront sensor on its camera, and the interface of slope computations."""
 
 from __future__ import annotations
 
@@ -10,37 +10,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.representation import short_repr
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import IncompatibleProduct
 
-#: Spots move and blur by more than their centres of gravity show: what the window and the threshold
-#: cut off, and the turbulence within each lenslet. Found on a twin with known optics (docs/decisions).
+#: Ratio of the rms spot motion and blur to the rms of the centres of gravity, which the window, the
+#: threshold and the turbulence within a lenslet reduce. Measured on a twin with known optics.
 SPOT_MOTION_FACTOR = 1.2
 
 
+@renamed_members(with_motion="with_slope_statistics", short_look="short_run_note")
 class SensorGeometry(abc.ABC):
-    """What procedures, products and reports need to know of a sensor, whatever its kind.
+    """Geometry of a sensor of any kind, an immutable dataclass.
 
-    A geometry is an immutable dataclass. A sub-aperture is the part of the pupil that one slope pair
-    belongs to: a lenslet, or a pixel of a pyramid's pupil image.
+    A sub-aperture is the part of the pupil of one slope pair: a lenslet, or a pixel of a pupil image.
 
     Attributes
     ----------
     kind
-        As ``sensor.kind`` of the configuration calls it.
+        Value of ``sensor.kind`` in the configuration.
     slope_unit
-        Unit of the slopes, as products state it.
+        Unit of the slopes.
     elements
-        What its sub-apertures are called, in the plural.
-    short_look
-        What a short run under turbulence leaves in the geometry, for a note.
+        Name of the sub-apertures, plural.
+    short_run_note
+        Note on the error of the geometry after a short run under turbulence.
     valid
         Valid sub-apertures, boolean ``(n_rows, n_columns)``.
     flux
-        Light of every sub-aperture relative to a bright one, ``(n_rows, n_columns)``.
+        Flux of every sub-aperture relative to a bright one, ``(n_rows, n_columns)``.
     counts
         Counts per frame of a bright sub-aperture; 0 if unknown.
     background
-        Level of the dark pixels in counts that was subtracted when no dark frame was at hand.
+        Background level in counts that was subtracted in the absence of a dark frame.
     """
 
     __slots__ = ()
@@ -67,57 +68,56 @@ class SensorGeometry(abc.ABC):
 
     @abc.abstractmethod
     def with_background(self, counts: float) -> Self:
-        """The geometry with the background level that was subtracted."""
+        """The geometry with this background level."""
 
     @abc.abstractmethod
     def with_slope_statistics(
         self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0
     ) -> Self:
-        """The geometry with the motion that a measurement saw.
+        """The geometry with the slope statistics of a measurement.
 
         Parameters
         ----------
         rms
-            Rms over time of the slopes, in their unit.
+            Temporal rms of the slopes, in their unit.
         pokes
-            Rms surface of the mirror's random pokes, all modes together, as fraction of full stroke.
-        looks
-            Independent states of the slopes that were seen; 0 if unknown.
-        steady
-            Share of the slopes' variance that is still there two frames later; 0 if unknown.
+            Rms surface of the random pokes, all modes, as fraction of full stroke.
+        n_effective
+            Number of independent realisations of the turbulence; 0 if unknown.
+        persistent_fraction
+            Fraction of the slope variance that is correlated over two frames; 0 if unknown.
         """
 
     @abc.abstractmethod
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> Self:
-        """The geometry with better references, after a longer look at the turbulence.
+        """The geometry with references from a longer average over the turbulence.
 
-        It was found on the first frames of a run, whose mean aberration is the turbulence's own; over
-        the whole run that averages out further. Pixels and mask stay as they are, so every slope of
-        the run keeps its meaning.
+        The geometry is found on the first frames of a run and contains their mean aberration, which
+        averages out over the whole run. Pixels and mask do not change.
 
         Parameters
         ----------
         mean
-            Mean slopes of the run ``(n_slopes,)``, against the references in force.
+            Mean slopes of the run ``(n_slopes,)`` relative to the present references.
         """
 
 
 class SlopeFunction(Protocol):
-    """Takes frames, returns slopes."""
+    """Computes slopes from frames."""
 
     @property
     def grid(self) -> SensorGeometry:
-        """The geometry that the slopes belong to."""
+        """The geometry of the slopes."""
         ...
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape of the frames it takes (rows, columns)."""
+        """Shape of the frames (rows, columns)."""
         ...
 
     @property
     def flux(self) -> NDArray[np.float32]:
-        """Light of each valid sub-aperture in the last frame ``(n_valid,)``, in counts."""
+        """Flux of each valid sub-aperture in the last frame ``(n_valid,)``, in counts."""
         ...
 
     def __call__(
@@ -130,17 +130,18 @@ class SlopeFunction(Protocol):
         ...
 
 
+@renamed_members(air_px="turbulence_px")
 @dataclass(frozen=True, slots=True, eq=False)
 class SubApertureGrid(SensorGeometry):
-    """The lenslet grid of a Shack-Hartmann sensor on the camera, found from frames.
+    """The lenslet grid of a Shack-Hartmann sensor on the camera.
 
-    The centre of lenslet ``(i, j)`` (row, column) lies at ``origin + (j, i) * pitch`` pixels of
-    the region read, x along columns and y along rows, pixel centres at whole numbers.
+    The centre of lenslet ``(i, j)`` (row, column) is at ``origin + (j, i) * pitch`` pixels of the region,
+    x along columns and y along rows, pixel centres at integers.
 
     Parameters
     ----------
     pitch_px
-        Lenslet pitch in camera pixels (need not be whole).
+        Lenslet pitch in camera pixels; any real number.
     origin_px
         Centre of lenslet (0, 0) as (x, y) in pixels.
     valid
@@ -150,24 +151,22 @@ class SubApertureGrid(SensorGeometry):
     flux
         Flux of every sub-aperture relative to a bright one, ``(n_rows, n_columns)``.
     counts
-        Counts per frame of a bright sub-aperture (the 95th percentile of those lit); 0 if unknown.
+        Counts per frame of a bright sub-aperture (95th percentile of the illuminated ones); 0 if unknown.
     motion_px
-        Rms motion of the spots along an axis, in pixels, during the measurement that a model of
-        this sensor is to match.
+        Rms spot motion per axis, in pixels, during the measurement that a model of this sensor describes.
     background
-        Level of the dark pixels in counts that was subtracted when no dark frame was at hand.
-    air_px
-        The part of ``motion_px`` that lasts from frame to frame in open loop, which is the turbulence's and
-        not the pokes'; rms along an axis in pixels, 0 if unknown.
+        Background level in counts that was subtracted in the absence of a dark frame.
+    turbulence_px
+        Part of ``motion_px`` that is correlated between frames in open loop, and therefore due to the
+        turbulence and not to pokes; rms per axis in pixels, 0 if unknown.
     """
 
     kind: ClassVar[str] = "shack-hartmann"
     slope_unit: ClassVar[str] = "pixel"
     elements: ClassVar[str] = "sub-apertures"
     short_run_note: ClassVar[str] = (
-        "the references hold the mean focus of {seconds:.2g} s of turbulence, which costs Strehl ratio "
-        "and which the wind does not explain; the matrix is not touched by it: close the loop on "
-        "references taken over a longer time"
+        "the references contain the mean focus of {seconds:.2g} s of turbulence, which reduces the Strehl "
+        "ratio; the matrix is not affected: close the loop with references averaged over a longer time"
     )
 
     pitch_px: float
@@ -195,10 +194,10 @@ class SubApertureGrid(SensorGeometry):
     def with_slope_statistics(
         self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0
     ) -> SubApertureGrid:
-        """See :meth:`SensorGeometry.with_slope_statistics`; the spots move more than the slopes say.
+        """See :meth:`SensorGeometry.with_slope_statistics`; applies :data:`SPOT_MOTION_FACTOR`.
 
-        What is known of the air stays where a measurement tells nothing of it, as in a closed loop, which
-        takes away the motion of the spots but not the turbulence within a lenslet.
+        Without a ``persistent_fraction``, as in closed loop, ``turbulence_px`` is kept: the loop removes the
+        motion of the spots but not the turbulence within a lenslet.
         """
         turbulence = (
             SPOT_MOTION_FACTOR * rms * float(np.sqrt(persistent_fraction))
@@ -208,10 +207,10 @@ class SubApertureGrid(SensorGeometry):
         return replace(self, motion_px=SPOT_MOTION_FACTOR * rms, turbulence_px=turbulence)
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> SubApertureGrid:
-        """See :meth:`SensorGeometry.with_mean_slopes`: a lattice through the mean spots.
+        """See :meth:`SensorGeometry.with_mean_slopes`; fits a regular lattice to the mean spots.
 
-        Single spots keep no reference of their own, only shift and stretch of the whole lattice: the
-        lenslets stand regularly, the mean of the turbulence does not.
+        Only shift and magnification of the lattice are updated, because the lenslets are regular and the
+        mean turbulence is not.
         """
         spots = mean.reshape(2, -1).T
         rows, columns = np.nonzero(self.valid)
@@ -220,10 +219,10 @@ class SubApertureGrid(SensorGeometry):
         shift = weight @ spots / weight.sum()
         middle = weight @ at / weight.sum()
         lever = at - middle
-        stretch = float(
+        magnification = float(
             (weight[:, None] * lever * (spots - shift)).sum() / (weight[:, None] * lever**2).sum()
         )
-        lattice = shift + stretch * lever
+        lattice = shift + magnification * lever
         return replace(self, references_px=(self.references_px + lattice).astype(np.float32))
 
 
@@ -231,12 +230,12 @@ G = TypeVar("G", bound=SensorGeometry)
 
 
 def require_kind(grid: SensorGeometry, kind: type[G]) -> G:
-    """The geometry, for code that works with one kind of sensor only.
+    """The geometry, for code that supports one kind of sensor only.
 
     Raises
     ------
     IncompatibleProduct
-        It is of another kind.
+        The geometry is of another kind.
     """
     if not isinstance(grid, kind):
         raise IncompatibleProduct(

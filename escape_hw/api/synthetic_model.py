@@ -1,4 +1,4 @@
-"""The synthetic model that SPRINT inverts."""
+"""Interface of the synthetic models that SPRINT inverts."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from escape_hw.api.registration import Registration
 
 @runtime_checkable
 class SyntheticModel(Protocol):
-    """A model of mirror and sensor that yields interaction matrices under any registration.
+    """A model of mirror and sensor that gives interaction matrices at any registration.
 
-    It knows the nominal design only. It never sees a twin's hidden truth.
+    It depends on the nominal design only, never on the true state of a twin.
     """
 
     @property
     def name(self) -> str:
-        """Name of the model, as written into products."""
+        """Name of the model in products."""
         ...
 
     @property
@@ -54,79 +54,79 @@ class SyntheticModel(Protocol):
         registration
             Registration of the mirror.
         width
-            Scale of the influence functions' width relative to nominal.
+            Width of the influence functions relative to nominal.
 
         Returns
         -------
         ndarray, ``(n_slopes, n_act)``
-            In the sensor's slope unit, all x then all y over the valid sub-apertures.
+            In the slope unit of the sensor, all x then all y over the valid sub-apertures.
         """
         ...
 
     def variants(self) -> Sequence[Self]:
-        """Models that differ from this one by one standard deviation of something uncertain.
+        """Models that differ from this one by one standard deviation of an uncertain parameter.
 
-        SPRINT fits how much of each difference the data hold, so that the registration does not pay
-        for it and its errors know of it. Empty when the model is sure of itself.
+        SPRINT fits the amplitude of each difference, which removes its bias from the registration and adds
+        its uncertainty to the standard errors. Empty if there is no such parameter.
         """
         ...
 
 
 @runtime_checkable
 class HasSystematicError(Protocol):
-    """A model whose place on the sensor is itself known with an error only."""
+    """A model with a systematic error of the origin of its registration."""
 
     @property
     def registration_systematic_error(self) -> NDArray[np.float64]:
-        """Standard errors of where the registration counts from ``(5,)``, in its units.
+        """Standard errors of the origin of the registration ``(5,)``, in its units.
 
-        No matrix shows them; SPRINT adds them to its errors.
+        SPRINT adds them to its standard errors, because no interaction matrix shows them.
         """
         ...
 
 
 @runtime_checkable
 class HasGainTrend(Protocol):
-    """A model whose slopes may answer more at the rim of the pupil than it says, or less."""
+    """A model with an uncertain radial trend of the slope gains."""
 
     @property
     def gain_trend(self) -> float:
-        """Prior scatter of a trend: relative change of a slope's gain from the centre to the rim, or 0."""
+        """Prior standard deviation of the relative change of slope gain from centre to rim; 0: none."""
         ...
 
 
 @runtime_checkable
 class HasSlopeWeights(Protocol):
-    """A model that knows which sub-apertures it is no model of."""
+    """A model with a weight per slope, low where the model does not apply."""
 
     @property
     def slope_weights(self) -> NDArray[np.float64]:
-        """Weight of every slope's squares ``(n_slopes,)``, in (0, 1]."""
+        """Weights of the squared slopes ``(n_slopes,)``, in (0, 1]."""
         ...
 
 
 @runtime_checkable
 class HasPupilShift(Protocol):
-    """A model that knows what its matrices become when the pupil stands elsewhere on the sensor."""
+    """A model that can shift the pupil on the sensor."""
 
     def with_pupil_shift(self, shift_x: float, shift_y: float) -> SyntheticModel:
-        """The same sensor with the pupil shifted on it, and the mirror with the pupil.
+        """The model with pupil and mirror shifted on the sensor.
 
         Parameters
         ----------
         shift_x, shift_y
-            In % of a sub-aperture, positive to higher columns and rows.
+            In % of a sub-aperture, positive towards higher columns and rows.
         """
         ...
 
 
 @runtime_checkable
 class DifferentiableModel(SyntheticModel, Protocol):
-    """A synthetic model that also gives few modes at a time, and its derivatives in closed form.
+    """A synthetic model with modal matrices and analytic derivatives.
 
-    Nothing more is needed of a model than :class:`SyntheticModel`; with this SPRINT is many times
-    faster. The functions of :mod:`escape_hw.calibration.modes.derivatives` take either. Derivatives are by
-    the five parameters of the registration, in their order and units, and by the width.
+    Optional: SPRINT is many times faster with it. The functions of
+    :mod:`escape_hw.calibration.modes.derivatives` accept either kind. Derivatives are with respect to the
+    five parameters of the registration, in their order and units, and to the width.
     """
 
     def modal_matrix(
@@ -141,12 +141,12 @@ class DifferentiableModel(SyntheticModel, Protocol):
         m2c
             Mode-to-command matrix ``(n_act, n_modes)``.
         width
-            Scale of the influence functions' width relative to nominal.
+            Width of the influence functions relative to nominal.
 
         Returns
         -------
         ndarray, ``(n_slopes, n_modes)``
-            ``zonal_matrix(registration, width) @ m2c``, to single precision at least.
+            ``zonal_matrix(registration, width) @ m2c``, at least in single precision.
         """
         ...
 

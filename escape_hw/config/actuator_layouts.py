@@ -1,4 +1,4 @@
-"""Named arrangements of actuators."""
+"""Named arrangements of actuators on a mirror."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-#: Actuators on each ring of the adaptive secondary mirrors, from the inside out. A ring of n stands at
-#: n / 6 pitches from the centre, so rings are one pitch apart and actuators 1.05 along them. 672
-#: is the arrangement of LBT's mirrors; MMT publishes that its mirror has 336, but not on which rings: eight
-#: rings in the same progression are the choice here, which leave a hole of 6 pitches in the middle.
+#: Actuators on each ring of the adaptive secondary mirrors, from the inside out. A ring of n actuators has a
+#: radius of n / 6 pitches, so rings are 1 pitch apart and actuators 1.05 pitches along them. 672 is the
+#: arrangement of the LBT mirrors. The rings of the 336 actuators of the MMT mirror are not published; eight
+#: rings in the same progression are chosen here, with a central hole of 6 pitches.
 RINGS = {
     336: tuple(range(21, 64, 6)),
     672: tuple(range(9, 88, 6)),
 }
-#: What a layout's name looks like.
+#: Pattern of the names of layouts.
 PATTERN = rf"^((circle|square)-[1-9][0-9]{{0,2}}|rings-({'|'.join(map(str, RINGS))}))$"
 
 
 def _rows(layout: str) -> list[list[bool]]:
     kind, n = _parse(layout)
     if kind == "rings":
-        raise ValueError(f"layout {layout!r} stands on rings, not on a grid")
-    # Twice the distance from the centre stays whole for even n as well.
+        raise ValueError(f"layout {layout!r} is on rings, not on a grid")
+    # In half pitches, so that coordinates are integers for even n too.
     axis = range(1 - n, n, 2)
     return [[kind == "square" or x * x + y * y < n * n for x in axis] for y in axis]
 
@@ -40,30 +40,18 @@ def _parse(layout: str) -> tuple[str, int]:
 
 
 def is_on_grid(layout: str) -> bool:
-    """True when the actuators stand on a square grid.
-
-    Raises
-    ------
-    ValueError
-        The name is not a layout.
-    """
+    """Whether the actuators are on a square grid; raises :class:`ValueError` for an unknown layout."""
     return _parse(layout)[0] != "rings"
 
 
 def n_actuators(layout: str) -> int:
-    """Number of actuators of a layout.
-
-    Raises
-    ------
-    ValueError
-        The name is not a layout.
-    """
+    """Number of actuators; raises :class:`ValueError` for an unknown layout."""
     kind, n = _parse(layout)
     return n if kind == "rings" else sum(map(sum, _rows(layout)))
 
 
 def actuator_map(layout: str) -> NDArray[np.bool_]:
-    """Where the actuators stand on their grid.
+    """Map of the actuators on their grid.
 
     ``circle-N`` fills a circle of diameter N on an N x N grid: ``circle-11`` is the 97 actuators of
     the ALPAO DM97, with ``i**2 + j**2 < 5.5**2``. ``square-N`` fills the whole grid.
@@ -75,7 +63,7 @@ def actuator_map(layout: str) -> NDArray[np.bool_]:
     Raises
     ------
     ValueError
-        The name is not a layout, or its actuators do not stand on a grid.
+        Unknown layout, or a layout without a grid.
     """
     import numpy as np
 
@@ -83,10 +71,10 @@ def actuator_map(layout: str) -> NDArray[np.bool_]:
 
 
 def positions(layout: str) -> NDArray[np.float64]:
-    """Where the actuators stand, from the mirror's centre, in pitches.
+    """Actuator positions from the centre of the mirror, in pitches.
 
-    On a grid they are numbered row by row. On rings they are numbered from the inside out and
-    along each ring from +x towards +y, the first half a step away from +x.
+    On a grid the numbering is row-major. On rings it goes from the inside out and along each ring from +x
+    towards +y, beginning half a step away from +x.
 
     Returns
     -------
@@ -96,7 +84,7 @@ def positions(layout: str) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        The name is not a layout.
+        Unknown layout.
     """
     import numpy as np
 

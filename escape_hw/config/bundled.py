@@ -1,4 +1,4 @@
-"""The bundled systems, and finding a system by name or by file."""
+"""The bundled systems, and reading a system by name or from a file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SUFFIX = ".toml"
 
 
 def bundled_systems() -> tuple[str, ...]:
-    """Names of the systems that come with the package, sorted."""
+    """Sorted names of the bundled systems."""
     folder = importlib.resources.files("escape_hw.config") / "systems"
     names = (entry.name for entry in folder.iterdir())
     return tuple(sorted(name.removesuffix(_SUFFIX) for name in names if name.endswith(_SUFFIX)))
@@ -25,7 +25,7 @@ def bundled_text(name: str) -> str:
     Raises
     ------
     ConfigError
-        There is no such system; the nearest name is given.
+        There is no such system; the message gives the closest name.
     """
     known = bundled_systems()
     if name not in known:
@@ -40,17 +40,17 @@ def bundled_text(name: str) -> str:
 
 
 def find_system(system: str | os.PathLike[str]) -> tuple[str, str]:
-    """The text of a system and how to call its source in messages.
+    """The TOML text of a system, and the name of its source for messages.
 
     Parameters
     ----------
     system
-        Name of a bundled system, or the path of a TOML file (it ends in ``.toml`` or has a folder).
+        Name of a bundled system, or path of a TOML file (it ends in ``.toml`` or contains a folder).
 
     Raises
     ------
     ConfigError
-        Unknown name, or a file that cannot be read.
+        Unknown name, or an unreadable file.
     """
     name = os.fspath(system)
     path = Path(name).expanduser()

@@ -7,10 +7,10 @@ from typing import Literal, get_args
 Estimator = Literal["auto", "matrix", "telemetry"]
 #: Data that SPRINT fits within ESCAPE.
 ESTIMATORS: tuple[str, ...] = get_args(Estimator)
-PokePattern = Literal["white", "shaped", "equal-snr"]
+PokePattern = Literal["white", "anticorrelated", "equal-snr"]
 #: Poke sequences of DO-CRIME.
 POKE_PATTERNS: tuple[str, ...] = get_args(PokePattern)
-Solver = Literal["effects", "light", "frozen", "batches", "diagonal"]
+Solver = Literal["mixed-effects", "registration-only", "frozen-derivatives", "batches", "diagonal"]
 #: Solvers of SPRINT.
 SOLVERS: tuple[str, ...] = get_args(Solver)
 ModesChoice = Literal["snr", "first", "d-optimal", "a-optimal"]
@@ -22,6 +22,6 @@ EXTRA_PARAMETERS: tuple[str, ...] = get_args(ExtraParameter)
 Loss = Literal["squares", "huber"]
 #: Loss functions of SPRINT.
 LOSSES: tuple[str, ...] = get_args(Loss)
-ActuatorModel = Literal["found", "alike"]
+ActuatorModel = Literal["fitted", "nominal"]
 #: Actuators of the pseudo-synthetic matrix.
 ACTUATOR_MODELS: tuple[str, ...] = get_args(ActuatorModel)

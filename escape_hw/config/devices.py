@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-#: Frequency (Hz), amplitude of the axes x and y relative to what was asked, their lags (degrees).
+#: Frequency (Hz), amplitudes of the axes x and y relative to the request, their lags (degrees).
 Correction = TomlArray[
     tuple[
         Annotated[float, Field(gt=0)],
@@ -31,10 +31,10 @@ AxisGain = Annotated[float, Field(ge=-10, le=10)]
 
 
 def derive_tilt_scale(document: Any) -> Any:
-    """A document whose modulator knows its tilt per lambda/D, if it tells the size of its beam.
+    """Set ``devices.modulator.rad_per_lambda_d`` from ``beam_m`` if it is absent.
 
-    Reflection doubles the tilt, and a beam of diameter D on the mirror has its lambda/D there:
-    ``rad_per_lambda_d = wavelength / (2 D)``.
+    For a beam of diameter D on the modulator mirror it is ``wavelength / (2 D)``: reflection doubles the
+    tilt. Returns the document; nothing is done if a value is missing or invalid.
     """
     try:
         wavelength_m, modulator = document["system"]["wavelength_m"], document["devices"]["modulator"]
@@ -42,14 +42,14 @@ def derive_tilt_scale(document: Any) -> Any:
             return document
         tilt = wavelength_m / (2 * modulator["beam_m"])
     except (KeyError, TypeError):
-        # What is missing or of the wrong kind is reported key by key later on.
+        # The validation reports missing and invalid keys later.
         return document
     devices = {**document["devices"], "modulator": {**modulator, "rad_per_lambda_d": tilt}}
     return {**document, "devices": devices}
 
 
 class WireConfig(Section):
-    """How the controller is connected; the twin has no wire."""
+    """Connection of the real controller; not used by the twin."""
 
     kind: Literal["tcp", "serial", "usb", "emulator"] = Field(
         "tcp", description="'tcp', 'serial', 'usb', or 'emulator' for one within this process"
@@ -58,69 +58,71 @@ class WireConfig(Section):
     port: int = Field(50000, ge=1, le=65535, description="tcp: port of the controller")
     serial_port: str = Field("/dev/pi_e727", min_length=1, description="serial: device file")
     baud: int = Field(115200, ge=300, le=4_000_000, description="serial: bits per second")
-    usb_vendor: int = Field(0x1A72, ge=0, le=0xFFFF, description="usb: vendor's number")
+    usb_vendor: int = Field(0x1A72, ge=0, le=0xFFFF, description="usb: vendor id")
     usb_product: int | None = Field(
-        None, ge=0, le=0xFFFF, description="usb: product's number; absent: any of the vendor's"
+        None, ge=0, le=0xFFFF, description="usb: product id; absent: any of this vendor"
     )
-    timeout_s: float = Field(1.0, gt=0, le=60, description="longest wait for an answer, seconds")
+    timeout_s: float = Field(1.0, gt=0, le=60, description="longest wait for a reply, seconds")
     connect_s: float = Field(3.0, gt=0, le=60, description="longest wait for a connection, seconds")
 
 
 class StageConfig(Section):
-    """The axes of the real stage and the circle they draw; the twin has its own truth."""
+    """Axes of the real stage and correction of its circle; not used by the twin."""
 
     axes: TomlArray[tuple[str, str]] = Field(
         ("1", "2"), description="names of the axes that move the beam along x and y"
     )
     axis_gain: TomlArray[tuple[AxisGain, AxisGain]] = Field(
         (1.0, 1.0),
-        description="beam's tilt per tilt of each axis, relative to normal incidence; negative: reversed, "
-        "0.707: an axis that the beam meets at 45 degrees",
+        description="beam tilt per tilt of each axis, relative to normal incidence; negative: reversed, "
+        "0.707: axis at 45 degrees to the beam",
     )
     auto_zero: Literal["needed", "always", "never"] = Field(
-        "needed", description="auto-zero on opening; it sweeps the full range for about a minute"
+        "needed", description="auto-zero on opening, which sweeps the full range for about a minute"
     )
     auto_zero_v: float | None = Field(
-        None, ge=-30, le=135, description="voltage of auto-zero, volts; absent: the controller's own"
+        None, ge=-30, le=135, description="voltage of auto-zero, volts; absent: default of the controller"
     )
     auto_zero_s: float = Field(180.0, gt=0, le=3600, description="longest wait for auto-zero, seconds")
     settle_s: float = Field(5.0, gt=0, le=600, description="longest wait for an axis on target, seconds")
-    min_points: int = Field(
-        20, ge=4, le=1000, description="fewest points of a turn; the clock's 50 us times this is the shortest"
-    )
-    max_points: int = Field(4096, ge=64, le=262144, description="most points of a wave table")
-    correct: Literal["recorder", "table", "none"] = Field(
+    min_points: int = Field(20, ge=4, le=1000, description="smallest number of points per turn, 50 us each")
+    max_points: int = Field(4096, ge=64, le=262144, description="largest number of points of a wave table")
+    correction_source: Literal["recorder", "table", "none"] = Field(
         "recorder",
-        description="what makes the circle round: positions recorded at every start, the table of "
-        "'corrections', or nothing",
+        description="source of the corrections of the circle: positions recorded at every start, the table "
+        "'corrections', or none",
     )
     corrections: TomlArray[tuple[Correction, ...]] = Field(
         (),
-        description="frequency (hertz), amplitude of x and of y relative to what was asked, lag of x and of "
-        "y (degrees), as 'escape modulator start' reports them",
+        description="frequency (hertz), amplitudes of x and y relative to the request, lags of x and y "
+        "(degrees), as reported by 'escape modulator start'",
     )
-    round_within: float = Field(
-        0.02, gt=0, le=0.5, description="largest error of radius and roundness that counts as corrected"
+    circle_tolerance: float = Field(
+        0.02, gt=0, le=0.5, description="largest relative error of radius and roundness after correction"
     )
     trigger_line: int = Field(1, ge=0, le=3, description="output that triggers the camera; 0: none")
-    trigger_mode: int = Field(4, ge=0, le=99, description="the controller's number of 'generator trigger'")
-    trigger_point: int = Field(1, ge=1, le=262144, description="point of the turn where the pulse rises")
+    trigger_mode: int = Field(
+        4, ge=0, le=99, description="number of the controller's mode 'generator trigger'"
+    )
+    trigger_point: int = Field(
+        1, ge=1, le=262144, description="point of the turn at the rising edge of the pulse"
+    )
 
     @model_validator(mode="after")
     def _rules(self) -> Self:
         violations = []
         if self.axes[0] == self.axes[1]:
-            violations.append(RuleViolation("axes", list(self.axes), "two different axes are needed"))
+            violations.append(RuleViolation("axes", list(self.axes), "the two axes must differ"))
         if any(abs(gain) < 0.1 for gain in self.axis_gain):
-            text = "an axis that moves the beam less than a tenth of normal makes no circle"
+            text = "the magnitude must be at least 0.1"
             violations.append(RuleViolation("axis_gain", list(self.axis_gain), text))
         if self.min_points > self.max_points:
             violations.append(
                 RuleViolation("min_points", self.min_points, f"max_points is {self.max_points}")
             )
-        if self.correct == "table" and not self.corrections:
+        if self.correction_source == "table" and not self.corrections:
             text = "needs stage.corrections; 'recorder' measures them"
-            violations.append(RuleViolation("correct", self.correct, text))
+            violations.append(RuleViolation("correction_source", self.correction_source, text))
         raise_violations(violations)
         return self
 
@@ -131,23 +133,21 @@ Size = Annotated[int, Field(ge=1, le=16384)]
 
 
 class DeviceConfig(Section):
-    """What every device section has: which driver, which twin, which of them."""
+    """Keys of every device section: driver, twin, and which of them to use."""
 
     driver: str = Field(
-        "", description="driver of the real device (entry point in escape.devices); empty: there is none"
+        "", description="driver of the real device (entry point in escape.devices); empty: none"
     )
     sim_driver: str = Field("", description="twin of the device (entry point in escape.devices)")
-    mode: Mode | None = Field(
-        None, description="'sim' or 'hardware' for this device alone; absent: as system.mode"
-    )
-    serial: str = Field("", description="serial number, so that the wrong device is never opened")
+    mode: Mode | None = Field(None, description="'sim' or 'hardware' for this device; absent: as system.mode")
+    serial: str = Field("", description="serial number; a device with another one is not opened")
     options: dict[str, str | int | float | bool] = Field(
-        default_factory=dict, description="further settings that only this driver understands"
+        default_factory=dict, description="settings specific to the driver"
     )
 
 
 class LimitsConfig(Section):
-    """Limits that the guard enforces on every command; a rule that is absent is off."""
+    """Limits of every command, enforced by the guard; an absent rule is off."""
 
     max_stroke: float = Field(
         1.0, gt=0, le=1, description="largest magnitude of a command, fraction of full stroke"
@@ -168,11 +168,11 @@ class LimitsConfig(Section):
         description="largest magnitude of the mean command (piston), fraction of full stroke",
     )
     disabled: TomlArray[tuple[Annotated[int, Field(ge=0)], ...]] = Field(
-        (), description="numbers of the actuators that must stay at zero"
+        (), description="indices of the actuators that must stay at zero"
     )
 
     def to_limits(self) -> MirrorLimits:
-        """The limits as the guard takes them."""
+        """The limits for the guard."""
         return MirrorLimits(self.max_stroke, self.max_slew, self.max_neighbour, self.max_mean, self.disabled)
 
 
@@ -181,7 +181,7 @@ class MirrorConfig(DeviceConfig):
 
     layout: str = Field(
         pattern=actuator_layouts.PATTERN,
-        description="where the actuators stand: 'circle-N' or 'square-N' on an N x N grid, "
+        description="arrangement of the actuators: 'circle-N' or 'square-N' on an N x N grid, "
         "'rings-336' or 'rings-672' on rings",
     )
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
@@ -189,7 +189,9 @@ class MirrorConfig(DeviceConfig):
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
     )
     coupling: float = Field(
-        ge=0.01, le=0.9, description="nominal influence of an actuator at its neighbour, fraction of its peak"
+        ge=0.01,
+        le=0.9,
+        description="nominal influence function at the adjacent actuator, fraction of its peak",
     )
     stroke_m: float = Field(gt=0, le=1e-3, description="metres of surface at the actuator for a command of 1")
     limits: LimitsConfig = Field(default_factory=LimitsConfig, description="limits of every command")
@@ -200,7 +202,7 @@ class MirrorConfig(DeviceConfig):
         return actuator_layouts.n_actuators(self.layout)
 
     def actuator_map(self) -> NDArray[np.bool_] | None:
-        """Boolean map ``(N, N)``, true where an actuator stands; ``None`` when there is no grid."""
+        """Boolean map ``(N, N)``, true where there is an actuator; ``None`` without a grid."""
         return (
             actuator_layouts.actuator_map(self.layout) if actuator_layouts.is_on_grid(self.layout) else None
         )
@@ -210,20 +212,26 @@ class MirrorConfig(DeviceConfig):
         return actuator_layouts.positions(self.layout)
 
     def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
-        """Identity and nominal geometry, as a driver or twin of this mirror tells them.
+        """Identity and nominal geometry for a driver or twin.
 
         Parameters
         ----------
         model
-            What the device is.
+            Model of the device.
         simulated
-            It is a twin.
+            Whether it is a twin.
         serial
-            As the device says; by default as configured.
+            Serial number read from the device; by default as configured.
         """
-        places = self.positions() * self.pitch_m
+        positions_m = self.positions() * self.pitch_m
         return DMInfo(
-            model, serial or self.serial, self.n_act, self.actuator_map(), places, self.stroke_m, simulated
+            model,
+            serial or self.serial,
+            self.n_act,
+            self.actuator_map(),
+            positions_m,
+            self.stroke_m,
+            simulated,
         )
 
     @model_validator(mode="after")
@@ -237,13 +245,13 @@ class MirrorConfig(DeviceConfig):
 
 
 class CameraConfig(DeviceConfig):
-    """A camera as it is read out."""
+    """A camera."""
 
     sensor_px: TomlArray[tuple[Size, Size]] = Field(
-        description="width and height of the whole sensor as read out (after binning), pixels"
+        description="width and height of the sensor after binning, pixels"
     )
     region: TomlArray[tuple[Pixels, Pixels, Size, Size]] = Field(
-        description="region read: x, y, width, height, pixels"
+        description="region: x, y, width, height, pixels"
     )
     bit_depth: int = Field(ge=8, le=16, description="bits per pixel")
     exposure_s: float = Field(ge=1e-6, le=60, description="exposure time, seconds")
@@ -252,7 +260,7 @@ class CameraConfig(DeviceConfig):
     timeout_s: float = Field(1.0, gt=0, le=120, description="longest wait for a frame, seconds")
 
     def settings(self) -> CameraSettings:
-        """The settings as a camera takes them."""
+        """The settings for the camera."""
         return CameraSettings(Region(*self.region), self.exposure_s, self.frame_rate_hz, self.gain_db)
 
     @model_validator(mode="after")
@@ -279,24 +287,24 @@ class CameraConfig(DeviceConfig):
 
 
 class ScienceConfig(CameraConfig):
-    """The science camera, which sees the point-spread function."""
+    """The science camera, which records the point-spread function."""
 
     psf_px: float = Field(ge=0.5, le=100, description="lambda/D in camera pixels")
     model_psf: Literal["measured", "design"] = Field(
         "measured",
-        description="what Strehl ratios refer to: an image 'measured' without turbulence, or the 'design' "
-        "pupil's where the turbulence cannot be taken out",
+        description="reference of Strehl ratios: an image 'measured' without turbulence, or computed from "
+        "the 'design' where the turbulence cannot be removed",
     )
 
 
 class ModulatorConfig(DeviceConfig):
-    """The tip-tilt stage that turns the beam on a pyramid."""
+    """The tip-tilt stage that modulates the beam on a pyramid."""
 
     frequency_hz: float = Field(
-        gt=0, le=5000, description="turns per second that are asked for, hertz; the stage's clock rounds them"
+        gt=0, le=5000, description="requested modulation frequency, hertz; the clock of the stage rounds it"
     )
     beam_m: float | None = Field(
-        None, gt=0, le=10, description="diameter of the beam on the modulator's mirror, metres"
+        None, gt=0, le=10, description="beam diameter on the modulator mirror, metres"
     )
     rad_per_lambda_d: float = Field(
         gt=0,
@@ -312,12 +320,12 @@ class ModulatorConfig(DeviceConfig):
 
 
 class ScreenConfig(DeviceConfig):
-    """The changer of rotating phase screens: the bench's turbulence."""
+    """The rotating phase screens, which provide the turbulence of a bench."""
 
     screens_r0_m: TomlArray[tuple[Annotated[float, Field(gt=0, le=10)], ...]] = Field(
         min_length=1, description="Fried parameter of each screen at the system's wavelength, metres"
     )
-    screen: int = Field(0, ge=0, description="number of the screen in use, counted from 0")
+    screen: int = Field(0, ge=0, description="screen in use, counted from 0")
     speed_m_s: float = Field(
         ge=0, le=100, description="speed of the screen across the pupil, metres per second"
     )
@@ -338,8 +346,8 @@ class DevicesConfig(Section):
 
     dm: MirrorConfig = Field(description="deformable mirror")
     wfs: CameraConfig = Field(description="camera of the wavefront sensor")
-    science: ScienceConfig | None = Field(None, description="science camera; absent: there is none")
-    screen: ScreenConfig | None = Field(None, description="phase screens; absent: there are none")
+    science: ScienceConfig | None = Field(None, description="science camera; absent: none")
+    screen: ScreenConfig | None = Field(None, description="phase screens; absent: none")
     modulator: ModulatorConfig | None = Field(
-        None, description="tip-tilt modulator of a pyramid; absent: there is none"
+        None, description="tip-tilt modulator of a pyramid; absent: none"
     )

@@ -1,4 +1,4 @@
-"""What keys the configuration has: walks the models, for messages and for overrides."""
+"""The keys of the configuration, found by walking the models; for messages and overrides."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def dotted(path: Sequence[str | int]) -> str:
 
 
 def sections_of(annotation: Any) -> dict[str, type[BaseModel]]:
-    """The models that an annotation stands for: ``Model``, ``Model | None`` or one of several.
+    """The models in an annotation: ``Model``, ``Model | None`` or a tagged union.
 
-    Of several the key is the tag by which a validation tells them apart, else it is empty.
+    Keys are the tags of a union, or an empty string for a single model.
     """
     found: dict[str, type[BaseModel]] = {}
     for option in typing.get_args(annotation) if _is_union(annotation) else (annotation,):
@@ -43,29 +43,29 @@ def sections_of(annotation: Any) -> dict[str, type[BaseModel]]:
 
 
 def fields_of(section: type[BaseModel]) -> dict[str, FieldInfo]:
-    """The keys of a section by the names that files use."""
+    """The fields of a section by their names in files."""
     return {field.alias or name: field for name, field in section.model_fields.items()}
 
 
 def is_free_table(field: FieldInfo) -> bool:
-    """True for a table whose keys are not ours to know (a driver's options)."""
+    """True for a table with arbitrary keys (the options of a driver)."""
     return typing.get_origin(field.annotation) is dict
 
 
 @dataclass(frozen=True, slots=True)
 class KeyLocation:
-    """Where a path leads.
+    """Result of following a path through the models.
 
     Parameters
     ----------
     path
-        The path as files write it, without the tags that a validation puts in.
+        The path as in files, without the tags that a validation inserts.
     field
-        The field there; ``None`` when the path leads nowhere.
-    known
-        The part of ``path`` that exists; an item of an array or of a free table counts.
-    holders
-        The sections that may hold the first key that does not exist; empty when all do.
+        The field at the path; ``None`` if the path does not exist.
+    existing
+        The part of ``path`` that exists, including items of arrays and of free tables.
+    candidate_sections
+        The sections that could contain the first missing key; empty if the whole path exists.
     """
 
     path: KeyPath
@@ -75,7 +75,7 @@ class KeyLocation:
 
 
 def locate_key(path: Sequence[str | int]) -> KeyLocation:
-    """Follow a path, of a file or of a validation, through the models."""
+    """Follow a path from a file or a validation through the models."""
     sections: dict[str, type[BaseModel]] = {"": SystemConfig}
     field: FieldInfo | None = None
     plain: list[str | int] = []
@@ -101,7 +101,7 @@ def locate_key(path: Sequence[str | int]) -> KeyLocation:
 
 
 def kinds_with_key(path: KeyPath) -> list[str]:
-    """The kinds of a section that have the key at the end of a path, when there are several kinds."""
+    """The kinds of a section with several kinds that have the last key of a path."""
     field = locate_key(path[:-1]).field
     variants = {} if field is None else sections_of(field.annotation)
     return [kind for kind, section in variants.items() if path[-1] in fields_of(section)]
@@ -109,7 +109,7 @@ def kinds_with_key(path: KeyPath) -> list[str]:
 
 @cache
 def all_keys() -> tuple[str, ...]:
-    """Every key of the configuration, sections left out, as dotted text."""
+    """Every key of the configuration, without section names alone, as dotted text."""
     return tuple(dict.fromkeys(_leaves(SystemConfig, "")))
 
 
@@ -123,13 +123,13 @@ def _leaves(section: type[BaseModel], prefix: str) -> Iterator[str]:
 
 
 def closest_match(word: str, choices: Iterable[str]) -> str | None:
-    """The choice that looks most like a word, or ``None`` when none comes close."""
+    """The choice most similar to a word, or ``None``."""
     found = difflib.get_close_matches(word, list(choices), n=1, cutoff=0.6)
     return found[0] if found else None
 
 
 def closest_key(path: Sequence[str | int]) -> str | None:
-    """The key somebody probably meant: a neighbour, the same name elsewhere, or a similar path."""
+    """Suggestion for an unknown key: a similar neighbour, the same name elsewhere, or a similar path."""
     place = locate_key(path)
     path, depth = place.path, len(place.existing)
     neighbours = [name for holder in place.candidate_sections for name in fields_of(holder)]
@@ -137,22 +137,14 @@ def closest_key(path: Sequence[str | int]) -> str | None:
     if neighbour is not None:
         return dotted((*place.existing, neighbour, *path[depth + 1 :]))
     elsewhere = [key for key in all_keys() if key.rpartition(".")[2] == str(path[-1])]
-    # Who forgets a section forgets one; a deeper key only looks nearer when its sections are short.
+    # Prefer the least nested keys: usually one section name is missing.
     levels = min((key.count(".") for key in elsewhere), default=0)
     elsewhere = [key for key in elsewhere if key.count(".") == levels]
     return closest_match(dotted(path), elsewhere or all_keys()) or (elsewhere[0] if elsewhere else None)
 
 
 def range_text(field: FieldInfo, item: int | None = None) -> str:
-    """The allowed range of a number as text, ``0 < x <= 2``; empty when there is none.
-
-    Parameters
-    ----------
-    field
-        The field.
-    item
-        For an array: the number of the item asked about.
-    """
+    """Allowed range of a number, or of item ``item`` of an array, as text: ``0 < x <= 2``; may be empty."""
     low = high = ""
     for rule in _rules(field, item):
         if isinstance(rule, Ge):

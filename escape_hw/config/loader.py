@@ -16,15 +16,17 @@ from pydantic_core import ErrorDetails
 from escape_hw.config import key_tree
 from escape_hw.config.bundled import find_system
 from escape_hw.config.key_tree import KeyPath
+from escape_hw.config.renamed import present_key, update_document, update_override
 from escape_hw.config.section import RULE_ERROR
 from escape_hw.config.system import SystemConfig
 from escape_hw.config.toml_text import format_value, key_lines, line_of
+from escape_hw.deprecation import warn_renamed
 from escape_hw.errors import ConfigError
 
-#: Longest value that is quoted in a message.
+#: Longest value quoted in a message, characters.
 _MAX_LENGTH = 60
 
-#: What pydantic's kinds of error are called here.
+#: pydantic error type -> message.
 _MESSAGES = {
     "float_type": "must be a number",
     "int_type": "must be a whole number",
@@ -44,23 +46,22 @@ _MESSAGES = {
 
 @dataclass(frozen=True, slots=True)
 class ConfigProblem:
-    """One thing that is wrong: which key, its value as text (may be empty), what and what to do."""
+    """One invalid key: its path, its value as text (may be empty), the problem and the remedy."""
 
     path: KeyPath
     value: str
     message: str
 
     def line(self, where: str) -> str:
-        """The problem on one line, after the place it was found at."""
+        """The problem on one line that begins with its place, for example ``file:line``."""
         value = f" {self.value}" if self.value else ""
         return f"{where}  {key_tree.dotted(self.path)}:{value}  {self.message}"
 
 
 def unknown_key_problem(path: Sequence[str | int], value: Any) -> ConfigProblem:
-    """A key that the configuration does not have."""
+    """Problem of a key that does not exist, with the closest key as a suggestion."""
     plain = key_tree.locate_key(path).path
     if key_tree.locate_key(plain).existing == plain:
-        # Another kind of this section has it.
         others = ", ".join(f"'{kind}'" for kind in key_tree.kinds_with_key(plain))
         return ConfigProblem(plain, format_short(value), f"is a key of kind = {others} only")
     suggestion = key_tree.closest_key(path)
@@ -69,7 +70,7 @@ def unknown_key_problem(path: Sequence[str | int], value: Any) -> ConfigProblem:
 
 
 def problems_from(error: ValidationError) -> list[ConfigProblem]:
-    """Every problem that a validation found, without repetitions, in the order of the models."""
+    """Problems found by a validation, without repetitions, in the order of the models."""
     found: dict[tuple[KeyPath, str], ConfigProblem] = {}
     for detail in error.errors(include_url=False):
         for problem in _translate(detail):
@@ -78,7 +79,7 @@ def problems_from(error: ValidationError) -> list[ConfigProblem]:
 
 
 def format_short(value: Any) -> str:
-    """A value as TOML text, shortened when it is long."""
+    """A value as TOML text of limited length."""
     try:
         text = format_value(value)
     except TypeError:
@@ -92,8 +93,10 @@ def _translate(detail: ErrorDetails) -> list[ConfigProblem]:
     path, field, existing = place.path, place.field, place.existing
     if kind == RULE_ERROR:
         return [
-            ConfigProblem((*path, *breach.key.split(".")), format_short(breach.value), breach.message)
-            for breach in detail["ctx"]["breaches"]
+            ConfigProblem(
+                (*path, *violation.key.split(".")), format_short(violation.value), violation.message
+            )
+            for violation in detail["ctx"]["violations"]
         ]
     if kind == "extra_forbidden":
         return [unknown_key_problem(detail["loc"], value)]
@@ -146,13 +149,13 @@ def _wrong_choice(detail: ErrorDetails) -> str:
     return f"must be {expected}" + (f" (did you mean '{suggestion}'?)" if suggestion else "")
 
 
-#: Text that may stand without quotes, since a shell takes them away: words, paths, network addresses.
+#: Text accepted without quotes, which a shell removes: words, paths, network addresses.
 _BARE_WORD = re.compile(r"^(?:[A-Za-z_/~.][\w./~ :+-]*|\d{1,3}(?:\.\d{1,3}){3})$")
 
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One override: the key's path, its value, and where it came from (``--set``, ``--seed``)."""
+    """One override: path of the key, value, and origin (``--set``, ``--seed``)."""
 
     path: tuple[str, ...]
     value: Any
@@ -160,12 +163,12 @@ class Override:
 
 
 def parse_override(text: str) -> Override:
-    """Read ``key=value``; the value is TOML, and a bare word is text.
+    """Parse ``key=value``; the value is TOML or a bare word.
 
     Raises
     ------
     ConfigError
-        There is no ``=``, or either side cannot be read.
+        The text is not of this form.
     """
     key, equals, raw = text.partition("=")
     path = tuple(part.strip() for part in key.split("."))
@@ -186,9 +189,9 @@ def parse_override(text: str) -> Override:
 def apply_overrides(
     document: dict[str, Any], overrides: Iterable[Override]
 ) -> list[tuple[Override, ConfigProblem]]:
-    """Put overrides into a parsed document, in order, and report those that cannot be.
+    """Apply overrides to a parsed document, in order; returns those that are not possible.
 
-    Keys that the document leaves out may be set as long as the models have them.
+    A key may be absent from the document but must exist in the models.
     """
     problems = []
     for override in overrides:
@@ -223,21 +226,26 @@ def load_system(
     seed: int | None = None,
     mode: str | None = None,
 ) -> SystemConfig:
-    """Read a system by its name or from a file.
+    """Load the configuration of a system by its name or from a file.
 
     Parameters
     ----------
     system
         Name of a bundled system, or path of a TOML file.
     overrides
-        ``section.key=value`` each, applied in order.
+        ``section.key=value``, applied in order.
     seed, mode
         Replace ``system.seed`` and ``system.mode``.
 
     Raises
     ------
     ConfigError
-        One line for each problem: file and line (or ``--set``), key, value, what to do.
+        One line per problem: file and line (or ``--set``), key, value, remedy.
+
+    Warns
+    -----
+    RenamedWarning
+        A key or value has its name of an earlier version, see :mod:`escape_hw.config.renamed`.
     """
     text, source = find_system(system)
     return load_text(text, source, overrides=overrides, seed=seed, mode=mode)
@@ -251,21 +259,18 @@ def load_text(
     seed: int | None = None,
     mode: str | None = None,
 ) -> SystemConfig:
-    """Read a configuration from TOML text; see :func:`load_system`.
-
-    Parameters
-    ----------
-    text
-        The TOML document.
-    source
-        What to call it in messages.
-    """
+    """Load a configuration from TOML text; ``source`` names it in messages. See :func:`load_system`."""
     changes, lines = _parse_changes(overrides, seed, mode)
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError("\n".join([_syntax_line(error, text, source), *lines])) from None
-    return _validate(document, key_lines(text), source, changes, lines)
+    places = key_lines(text)
+    for key, message in update_document(document):
+        warn_renamed(f"{source}:{places.get(tuple(key.split('.')), 1)}  {message}")
+    # A line counts for the present name of its key.
+    places = {present_key(path): line for path, line in places.items()} | places
+    return _validate(document, places, source, changes, lines)
 
 
 def _validate(
@@ -298,9 +303,14 @@ def _parse_changes(
     changes, lines = [], []
     for text in overrides:
         try:
-            changes.append(parse_override(text))
+            override = parse_override(text)
         except ConfigError as error:
             lines.append(str(error))
+            continue
+        path, value, renamings = update_override(override.path, override.value)
+        for _, message in renamings:
+            warn_renamed(f"{override.origin}  {message}")
+        changes.append(Override(path, value, override.origin))
     if seed is not None:
         changes.append(Override(("system", "seed"), seed, "--seed"))
     if mode is not None:

@@ -1,4 +1,4 @@
-"""Registry of entry points: device drivers, twins, synthetic models, emulators, simulated benches and the window."""
+"""Registry of entry points: drivers, twins, synthetic models, emulators, simulated benches, windows."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ T = TypeVar("T")
 
 
 def require_factory(what: str, where: str, factory: object, parameters: Sequence[str]) -> None:
-    """Refuse what cannot be called as a factory is.
+    """Check that an object can be called as a factory.
 
     Parameters
     ----------
     what, where
-        Of whom it is, and where it was found.
+        Description and location of the object, for the message.
     factory
-        What was found.
+        The object.
     parameters
-        What it is called with, in this order.
+        Names of the positional arguments.
 
     Raises
     ------
     ConfigError
-        It is not callable, or takes other arguments.
+        The object is not callable or takes other arguments.
     """
     call = f"factory({', '.join(parameters)})"
     if not callable(factory):
@@ -47,7 +47,7 @@ def require_factory(what: str, where: str, factory: object, parameters: Sequence
     try:
         signature = inspect.signature(factory)
     except (TypeError, ValueError):
-        # Some compiled functions do not tell; calling them will.
+        # Some compiled functions have no signature.
         return
     try:
         signature.bind(*parameters)
@@ -58,38 +58,39 @@ def require_factory(what: str, where: str, factory: object, parameters: Sequence
 
 
 def call_factory(what: str, kind: type[T], factory: Callable[..., object], *arguments: Any) -> T:
-    """What a factory makes, if it is of the right kind.
+    """Call a factory and check the type of its result.
 
     Parameters
     ----------
     what
-        Of whom it is.
+        Description of the factory, for the message.
     kind
-        What it must make.
+        Required type of the result.
     factory, arguments
-        Called with these.
+        The factory and its arguments.
 
     Raises
     ------
     ConfigError
-        It fails, or makes something else.
+        The factory fails or returns another type.
     EscapeError
-        The factory's own.
+        Raised by the factory itself.
     """
     try:
-        one = factory(*arguments)
+        product = factory(*arguments)
     except EscapeError:
         raise
     except Exception as error:
         raise ConfigError(
-            f"{what} cannot be made: {_factory_name(factory)} failed with {type(error).__name__}: {error}"
+            f"{what} cannot be created: {_factory_name(factory)} failed with {type(error).__name__}: {error}"
             f"{_raised_at(error)}"
         ) from error
-    if not isinstance(one, kind):
+    if not isinstance(product, kind):
         raise ConfigError(
-            f"{what} makes a {type(one).__name__}, not a {kind.__name__}; {_factory_name(factory)} must return one"
+            f"{what} creates a {type(product).__name__}, not a {kind.__name__}; "
+            f"{_factory_name(factory)} must return one"
         )
-    return one
+    return product
 
 
 def _factory_name(factory: object) -> str:
@@ -98,7 +99,6 @@ def _factory_name(factory: object) -> str:
 
 
 def _raised_at(error: Exception) -> str:
-    """Where it was raised, for its author."""
     frames = traceback.extract_tb(error.__traceback__)
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
@@ -115,7 +115,7 @@ _KINDS = {
     STAND_INS: "simulated bench",
     WINDOWS: "window",
 }
-#: What the factories of each group are called with.
+#: Arguments of the factories of each group.
 _PARAMETERS = {
     DEVICES: ("name", "config", "shared"),
     MODELS: ("config", "grid"),
@@ -123,13 +123,13 @@ _PARAMETERS = {
     STAND_INS: ("config",),
     WINDOWS: ("system", "address", "screenshot", "reset_settings"),
 }
-#: What the name of every twin begins with; other drivers drive real hardware.
+#: Prefix of the names of twins; other drivers are for real hardware.
 TWIN_PREFIX = "sim-"
 
 #: ``factory(name, config, shared) -> device``: the key in ``[devices]``, the whole configuration and
-#: one dictionary per opened system, through which the twins of one bench find each other.
+#: one dictionary per opened system, which the twins of a bench share.
 DeviceFactory = Callable[[str, SystemConfig, dict[str, object]], Device]
-#: ``factory(config, grid) -> model``; without a grid the model takes the nominal one.
+#: ``factory(config, grid) -> model``; without a grid the model uses the nominal one.
 ModelFactory = Callable[[SystemConfig, SensorGeometry | None], SyntheticModel]
 #: ``run(system, address, screenshot, reset_settings) -> exit code``: shows the window until it is closed.
 WindowRunner = Callable[[str, str, Path | None, bool], int]
@@ -138,31 +138,31 @@ _REGISTERED: dict[str, DeviceFactory] = {}
 
 
 def register_device(name: str, factory: DeviceFactory) -> None:
-    """Offer a driver or twin under a name, in this process only.
+    """Register a driver or twin in this process, for scripts and notebooks.
 
-    For scripts and notebooks that try a driver out; a package declares an entry point in the group
-    ``escape.devices`` instead. Registering the same name again replaces the earlier factory.
+    A package declares an entry point in the group ``escape.devices`` instead. Registering a name again
+    replaces the factory.
 
     Parameters
     ----------
     name
-        What ``driver`` or ``sim_driver`` of a device section says.
+        Value of ``driver`` or ``sim_driver`` in a device section.
     factory
-        ``factory(name, config, shared)`` makes a device that is not open, see :data:`DeviceFactory`.
+        ``factory(name, config, shared)`` returns a device that is not open, see :data:`DeviceFactory`.
 
     Raises
     ------
     ConfigError
-        An installed package offers that name already, or it is no such factory.
+        An installed package provides this name, or the factory is not callable with these arguments.
     """
     require_factory(f"device driver '{name}'", repr(factory), factory, _PARAMETERS[DEVICES])
     if any(entry.name == name for entry in importlib.metadata.entry_points(group=DEVICES)):
-        raise ConfigError(f"device driver '{name}' is offered by an installed package; choose another name")
+        raise ConfigError(f"device driver '{name}' is provided by an installed package; choose another name")
     _REGISTERED[name] = factory
 
 
 def available(group: str) -> tuple[str, ...]:
-    """Names registered in a group (:data:`DEVICES`, :data:`MODELS`, :data:`EMULATORS`), sorted."""
+    """Sorted names of a group (:data:`DEVICES`, :data:`MODELS`, :data:`EMULATORS`)."""
     own = _REGISTERED if group == DEVICES else ()
     return tuple(sorted({*own, *(entry.name for entry in importlib.metadata.entry_points(group=group))}))
 
@@ -173,61 +173,37 @@ def device_factory(name: str, *, hardware: bool = False) -> DeviceFactory:
     Parameters
     ----------
     name
-        Of the driver or twin.
+        Name of the driver or twin.
     hardware
-        A driver of real hardware is wanted: no twin is offered instead of one that is missing.
+        Whether a driver for real hardware is required; the message then suggests no twins.
 
     Raises
     ------
     ConfigError
-        Unknown name (with the nearest one), or its package is not completely installed.
+        Unknown name (the message gives the closest one), or its package is not completely installed.
     """
     return _REGISTERED[name] if name in _REGISTERED else cast(DeviceFactory, _load(DEVICES, name, hardware))
 
 
 def model_factory(name: str) -> ModelFactory:
-    """The factory of a synthetic model; calling it raises ConfigError when it fails or makes none.
-
-    Raises
-    ------
-    ConfigError
-        Unknown name (with the nearest one), its package is not completely installed, or is broken.
-    """
+    """The factory of a synthetic model, with its result checked. Raises as :func:`device_factory`."""
     return cast(
         ModelFactory, partial(call_factory, f"synthetic model '{name}'", SyntheticModel, _load(MODELS, name))
     )
 
 
 def emulator_factory(name: str) -> EmulatorFactory:
-    """The factory of an emulator.
-
-    Raises
-    ------
-    ConfigError
-        Unknown name (with the nearest one), or its package is not completely installed.
-    """
+    """The factory of an emulator. Raises as :func:`device_factory`."""
     return cast(EmulatorFactory, _load(EMULATORS, name))
 
 
 def stand_in_bench_factory() -> StandInBenchFactory:
-    """The factory of the simulated bench behind real drivers.
-
-    Raises
-    ------
-    ConfigError
-        The package that holds it is not completely installed.
-    """
+    """The factory of the simulated bench behind real drivers. Raises as :func:`device_factory`."""
     return cast(StandInBenchFactory, _load(STAND_INS, "bench"))
 
 
 def window_runner() -> WindowRunner:
-    """What shows the graphical interface.
-
-    Raises
-    ------
-    ConfigError
-        The interface or what it needs is not installed.
-    """
+    """The function that shows the graphical interface. Raises as :func:`device_factory`."""
     return cast(WindowRunner, _load(WINDOWS, "gui"))
 
 
@@ -240,7 +216,7 @@ def _load(group: str, name: str, hardware: bool = False) -> Any:
         raise ConfigError(_no_driver_message(name) if hardware else _unknown_name_message(group, name))
     if len(entries) > 1:
         owners = " and ".join(f"{value} ({_package(entry)})" for value, entry in sorted(entries.items()))
-        raise ConfigError(f"{kind} '{name}' is offered twice: {owners}; uninstall one of the packages")
+        raise ConfigError(f"{kind} '{name}' is provided twice: {owners}; uninstall one of the packages")
     (entry,) = entries.values()
     try:
         factory = entry.load()
@@ -261,7 +237,7 @@ def _unknown_name_message(group: str, name: str) -> str:
     listing = ", ".join(known) if known else "none: is escape-hw itself installed in this environment?"
     return (
         f"no {_KINDS[group]} '{name}' is installed ({hint}installed: {listing}); "
-        f"install the package that offers it as an entry point in '{group}'"
+        f"install the package that provides it as an entry point in '{group}'"
     )
 
 
@@ -271,7 +247,7 @@ def _no_driver_message(name: str) -> str:
     hint = f"did you mean '{suggestion}'? " if suggestion else ""
     return (
         f"no driver '{name}' for real hardware is installed ({hint}"
-        f"installed: {', '.join(real) if real else 'none, only twins'}); install the package that offers "
+        f"installed: {', '.join(real) if real else 'none, only twins'}); install the package that provides "
         f"'{name}' as an entry point in '{DEVICES}', or use the twin (--mode sim)"
     )
 

@@ -1,4 +1,4 @@
-"""What every configuration section has in common."""
+"""Base class of configuration sections, and rules over several keys."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 from pydantic_core import PydanticCustomError
 
-#: Type of the errors that rules over several keys raise; the loader unpacks them.
+#: Error type of violated rules over several keys.
 RULE_ERROR = "rule"
 
 T = TypeVar("T")
 
 
 class Section(BaseModel):
-    """A frozen table of the configuration; unknown keys and silent conversions are errors."""
+    """A frozen table of the configuration. Unknown keys and type conversions are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class RuleViolation(NamedTuple):
-    """A rule over several keys that is broken: the key to blame (dotted), its value, what to do."""
+    """A violated rule over several keys: the key to report (dotted), its value, the remedy."""
 
     key: str
     value: Any
@@ -29,22 +29,22 @@ class RuleViolation(NamedTuple):
 
 
 def raise_violations(violations: Iterable[RuleViolation]) -> None:
-    """Raise one error that carries every broken rule; for ``model_validator(mode="after")``.
+    """Raise one error with all violations, if there are any; for ``model_validator(mode="after")``.
 
     Raises
     ------
     PydanticCustomError
-        When there is any breach.
+        At least one rule is violated.
     """
     found = list(violations)
     if found:
-        text = "; ".join(f"{b.key} = {b.value}: {b.message}" for b in found)
-        raise PydanticCustomError(RULE_ERROR, "{text}", {"text": text, "breaches": found})
+        text = "; ".join(f"{v.key} = {v.value}: {v.message}" for v in found)
+        raise PydanticCustomError(RULE_ERROR, "{text}", {"text": text, "violations": found})
 
 
 def _list_to_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-#: ``TomlArray[tuple[float, ...]]``: a TOML array that is kept as a tuple, so that sections stay frozen.
+#: ``TomlArray[tuple[float, ...]]``: a TOML array stored as a tuple, which keeps sections immutable.
 TomlArray = Annotated[T, BeforeValidator(_list_to_tuple)]

@@ -1,4 +1,4 @@
-"""Configuration of the wavefront sensor, one section for each kind of sensor."""
+"""Section [sensor], one model for each kind of wavefront sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from escape_hw.config.section import RuleViolation, Section, TomlArray, raise_violations
 
-#: The kind that a section without ``kind`` is taken for.
+#: Kind of a section without ``kind``.
 _DEFAULT_KIND = "shack-hartmann"
 
 Coordinate = Annotated[float, Field(ge=0, le=16384)]
@@ -18,12 +18,12 @@ Point = TomlArray[tuple[Coordinate, Coordinate]]
 
 
 class SensorSection(Section):
-    """What the sensors have in common."""
+    """Keys of every kind of sensor."""
 
     kind: str = Field(_DEFAULT_KIND, description="kind of sensor")
     n_sub: int = Field(ge=2, le=400, description="sub-apertures across the pupil")
     min_flux: float = Field(
-        0.5, gt=0, le=1, description="least flux of a valid sub-aperture, fraction of the brightest"
+        0.5, gt=0, le=1, description="smallest flux of a valid sub-aperture, fraction of the brightest"
     )
     beam_radius_m: Annotated[float, Field(allow_inf_nan=True)] = Field(
         math.inf, gt=0, description="1/e^2 intensity radius of the Gaussian beam, metres; inf: uniform"
@@ -47,19 +47,19 @@ class ShackHartmannSection(SensorSection):
 
 
 class PyramidSection(SensorSection):
-    """A four-sided pyramid sensor; a sub-aperture is one pixel of the pupil's image."""
+    """A four-sided pyramid sensor; a sub-aperture is one pixel of the pupil image."""
 
     kind: Literal["pyramid"] = Field(description="kind of sensor: 'shack-hartmann' or 'pyramid'")
-    n_sub: int = Field(ge=4, le=400, description="camera pixels across a pupil image")
+    n_sub: int = Field(ge=4, le=400, description="diameter of a pupil image, camera pixels")
     pupils_px: TomlArray[tuple[Point, Point, Point, Point]] = Field(
         description="nominal centres of the pupil images in the region, (x, y) in pixels: "
         "upper left, upper right, lower left, lower right"
     )
-    modulation: float = Field(3.0, ge=0, le=50, description="radius of the modulation, lambda/D; 0: none")
+    modulation: float = Field(3.0, ge=0, le=50, description="modulation radius, lambda/D; 0: none")
     normalisation: Literal["global", "local"] = Field(
         "global",
-        description="slopes are divided by the mean light of all pixels ('global') "
-        "or by each pixel's own ('local')",
+        description="slopes are divided by the mean flux of all pixels ('global') "
+        "or by the flux of each pixel ('local')",
     )
 
     @model_validator(mode="after")
@@ -68,7 +68,7 @@ class PyramidSection(SensorSection):
         return self
 
     def pupils_outside(self, width: int, height: int) -> list[int]:
-        """Numbers of the nominal pupil images that the region cuts."""
+        """Numbers of the nominal pupil images that extend beyond the region."""
         half = self.n_sub / 2
         return [
             number
@@ -78,7 +78,7 @@ class PyramidSection(SensorSection):
 
 
 def _placement_violations(centres: tuple[tuple[float, float], ...], n_sub: int) -> list[RuleViolation]:
-    """Pupil images in the wrong order, or on top of each other."""
+    """Violations by pupil images in the wrong order, or overlapping."""
     violations = []
     places = ("upper left", "upper right", "lower left", "lower right")
     for first, second, axis in ((0, 1, 0), (2, 3, 0), (0, 2, 1), (1, 3, 1)):
@@ -104,13 +104,12 @@ def _placement_violations(centres: tuple[tuple[float, float], ...], n_sub: int) 
 
 
 def _kind(value: Any) -> Any:
-    """The kind that a table or a section names."""
     return (
         value.get("kind", _DEFAULT_KIND) if isinstance(value, dict) else getattr(value, "kind", _DEFAULT_KIND)
     )
 
 
-#: A section of either kind; the key ``kind`` says which.
+#: A section of either kind, selected by the key ``kind``.
 AnySensor = Annotated[
     Annotated[ShackHartmannSection, Tag("shack-hartmann")] | Annotated[PyramidSection, Tag("pyramid")],
     Discriminator(_kind),

@@ -1,4 +1,4 @@
-"""Complete configuration of a system: sections [system], [telescope], [basis], [loop], [calibration], [tracking], [server] and rules between sections."""
+"""Complete configuration of a system, its general sections, and rules between sections."""
 
 from __future__ import annotations
 
@@ -25,93 +25,97 @@ from escape_hw.errors import ConfigError
 
 
 class TelescopeSection(Section):
-    """What stands in the light before the pupil; ``system.pupil_m`` is its diameter."""
+    """Obscuration of the telescope; the diameter of its pupil is ``system.pupil_m``."""
 
     obscuration: float = Field(
-        0.0, ge=0, le=0.95, description="diameter of the central obscuration, fraction of the pupil's"
+        0.0, ge=0, le=0.95, description="diameter of the central obscuration, fraction of the pupil diameter"
     )
-    spider_m: float = Field(0.0, ge=0, le=10, description="width of the vanes that hold it, metres")
+    spider_m: float = Field(0.0, ge=0, le=10, description="width of the spider vanes, metres")
     spiders_deg: TomlArray[tuple[Annotated[float, Field(ge=-360, le=360)], ...]] = Field(
-        (), description="where each vane points from the centre, degrees from +x towards +y"
+        (), description="direction of each vane from the centre, degrees from +x towards +y"
     )
 
     @model_validator(mode="after")
     def _rules(self) -> Self:
         if self.spiders_deg and not self.spider_m:
             raise_violations(
-                [RuleViolation("spider_m", self.spider_m, "the vanes of spiders_deg need a width")]
+                [RuleViolation("spider_m", self.spider_m, "the vanes in spiders_deg need a width above 0")]
             )
         return self
 
 
 class TrackingSection(Section):
-    """How ``escape track`` follows a drifting system."""
+    """Settings of ``escape track``, which follows a drifting system in closed loop."""
 
     poke: float = Field(
         0.00025,
         gt=0,
         le=0.1,
-        description="pokes in the closed loop are uniform in +-poke, rms surface as fraction of full stroke",
+        description="closed-loop pokes are uniform in +-poke, rms surface as fraction of full stroke",
     )
     memory_s: float = Field(
-        10.0, ge=1, le=1e5, description="time in which old frames fade to 1/e in the live registration"
+        10.0,
+        ge=1,
+        le=1e5,
+        description="time constant of forgetting (to 1/e) in the live registration, seconds",
     )
-    worth: float = Field(
-        0.01,
-        gt=0,
-        le=1,
-        description="relative change of the matrix from which on a new one is worth an exchange",
+    exchange_threshold: float = Field(
+        0.01, gt=0, le=1, description="relative change of the matrix above which an exchange is proposed"
     )
-    limit: float = Field(
-        0.3,
-        gt=0,
-        le=10,
-        description="largest relative change of the matrix that is exchanged without asking",
+    exchange_limit: float = Field(
+        0.3, gt=0, le=10, description="largest relative change of the matrix exchanged without approval"
     )
-    largest_shift: float = Field(
+    max_shift: float = Field(
         100.0,
         gt=0,
         le=1000,
-        description="shift since the start that needs a new calibration, % of a sub-aperture",
+        description="shift since the start above which a new calibration is needed, % of a sub-aperture",
     )
 
 
 class ServerSection(Section):
-    """Limits of ``escape serve``; all of them make the mirror safe, but for the first."""
+    """Limits of ``escape serve``. Exceeding any of them but ``lease_s`` makes the mirror safe."""
 
     lease_s: float = Field(
-        5.0, ge=1.5, le=600, description="a client that may write and is silent for so long loses that right"
+        5.0, ge=1.5, le=600, description="a client with the write lease loses it after this silence, seconds"
     )
-    abandoned_s: float = Field(
-        10.0, ge=0.5, le=3600, description="time after which a procedure that nobody holds is aborted"
+    unattended_s: float = Field(
+        10.0,
+        ge=0.5,
+        le=3600,
+        description="a procedure without a lease holder is aborted after this time, seconds",
     )
-    silent_s: float = Field(
+    engine_silence_s: float = Field(
         10.0,
         ge=2,
         le=600,
-        description="an engine that says nothing for so long, its mirror not flat, is ended",
+        description="longest silence of the engine while the mirror is not flat, seconds; then it is killed",
     )
-    no_frames_s: float = Field(2.0, ge=0.2, le=600, description="longest time without a frame in closed loop")
-    saturated_share: float = Field(
-        0.2, gt=0, le=1, description="share of the actuators at their limits that counts as saturated"
+    no_frames_s: float = Field(
+        2.0, ge=0.2, le=600, description="longest time without a frame in closed loop, seconds"
+    )
+    saturated_fraction: float = Field(
+        0.2, gt=0, le=1, description="fraction of the actuators at their limits that counts as saturated"
     )
     saturated_s: float = Field(
-        1.0, ge=0.2, le=600, description="longest time with saturated actuators in closed loop"
+        1.0, ge=0.2, le=600, description="longest time with saturated actuators in closed loop, seconds"
     )
     diverging_factor: float = Field(
-        4.0, gt=1, le=1000, description="growth of the residual, beside its median, that counts as diverging"
+        4.0, gt=1, le=1000, description="ratio of the residual to its median that counts as diverging"
     )
-    diverging_s: float = Field(1.0, ge=0.2, le=600, description="longest time with a diverging residual")
+    diverging_s: float = Field(
+        1.0, ge=0.2, le=600, description="longest time with a diverging residual, seconds"
+    )
 
 
 S = TypeVar("S", bound=SensorSection)
 
-#: Largest gain of the loop: an integrator above it diverges on any bench.
+#: Largest gain of the loop. An integrator with a higher gain is unstable at any delay.
 MAX_GAIN = 2.0
 
 
 class SystemSection(Section):
-    """What the system is."""
+    """Identity of the system."""
 
     name: str = Field(
         pattern=r"^[a-z0-9][a-z0-9_-]*$",
@@ -119,12 +123,12 @@ class SystemSection(Section):
         description="name, written into every product (lower case, digits, '-' and '_')",
     )
     description: str = Field("", description="one line for lists and reports")
-    mode: Mode = Field("sim", description="'sim': every device is its twin; 'hardware': the real ones")
-    seed: int = Field(1, ge=0, le=2**63 - 1, description="seed of every random stream")
-    wavelength_m: float = Field(ge=1e-7, le=1e-4, description="wavelength of the sensor's light, metres")
-    pupil_m: float = Field(gt=0, le=100, description="diameter of the pupil, metres")
+    mode: Mode = Field("sim", description="'sim': every device is a twin; 'hardware': real devices")
+    seed: int = Field(1, ge=0, le=2**63 - 1, description="seed of all random streams")
+    wavelength_m: float = Field(ge=1e-7, le=1e-4, description="wavelength of the wavefront sensor, metres")
+    pupil_m: float = Field(gt=0, le=100, description="pupil diameter, metres")
     optics: Literal["fast", "oopao"] = Field(
-        "fast", description="the twin's optics: 'fast', or 'oopao' for the reference"
+        "fast", description="optical model of the twin: 'fast', or 'oopao' as the reference"
     )
 
 
@@ -144,7 +148,7 @@ class BasisSection(Section):
             raise_violations([RuleViolation("file", "", "kind = 'file' needs the name of a FITS file")])
         if self.kind != "file" and self.file:
             raise_violations(
-                [RuleViolation("file", self.file, f"is not read with kind = '{self.kind}'; remove it")]
+                [RuleViolation("file", self.file, f"is not used with kind = '{self.kind}'; remove it")]
             )
         return self
 
@@ -152,10 +156,10 @@ class BasisSection(Section):
 class LoopSection(Section):
     """Leaky integrator."""
 
-    gain: float = Field(0.4, gt=0, le=MAX_GAIN, description="gain of the integrator")
-    leak: float = Field(0.01, ge=0, le=1, description="share of the integrator lost per frame")
+    gain: float = Field(0.4, gt=0, le=MAX_GAIN, description="integrator gain")
+    leak: float = Field(0.01, ge=0, le=1, description="fraction of the integrator lost per frame")
     dropped_modes: int = Field(
-        0, ge=0, le=10000, description="weakest eigenmodes left out of the reconstructor"
+        0, ge=0, le=10000, description="number of weakest eigenmodes left out of the reconstructor"
     )
 
 
@@ -172,12 +176,12 @@ class CalibrationSection(Section):
         0.1,
         gt=0,
         le=1,
-        description="largest command of any actuator in the poke of one mode, fraction of full stroke",
+        description="largest actuator command in the poke of one mode, fraction of full stroke",
     )
     pokes: PokePattern = Field(
         "white",
-        description="DO-CRIME: 'white' pokes, 'shaped' ones that change sign more often than not, or white "
-        "ones that share the same Strehl budget so that modes have 'equal-snr'",
+        description="DO-CRIME: 'white' pokes, 'anticorrelated' pokes, which change sign more often than not, "
+        "or white pokes with amplitudes per mode that give 'equal-snr' at the same loss of Strehl ratio",
     )
     frames: int = Field(10000, ge=1, le=100_000_000, description="DO-CRIME: number of frames")
     push_pull_poke: float = Field(
@@ -187,45 +191,45 @@ class CalibrationSection(Section):
         20, ge=1, le=1_000_000, description="push-pull: frames per push and per pull"
     )
     modulated_frames: int = Field(
-        500, ge=50, le=1_000_000, description="modulation: frames per batch of modes driven at once"
+        500, ge=50, le=1_000_000, description="modulation-demodulation: frames per batch of modes"
     )
     whiten_order: int = Field(
-        6, ge=0, le=64, description="past frames that predict the turbulence; 0: plain estimator"
+        6, ge=0, le=64, description="number of past frames that predict the turbulence; 0: no whitening"
     )
-    lags: int = Field(5, ge=1, le=64, description="frames over which the temporal response is estimated")
+    lags: int = Field(5, ge=1, le=64, description="length of the estimated temporal response, frames")
     checkpoint_s: float = Field(
-        5.0, gt=0, description="seconds after which a calibration keeps its state again, to be resumed from"
+        5.0, gt=0, description="interval between checkpoints of a calibration, seconds"
     )
     estimator: Estimator = Field(
         "auto",
-        description="what SPRINT fits: the 'matrix' or the whitened 'telemetry'; 'auto': the telemetry",
+        description="SPRINT: fit the 'matrix' or the whitened 'telemetry'; 'auto': telemetry where possible",
     )
     sprint_modes: int = Field(50, ge=1, le=10000, description="SPRINT: largest number of modes used")
     modes_choice: ModesChoice = Field(
         "snr",
-        description="SPRINT: which modes: 'snr' (best measured), 'first', or those that tell most of the "
-        "registration, 'd-optimal' or 'a-optimal'",
+        description="SPRINT: selection of modes: highest 'snr', the 'first', or the most informative on the "
+        "registration by the 'd-optimal' or 'a-optimal' criterion",
     )
     solver: Solver = Field(
-        "effects",
-        description="SPRINT: 'effects' (with what the model does not know), 'light' (gain and registration), "
-        "'frozen' (the same, derivatives of the start), 'batches' (the paper's, few modes at a time), "
-        "'diagonal' (a gain for every mode)",
+        "mixed-effects",
+        description="SPRINT: 'mixed-effects' (errors of the model as random effects), 'registration-only' "
+        "(gain and registration), 'frozen-derivatives' (registration-only with the derivatives of the "
+        "starting point), 'batches' (the paper's, a few modes at a time), 'diagonal' (a gain per mode)",
     )
-    actuators: ActuatorModel = Field(
-        "found",
-        description="the pseudo-synthetic matrix has the actuators' gains and widths as SPRINT 'found' them, "
-        "or all 'alike', as the drawing has them",
+    actuator_model: ActuatorModel = Field(
+        "fitted",
+        description="actuator gains and influence widths in the pseudo-synthetic matrix: as 'fitted' by "
+        "SPRINT, or 'nominal'",
     )
     loss: Loss = Field(
-        "squares", description="SPRINT: 'squares', or 'huber' where some sub-apertures are not to be trusted"
+        "squares", description="SPRINT: least 'squares', or 'huber' where some sub-apertures are outliers"
     )
-    also: TomlArray[tuple[ExtraParameter, ...]] = Field(
+    extra_parameters: TomlArray[tuple[ExtraParameter, ...]] = Field(
         (),
-        description="SPRINT: what to fit beside the registration: 'anamorphosis' (shear of the mirror), "
-        "'pupil_shift' (of a pyramid's images since they were found)",
+        description="SPRINT: parameters fitted beside the registration: 'anamorphosis' (shear of the "
+        "mirror), 'pupil_shift' (of pyramid pupil images since they were located)",
     )
-    learning_rate: float = Field(1.0, gt=0, le=1, description="SPRINT: share of each step that is taken")
+    learning_rate: float = Field(1.0, gt=0, le=1, description="SPRINT: fraction of each Gauss-Newton step")
     model: str = Field(
         "fast", min_length=1, description="SPRINT: synthetic model (entry point in escape.models)"
     )
@@ -235,42 +239,42 @@ class SystemConfig(Section):
     """The whole configuration of a system."""
 
     schema_version: Literal[1] = Field(1, alias="schema", description="version of these keys")
-    system: SystemSection = Field(description="what the system is")
+    system: SystemSection = Field(description="identity of the system")
     telescope: TelescopeSection = Field(
-        default_factory=TelescopeSection, description="what stands in the light before the pupil"
+        default_factory=TelescopeSection, description="obscuration of the telescope"
     )
-    sensor: AnySensor = Field(description="the wavefront sensor")
-    devices: DevicesConfig = Field(description="the devices")
+    sensor: AnySensor = Field(description="wavefront sensor")
+    devices: DevicesConfig = Field(description="devices")
     basis: BasisSection = Field(description="modal basis")
     loop: LoopSection = Field(default_factory=LoopSection, description="integrator")
     calibration: CalibrationSection = Field(
         default_factory=CalibrationSection, description="defaults of the calibration procedures"
     )
-    tracking: TrackingSection = Field(default_factory=TrackingSection, description="the tracker")
+    tracking: TrackingSection = Field(default_factory=TrackingSection, description="tracker")
     server: ServerSection = Field(default_factory=ServerSection, description="limits of the server")
-    twin: TwinConfig = Field(default_factory=TwinConfig, description="the simulated bench")
+    twin: TwinConfig = Field(default_factory=TwinConfig, description="simulated bench")
 
     @model_validator(mode="before")
     @classmethod
     def _derived(cls, document: Any) -> Any:
-        """Keys that follow from others."""
+        """Fill in keys that follow from others."""
         return derive_tilt_scale(document)
 
     @property
     def simulated(self) -> bool:
-        """True when any device is to be a twin."""
+        """True when any device is a twin."""
         present = [device for _, device in self.devices if isinstance(device, DeviceConfig)]
         return any((d.mode or self.system.mode) == "sim" and d.sim_driver for d in present)
 
     def to_toml(self) -> str:
-        """The whole effective configuration, defaults included, as ASCII TOML text.
+        """The effective configuration, defaults included, as ASCII TOML text.
 
-        Loading the text gives an equal configuration; products carry it in their headers.
+        Loading the text gives an equal configuration. Products store it.
         """
         return dump_toml(self.model_dump(by_alias=True, exclude_none=True))
 
     def sensor_as(self, kind: type[S]) -> S:
-        """The sensor's section, for code that works with one kind of sensor only.
+        """The sensor section, for code that supports one kind of sensor only.
 
         Raises
         ------
@@ -281,7 +285,7 @@ class SystemConfig(Section):
             wanted = kind.model_fields["kind"].annotation
             raise ConfigError(
                 f"system '{self.system.name}' has sensor.kind = '{self.sensor.kind}'; "
-                f"this needs {', '.join(map(repr, get_args(wanted)))}"
+                f"this operation needs {', '.join(map(repr, get_args(wanted)))}"
             )
         return self.sensor
 
@@ -303,22 +307,22 @@ class SystemConfig(Section):
         return self
 
     def _sensor_rules(self) -> Iterator[RuleViolation]:
-        """What the kind of sensor asks of the other sections."""
+        """Rules between the sensor and the other sections."""
         twin = self.twin
         if not isinstance(self.sensor, PyramidSection):
-            text = f"is not read with sensor.kind = '{self.sensor.kind}'; remove it"
+            text = f"is not used with sensor.kind = '{self.sensor.kind}'; remove it"
             for key, value in twin.pyramid.model_dump(exclude_defaults=True).items():
                 yield RuleViolation(f"twin.pyramid.{key}", value, text)
             return
         modulator, radius = self.devices.modulator, self.sensor.modulation
         if radius and modulator is None:
-            text = "needs a modulator, [devices.modulator]; 0 is a pyramid without modulation"
+            text = "needs a section [devices.modulator]; 0 is a pyramid without modulation"
             yield RuleViolation("sensor.modulation", radius, text)
         beam_m = None if modulator is None else modulator.beam_m
         if modulator is not None and beam_m is not None:
             tilt = self.system.wavelength_m / (2 * beam_m)
             if abs(modulator.rad_per_lambda_d / tilt - 1) > 0.05:
-                text = f"a beam of {beam_m:g} m has {tilt:.3g} (wavelength / (2 beam_m)); leave one out"
+                text = f"beam_m = {beam_m:g} gives {tilt:.3g} (wavelength / (2 beam_m)); leave one out"
                 yield RuleViolation("devices.modulator.rad_per_lambda_d", modulator.rad_per_lambda_d, text)
         if modulator is not None and radius * modulator.rad_per_lambda_d > modulator.max_tilt_rad:
             largest = modulator.max_tilt_rad / modulator.rad_per_lambda_d
@@ -326,9 +330,10 @@ class SystemConfig(Section):
         width, height = self.devices.wfs.region[2:]
         for number in self.sensor.pupils_outside(width, height):
             centre = list(self.sensor.pupils_px[number])
-            text = f"the region of {width} x {height} pixels cuts this image of {self.sensor.n_sub} pixels"
+            n = self.sensor.n_sub
+            text = f"the region of {width} x {height} pixels cuts off part of this image of {n} pixels"
             yield RuleViolation("sensor.pupils_px", centre, text)
-        moved = "is for lenslets; pupil images are moved by twin.pyramid.centre_offsets_px"
+        moved = "applies to lenslets; use twin.pyramid.centre_offsets_px to move pupil images"
         if twin.wfs.pitch_px is not None:
             yield RuleViolation("twin.wfs.pitch_px", twin.wfs.pitch_px, moved)
         if any(twin.wfs.grid_offset_px):

@@ -1,4 +1,4 @@
-"""Documents generated from the models: JSON schema and the commented starter file."""
+"""JSON schema and commented starter file, generated from the models."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from escape_hw.config.toml_text import dump_toml, format_key, format_value
 
 
 def json_schema() -> dict[str, Any]:
-    """The schema of a system's TOML file with ranges, defaults and descriptions."""
+    """JSON schema of a system file with ranges, defaults and descriptions."""
     schema = SystemConfig.model_json_schema(by_alias=True)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -25,24 +25,24 @@ def json_schema() -> dict[str, Any]:
 
 
 def starter_text(name: str = "my-system", base: str = "razor-shwfs") -> str:
-    """A complete system as TOML with what every key means, its unit and its range.
+    """A complete system file with the meaning, unit and range of every key as comments.
 
     Parameters
     ----------
     name
         Name of the new system.
     base
-        The bundled system whose values it starts with.
+        Bundled system that provides the values.
 
     Raises
     ------
     ConfigError
-        The base does not exist, or the name is not a name for a system.
+        The base does not exist, or the name is not valid.
     """
     config = load_system(base, overrides=[f"system.name={format_value(name)}"])
     lines = [
-        f"# Starts as a copy of {base}. Keys may be left out where a default suits;",
-        "# a key behind '#' is absent and switches its rule or device off.",
+        f"# Created as a copy of {base}. Keys equal to their default may be removed;",
+        "# a key after '#' is absent, which switches its rule or device off.",
         *_section(config, ()),
     ]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""TOML text: writing, and line numbers of keys."""
+"""Writing of TOML text, and line numbers of its keys."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-#: A key's place in the document: names of tables and keys, numbers of array items.
+#: Path of a key: names of tables and keys, numbers of array items.
 KeyPath = tuple[str | int, ...]
 
 
 def key_lines(text: str) -> dict[KeyPath, int]:
-    """Line (counted from 1) where each key and each table of a valid TOML text begins.
+    """Line number, from 1, of each key and each table of a valid TOML text.
 
-    A statement ends at the first line end after which it parses by itself; that needs no scanner
-    of strings, comments and brackets, and cannot disagree with the parser.
+    A statement ends at the first line end at which it parses, so no separate scanner is needed.
     """
     lines: dict[KeyPath, int] = {}
     table: KeyPath = ()
@@ -42,7 +41,7 @@ def key_lines(text: str) -> dict[KeyPath, int]:
 
 
 def line_of(lines: dict[KeyPath, int], path: KeyPath) -> int | None:
-    """Line of a key, or else of the nearest table around it."""
+    """Line of a key, or of the innermost enclosing table."""
     for length in range(len(path), 0, -1):
         if path[:length] in lines:
             return lines[path[:length]]
@@ -81,12 +80,12 @@ _ESCAPES = {"\b": "\\b", "\t": "\\t", "\n": "\\n", "\f": "\\f", "\r": "\\r", '"'
 
 
 def dump_toml(table: Mapping[str, Any]) -> str:
-    """Write nested tables of plain values as ASCII TOML text that parses to an equal table.
+    """Nested tables of plain values as ASCII TOML text that parses to an equal table.
 
     Raises
     ------
     TypeError
-        A value is neither a table, an array, text, a number nor a truth value.
+        A value has no TOML form.
     """
     return "\n".join(_lines(table, ())).lstrip("\n") + "\n"
 
@@ -104,18 +103,12 @@ def _lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
 
 
 def format_key(key: str) -> str:
-    """A key, quoted when it must be."""
+    """A key, quoted if necessary."""
     return key if _BARE_KEY.fullmatch(key) else _quote(key)
 
 
 def format_value(value: Any) -> str:
-    """A plain value as TOML.
-
-    Raises
-    ------
-    TypeError
-        The value has no TOML form.
-    """
+    """A plain value as TOML; raises :class:`TypeError` if it has no TOML form."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):

@@ -21,6 +21,7 @@ from escape_hw.io.storage import check_writable, make_folder, storage_error, wri
 #: Free space required before a run, in bytes; a run's products are a few megabytes.
 MIN_FREE_BYTES = 50_000_000
 LOG_FILE = "run.log"
+RESULT_FILE = "result.json"
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +29,12 @@ log = logging.getLogger(__name__)
 def default_runs_folder() -> Path:
     """Default folder of runs: ``runs`` in the user's data directory."""
     return Path(platformdirs.user_data_dir("escape", appauthor=False)) / "runs"
+
+
+def dated_folder(runs: Path, *names: str) -> Path:
+    """Path of a new folder ``RUNS/DATE/TIME_NAME...`` in local time, since these names are for people."""
+    now = datetime.now().astimezone()
+    return runs / f"{now:%Y-%m-%d}" / "_".join((f"{now:%H%M%S}", *map(_sanitise_name, names)))
 
 
 class RunFolder:
@@ -57,10 +64,7 @@ class RunFolder:
     def __init__(self, system: str, kind: str, out: Path | str | None = None) -> None:
         self.system, self.kind = system, kind
         if out is None:
-            # Local time: these names are for people. Headers and result.json carry UTC.
-            now = datetime.now().astimezone()
-            name = f"{now:%H%M%S}_{_sanitise_name(system)}_{_sanitise_name(kind)}"
-            requested = default_runs_folder() / f"{now:%Y-%m-%d}" / name
+            requested = dated_folder(default_runs_folder(), system, kind)
         else:
             requested = Path(out).expanduser().absolute()
         self.path = _create_unique_folder(requested)
@@ -138,7 +142,7 @@ class RunFolder:
     def write_result(self, document: Mapping[str, Any]) -> Path:
         """Write ``result.json`` with the products' paths relative to the folder, so that it can be moved."""
         products = {name: str(path.relative_to(self.path)) for name, path in self.products.items()}
-        return self.write_text("result.json", dumps({**document, "products": products}) + "\n")
+        return self.write_text(RESULT_FILE, dumps({**document, "products": products}) + "\n")
 
 
 def read_result(folder: Path | str) -> dict[str, Any]:
@@ -149,7 +153,7 @@ def read_result(folder: Path | str) -> dict[str, Any]:
     ProductError
         No run folder, or its ``result.json`` is damaged.
     """
-    path = Path(folder) / "result.json"
+    path = Path(folder) / RESULT_FILE
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

@@ -1,1 +1,4 @@
-"""Pure functions from camera frame to mirror command, and Strehl ratios of science frames. Procedures that move hardware are in escape_hw.calibration."""
+"""Pure functions from camera frame to mirror command, and Strehl ratios of science frames.
+
+Procedures that move hardware are in escape_hw.calibration.
+"""

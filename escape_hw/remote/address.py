@@ -1,4 +1,4 @@
-"""Where servers listen: one file for each in a folder of the user's own, and what addresses look like."""
+"""Addresses of servers, and the user's list of running servers (one file each)."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ import platformdirs
 
 from escape_hw.errors import ConfigError, ServerGone, StorageError
 from escape_hw.io.storage import storage_error, write_atomic
-from escape_hw.streams.segments import process_start
+from escape_hw.supervision import is_alive
 
-#: Longest path of a local socket, the system's own limit (with room for its end).
+#: Longest path of a local socket, with a margin to the system's limit of 107 bytes.
 _LONGEST_SOCKET = 100
 _TCP = re.compile(r"tcp://(?P<host>[^/:]+|\[[0-9a-fA-F:]+\]):(?P<port>\d{1,5})")
-#: Addresses that stay on this machine.
+#: Addresses of this computer.
 _LOOPBACK = re.compile(r"127\.\d+\.\d+\.\d+|localhost|\[::1\]")
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where a server takes requests and tells events, as ZeroMQ writes addresses."""
+    """ZeroMQ addresses of a server's requests and events."""
 
     requests: str
     events: str
@@ -34,18 +34,18 @@ class Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class ServerListing:
-    """A server on this machine.
+    """A server on this computer.
 
     Parameters
     ----------
     system
-        The system that it serves.
+        Name of the system.
     pid, started
-        Its process, and when that began in clock ticks after boot.
+        Process of the server, and its start time in clock ticks after boot.
     requests, events
-        Its local sockets.
+        Local sockets.
     tcp
-        Address for other users and machines, ``tcp://host:port``; empty: none.
+        Address for other users and computers, ``tcp://host:port``; empty without one.
     """
 
     system: str
@@ -57,17 +57,17 @@ class ServerListing:
 
     @property
     def alive(self) -> bool:
-        """Whether that very process lives."""
-        return process_start(self.pid) == self.started
+        """Whether the process is alive."""
+        return is_alive(self.pid, self.started)
 
 
 def runtime_folder() -> Path:
-    """The user's own folder for sockets and listings, made when it is not there.
+    """The user's folder for sockets and listings; created when missing.
 
     Raises
     ------
     StorageError
-        It cannot be made, or others could write into it.
+        It cannot be created, or other users can write to it.
     """
     folder = Path(platformdirs.user_runtime_dir("escape", appauthor=False))
     try:
@@ -76,12 +76,12 @@ def runtime_folder() -> Path:
     except OSError as error:
         raise storage_error(folder, error) from error
     if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o022:
-        raise StorageError(f"{folder}: others may write there; remove it, or set XDG_RUNTIME_DIR")
+        raise StorageError(f"{folder}: other users can write there; remove it, or set XDG_RUNTIME_DIR")
     return folder
 
 
 def local_endpoint(system: str, pid: int) -> Endpoint:
-    """Local sockets for a server, which only this user can reach."""
+    """Local sockets of a server, which only this user can reach."""
     folder = runtime_folder()
     if len(str(folder)) + len(system) + 20 > _LONGEST_SOCKET:
         folder = Path(tempfile.mkdtemp(prefix="escape-"))
@@ -90,7 +90,7 @@ def local_endpoint(system: str, pid: int) -> Endpoint:
 
 
 def register_server(listing: ServerListing) -> Path:
-    """Write down that a server listens; readable for this user only.
+    """Write the listing of a server, readable for this user only.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def register_server(listing: ServerListing) -> Path:
 
 
 def unregister_server(listing: ServerListing) -> None:
-    """Take a server's listing and sockets away, if they are still its own."""
+    """Remove the listing, if it is still this server's, and the sockets."""
     if find_server(listing.system) == listing:
         (runtime_folder() / f"{listing.system}.json").unlink(missing_ok=True)
     for address in (listing.requests, listing.events):
@@ -116,7 +116,7 @@ def unregister_server(listing: ServerListing) -> None:
 
 
 def find_server(system: str) -> ServerListing | None:
-    """What is written down of a system's server, be it alive or dead."""
+    """Listing of a system's server, alive or not; ``None`` without one."""
     try:
         return ServerListing(**json.loads((runtime_folder() / f"{system}.json").read_bytes()))
     except (OSError, ValueError, TypeError):
@@ -124,33 +124,33 @@ def find_server(system: str) -> ServerListing | None:
 
 
 def running_servers() -> tuple[ServerListing, ...]:
-    """The servers of this user that live on this machine."""
+    """Running servers of this user on this computer."""
     found = (find_server(path.stem) for path in sorted(runtime_folder().glob("*.json")))
     return tuple(one for one in found if one is not None and one.alive)
 
 
 def tcp_endpoint(host: str, port: int) -> Endpoint:
-    """Addresses of a server on a network: events come from the port after that of the requests."""
+    """TCP addresses of a server; events use the port after that of the requests."""
     return Endpoint(f"tcp://{host}:{port}", f"tcp://{host}:{port + 1}")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address stays on this machine."""
+    """Whether an address belongs to the loopback interface."""
     return _LOOPBACK.fullmatch(host) is not None
 
 
 def resolve(name: str) -> Endpoint:
-    """Where to reach a server.
+    """Find the addresses of a server.
 
     Parameters
     ----------
     name
-        ``tcp://host:port``, or the name of a system that is served on this machine.
+        ``tcp://host:port``, or the name of a system that is served on this computer.
 
     Raises
     ------
     ConfigError
-        It means nothing.
+        The address is malformed.
     ServerGone
         No server of that system runs here.
     """

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import uuid
+import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -46,7 +47,7 @@ from escape_hw.runtime.procedures.python_method import procedure_method
 from escape_hw.runtime.procedures.registry import PROCEDURES
 from escape_hw.streams.ring import ReaderCache
 
-#: A server that was not heard of for so long does not come back with a result.
+#: Silence of a server after which waiting for a run ends.
 _SERVER_TIMEOUT_S = 15.0
 
 
@@ -56,14 +57,14 @@ class RemoteRun:
     Parameters
     ----------
     connection
-        To the server.
+        Connection to the server.
     id
-        Its number there.
+        Number of the run.
     name
-        The procedure.
+        Name of the procedure.
     """
 
-    def __init__(self, connection: ReadOnlyConnection, id: int, name: str) -> None:
+    def __init__(self, connection: Connection, id: int, name: str) -> None:
         self._connection, self.id, self.name = connection, id, name
 
     def __repr__(self) -> str:
@@ -72,13 +73,13 @@ class RemoteRun:
 
     @property
     def ended(self) -> FinishedRun | None:
-        """How it ended; ``None`` while it runs."""
+        """The finished run; ``None`` while it runs."""
         return self._connection.wait_for(self.id, 0.0)
 
     @property
     def running(self) -> ActiveRun | None:
-        """How far it is; ``None`` when it has ended."""
-        running = self._connection.state.procedure
+        """Progress; ``None`` when it has ended."""
+        running = self._connection.state.active_run
         return running if running is not None and running.id == self.id else None
 
     def wait(self, timeout_s: float | None = None, progress: bool = False) -> Any:
@@ -87,26 +88,25 @@ class RemoteRun:
         Parameters
         ----------
         timeout_s
-            Longest wait; for ever by default.
+            Longest wait; unlimited by default.
         progress
             Show a bar with the time left, in a terminal or a notebook.
 
         Returns
         -------
         CalibrationResult, LoopResult, GainsResult or dict
-            What the procedure returns on the command line's side; the run's document where it has no
-            product that this machine can read.
+            The procedure's result, or the run's document when it has no product that this computer can read.
 
         Raises
         ------
         Aborted
-            It was aborted; ``partial`` holds what was measured, if anything.
+            The run was aborted; ``partial`` holds the data measured so far, if any.
         CalibrationError
-            It failed; the message says why.
+            The run failed.
         TimeoutError
-            It goes on.
+            The run continues.
         ServerGone
-            Its server was not heard of any more.
+            The server has been silent for too long.
         """
         from rich.console import Console
 
@@ -120,19 +120,21 @@ class RemoteRun:
                 last_message_s = now if self._connection.connected else last_message_s
                 if now - last_message_s > _SERVER_TIMEOUT_S:
                     raise ServerGone(
-                        f"run {self.id}: its server has not been heard of for {now - last_message_s:.0f} s"
+                        f"run {self.id}: its server has been silent for {now - last_message_s:.0f} s"
                     )
                 if deadline is not None and now > deadline:
-                    raise TimeoutError(f"run {self.id} ({self.name}) goes on")
+                    raise TimeoutError(
+                        f"run {self.id} ({self.name}) has not ended within {timeout_s:g} s; it continues"
+                    )
                 self._require_engine()
                 if view is not None and (running := self.running) is not None:
                     view(_progress(running))
         return self._result(ended)
 
     def _require_engine(self) -> None:
-        """A run ends with its engine, without another word."""
+        """Raise when the engine has died, which ends its run without a further message."""
         state = self._connection.state
-        if state.procedure is not None or state.fault is None or state.engine_pid:
+        if state.active_run is not None or state.fault is None or state.engine_pid:
             return
         if self._connection.wait_for(self.id, 0.0) is None:
             raise CalibrationError(f"run {self.id} ({self.name}) ended with its engine: {state.fault.reason}")
@@ -147,7 +149,7 @@ class RemoteRun:
 
 
 def load_result(ended: FinishedRun) -> Any:
-    """The result of a run from its product, or its document where there is none that can be read here."""
+    """Load the result of a run from its product, or its document when no product can be read here."""
     from escape_hw.io.fits.gains import load_gains
     from escape_hw.io.fits.loop import load_loop
     from escape_hw.io.fits.matrix import load_matrix
@@ -162,42 +164,50 @@ def load_result(ended: FinishedRun) -> Any:
 
 def _progress(running: ActiveRun) -> Progress:
     return Progress(
-        running.stage, running.done, running.total, running.unit, running.elapsed_s, running.metrics
+        running.stage, running.completed, running.total, running.unit, running.elapsed_s, running.metrics
     )
 
 
-#: Longest wait for an ordinary answer, and for one that comes when a mirror is flat, seconds.
+def _program() -> str:
+    """Default name of this client: the name of its script, or ``notebook``."""
+    name = os.path.basename(sys.argv[0])
+    return "notebook" if name.startswith("ipykernel") else name or "python"
+
+
+#: Longest wait for an ordinary reply, and for one that is sent when the mirror is flat, seconds.
 TIMEOUT_S, SLOW_TIMEOUT_S = 3.0, 30.0
-#: A server that tells its state five times a second and was not heard of for so long is gone.
+#: Silence after which a server counts as disconnected; it publishes its state five times a second.
 _STALE_S = 2.0
 _LINES = 5000
-#: Longest wait for the event that belongs to an answer, seconds.
+#: Longest wait for the state that belongs to a reply, seconds.
 _EVENT_S = 10.0
 
 
-class ReadOnlyConnection:
-    """Looks at a server; satisfies :class:`~escape_hw.remote.source.Source`.
+class Connection:
+    """A connection to a server, see :func:`connect`; implements :class:`~escape_hw.remote.source.DataSource`.
+
+    It controls the server while it holds the lease.
 
     Parameters
     ----------
     endpoint
-        Where the server listens.
+        Addresses of the server.
     name
-        Who this is, for the other clients.
+        Name of this client, for the other clients.
     keys
-        Keys for a server on another machine.
+        Keys for a server on another computer.
 
     Attributes
     ----------
     client
-        This client's number, as in ``state.lease.client``.
+        Number of this client, as in ``state.lease.client``.
 
     Raises
     ------
     ServerGone
-        Nobody answers.
+        No reply.
     RequestRefused
-        The server is of another version.
+        The server has another version.
     """
 
     def __init__(
@@ -222,11 +232,11 @@ class ReadOnlyConnection:
             raise
 
     def _register(self) -> None:
-        answer, _, _ = self._link.ask(self._registration(), TIMEOUT_S)
+        answer, _, _ = self._link.send_request(self._registration(), TIMEOUT_S)
         self._registered = True
         with self._changed:
             self._state = State.model_validate(answer)
-        lines, _ = self._ask(ask.GetLog(client=self.client, count=1000))
+        lines, _ = self._request(ask.GetLog, count=1000)
         with self._changed:
             known = {line.number for line in self._log}
             old = [LogLine.model_validate(line) for line in lines if line["number"] not in known]
@@ -241,9 +251,14 @@ class ReadOnlyConnection:
 
     # ------------------------------------------------------------ life
     def close(self) -> None:
-        """Hang up; the server goes on."""
+        """Release the lease and close the connection; the server continues.
+
+        A running procedure needs another client in control.
+        """
         if self._closed:
             return
+        if self.holds_lease and self.connected:
+            self.release()
         self._closed = True
         self._link.close()
         self._readers.close()
@@ -258,31 +273,35 @@ class ReadOnlyConnection:
 
     def __repr__(self) -> str:
         state = self.state
-        return f"<Connection to {state.system}, {state.phase.value}, {'alive' if self.connected else 'gone'}>"
+        connected = "connected" if self.connected else "disconnected"
+        return f"<Connection to {state.system}, {state.phase.value}, {connected}>"
 
     def _repr_html_(self) -> str:
-        from escape_hw.remote.html import state_html
-
-        return state_html(self.state)
+        return self.state._repr_html_()
 
     def _heartbeat(self, refused: bool) -> Mapping[str, Any] | None:
         if not self._registered:
             return None
-        # Who was halted for long has been forgotten.
+        # A client that was suspended for long is no longer registered.
         return self._registration() if refused else {"verb": "heartbeat", "client": self.client}
 
     def _ask(self, request: ask.Request, timeout_s: float = TIMEOUT_S) -> tuple[Any, bytes]:
         document = request.model_dump(mode="json")
         try:
-            answer, data, serial = self._link.ask(document, timeout_s)
+            answer, data, serial = self._link.send_request(document, timeout_s)
         except ClientUnknown:
             self._register()
-            answer, data, serial = self._link.ask(document, timeout_s)
+            answer, data, serial = self._link.send_request(document, timeout_s)
         if isinstance(request, ask.STATE_CHANGING_REQUESTS):
-            # Events come another way than answers: who looks at the state next finds what was done.
+            # Events and replies use different sockets: wait for the state that shows the effect.
             with self._changed:
                 self._changed.wait_for(lambda: self._state.serial >= serial, _EVENT_S)
         return answer, data
+
+    def _request(
+        self, kind: type[ask.Request], timeout_s: float = TIMEOUT_S, **fields: Any
+    ) -> tuple[Any, bytes]:
+        return self._ask(ask.build_request(kind, client=self.client, **fields), timeout_s)
 
     def _event(self, topic: str, document: dict[str, Any]) -> None:
         with self._changed:
@@ -294,16 +313,16 @@ class ReadOnlyConnection:
                     self._log.append(line)
             elif topic == "progress":
                 running = ActiveRun.model_validate(document)
-                self._state = self._state.model_copy(update={"procedure": running})
+                self._state = self._state.model_copy(update={"active_run": running})
             elif topic == "ended":
                 ended = FinishedRun.model_validate(document)
                 self._ended[ended.id] = ended
             self._changed.notify_all()
 
-    # ------------------------------------------------------------ to look
+    # ------------------------------------------------------------ read only
     @property
     def connected(self) -> bool:
-        """Whether the server was heard of lately."""
+        """Whether the server has sent a message within the last seconds."""
         return not self._closed and time.monotonic() - self._link.last_message_s < _STALE_S
 
     @property
@@ -313,12 +332,12 @@ class ReadOnlyConnection:
 
     @property
     def holds_lease(self) -> bool:
-        """Whether this client may write, as far as it knows."""
+        """Whether this client has control, by the newest state."""
         lease = self._state.lease
         return lease is not None and lease.client == self.client
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
-        """The newest entry of a stream, or ``None`` when there is none newer than ``after``."""
+        """The newest entry of a stream; ``None`` when there is none newer than ``after``."""
         if not self._is_local:
             return self._latest_over_network(stream, after)
         segment = next((one.segment for one in self._state.streams if one.name == stream), None)
@@ -327,9 +346,7 @@ class ReadOnlyConnection:
 
     def _latest_over_network(self, stream: str, after: int) -> Sample | None:
         try:
-            head, data = self._ask(
-                ask.build_request(ask.GetLatestSample, client=self.client, stream=stream, after=after)
-            )
+            head, data = self._request(ask.GetLatestSample, stream=stream, after=after)
         except ServerGone:
             return None
         if head is None:
@@ -338,46 +355,50 @@ class ReadOnlyConnection:
         return Sample(head["index"], head["exposed_ns"], head["arrived_ns"], array, head["meta"])
 
     def geometry(self) -> Geometry:
-        """Where slopes and actuators stand; asked for again when the state says that it changed."""
+        """Positions of the sub-apertures and actuators; requested again when they change."""
         state = self._state
-        key = (state.engine_pid, state.phase is Phase.STARTING, state.geometries)
+        key = (state.engine_pid, state.phase is Phase.STARTING, state.geometry_version)
         known = self._geometry
         if known is None or known[0] != key:
             try:
-                answer, _ = self._ask(ask.GetGeometry(client=self.client))
+                answer, _ = self._request(ask.GetGeometry)
             except EscapeError:
                 return Geometry() if known is None else known[1]
             known = self._geometry = (key, Geometry.model_validate(answer))
         return known[1]
 
     def log_after(self, number: int) -> Sequence[LogLine]:
-        """Log lines after a number."""
+        """Log lines with a larger number."""
         with self._changed:
             return [line for line in self._log if line.number > number]
 
     def procedures(self) -> Sequence[ProcedureEntry]:
-        """What can be started."""
+        """The procedures with their parameters."""
         if self._procedures is None:
-            answer, _ = self._ask(ask.GetProcedures(client=self.client), SLOW_TIMEOUT_S)
+            answer, _ = self._request(ask.GetProcedures, SLOW_TIMEOUT_S)
             self._procedures = tuple(ProcedureEntry.model_validate(entry) for entry in answer)
         return self._procedures
 
-    def check(self, procedure: str, arguments: Arguments | None = None) -> ProcedurePlan:
-        """What a procedure would do; nothing moves.
+    def plan(self, procedure: str, arguments: Arguments | None = None) -> ProcedurePlan:
+        """Plan a procedure: frames, seconds, largest poke, warnings. Nothing moves.
 
         Raises
         ------
         ConfigError
-            An argument is wrong; says which and the way out.
+            An argument is unknown or out of range.
         """
-        request = ask.build_request(
-            ask.PlanProcedure, client=self.client, procedure=procedure, arguments=arguments or {}
+        answer, _ = self._request(
+            ask.PlanProcedure, SLOW_TIMEOUT_S, procedure=procedure, arguments=arguments or {}
         )
-        answer, _ = self._ask(request, SLOW_TIMEOUT_S)
         return ProcedurePlan.model_validate(answer)
 
+    def check(self, procedure: str, arguments: Arguments | None = None) -> ProcedurePlan:
+        """Plan a procedure; deprecated name of :meth:`plan`."""
+        warnings.warn("check() is now called plan()", DeprecationWarning, stacklevel=2)
+        return self.plan(procedure, arguments)
+
     def wait_for(self, run: int, timeout_s: float) -> FinishedRun | None:
-        """How a run ended, or ``None`` when it goes on; waits for news at most so long."""
+        """The end of a run; ``None`` when it has not ended within the time-out."""
         with self._changed:
             found = self._finished_run(run)
             if found is None:
@@ -386,66 +407,50 @@ class ReadOnlyConnection:
             return found
 
     def _finished_run(self, run: int) -> FinishedRun | None:
-        last = self._state.last
+        last = self._state.last_run
         return last if last is not None and last.id == run else self._ended.get(run)
-
-
-def _program() -> str:
-    """What other clients call this one: its script, or that it is a notebook."""
-    name = os.path.basename(sys.argv[0])
-    return "notebook" if name.startswith("ipykernel") else name or "python"
-
-
-class Connection(ReadOnlyConnection):
-    """A connection to a server, see :func:`connect`: looks and, with the right to write, acts."""
-
-    def close(self) -> None:
-        """Give the lease back and hang up; what runs goes on as long as somebody else takes it up."""
-        if self.holds_lease and self.connected:
-            self.release()
-        super().close()
 
     # ------------------------------------------------------------ the lease
     def acquire(self, take_over: bool = False) -> Lease:
-        """Ask for the right to write; it is held until :meth:`release` or :meth:`close`.
+        """Acquire control until :meth:`release` or :meth:`close`.
 
         Raises
         ------
         LeaseHeld
-            Somebody else has it; says who.
+            Another client has control.
         """
-        answer, _ = self._ask(ask.build_request(ask.AcquireLease, client=self.client, take_over=take_over))
+        answer, _ = self._request(ask.AcquireLease, take_over=take_over)
         lease = Lease.model_validate(answer)
         self._set_lease(lease)
         return lease
 
     def release(self) -> None:
-        """Give the right to write back; does nothing when the server has gone."""
+        """Release control; does nothing when the server is gone."""
         try:
-            self._ask(ask.ReleaseLease(client=self.client), 1.0)
+            self._request(ask.ReleaseLease, 1.0)
         except ServerGone:
             return
         self._set_lease(None)
 
     def _set_lease(self, lease: Lease | None) -> None:
-        """Know it at once, not with the next state."""
+        """Enter the lease into the present state, before the server publishes the next one."""
         with self._changed:
             self._state = self._state.model_copy(update={"lease": lease})
 
     # ------------------------------------------------------------ safety
     def open_loop(self) -> None:
-        """Open the loop; returns when the mirror is flat. Anybody may."""
-        self._ask(ask.OpenLoop(client=self.client), SLOW_TIMEOUT_S)
+        """Open the loop; returns when the mirror is flat. Needs no control."""
+        self._request(ask.OpenLoop, SLOW_TIMEOUT_S)
 
     def flatten(self) -> None:
-        """Abort what runs, open the loop; returns when the mirror is flat. Anybody may."""
-        self._ask(ask.Flatten(client=self.client), SLOW_TIMEOUT_S)
+        """Abort all activity; returns when the mirror is flat. Needs no control."""
+        self._request(ask.Flatten, SLOW_TIMEOUT_S)
 
     def abort(self) -> None:
-        """Stop the procedure, keeping what it measured; returns when the mirror is flat. Anybody may."""
-        self._ask(ask.AbortProcedure(client=self.client), SLOW_TIMEOUT_S)
+        """Abort the procedure and save its data; returns when the mirror is flat. Needs no control."""
+        self._request(ask.AbortProcedure, SLOW_TIMEOUT_S)
 
-    # ------------------------------------------------------------ to write
+    # ------------------------------------------------------------ control
     def start(self, procedure: str, **arguments: float | int | bool | str | None) -> RemoteRun:
         """Start a procedure.
 
@@ -526,12 +531,12 @@ class Connection(ReadOnlyConnection):
         return self.start(method, **given, **arguments).wait(progress=progress)
 
     def pause(self) -> None:
-        """Halt the running procedure between two steps, mirror flat."""
-        self._ask(ask.PauseProcedure(client=self.client))
+        """Pause the running procedure between two steps, mirror flat."""
+        self._request(ask.PauseProcedure)
 
     def resume(self) -> None:
-        """Go on with a halted procedure."""
-        self._ask(ask.ResumeProcedure(client=self.client))
+        """Resume a paused procedure."""
+        self._request(ask.ResumeProcedure)
 
     def close_loop(
         self,
@@ -540,16 +545,9 @@ class Connection(ReadOnlyConnection):
         leak: float | None = None,
         dropped_modes: int | None = None,
     ) -> None:
-        """Close the loop on a matrix that the server holds, until it is opened."""
-        request = ask.build_request(
-            ask.CloseLoop,
-            client=self.client,
-            matrix=matrix,
-            gain=gain,
-            leak=leak,
-            dropped_modes=dropped_modes,
-        )  # fmt: skip
-        self._ask(request, SLOW_TIMEOUT_S)
+        """Close the loop with a matrix of ``state.products`` until it is opened."""
+        settings = {"matrix": matrix, "gain": gain, "leak": leak, "dropped_modes": dropped_modes}
+        self._request(ask.CloseLoop, SLOW_TIMEOUT_S, **settings)
 
     def set_loop(
         self,
@@ -558,30 +556,26 @@ class Connection(ReadOnlyConnection):
         leak: float | None = None,
         dropped_modes: int | None = None,
     ) -> None:
-        """Other parameters for the loop, closed or not; what is absent stays."""
-        request = ask.build_request(
-            ask.SetLoop, client=self.client, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
-        )
-        self._ask(request, SLOW_TIMEOUT_S)
+        """Change parameters of the loop, closed or not; absent ones stay."""
+        settings = {"matrix": matrix, "gain": gain, "leak": leak, "dropped_modes": dropped_modes}
+        self._request(ask.SetLoop, SLOW_TIMEOUT_S, **settings)
 
     def load_product(self, path: str | Path, name: str | None = None) -> ProductEntry:
-        """Load a FITS product into the engine, under its file's name by default."""
-        answer, _ = self._ask(
-            ask.build_request(ask.LoadProduct, client=self.client, path=str(path), name=name), SLOW_TIMEOUT_S
-        )
+        """Load a FITS product into the server, by default under its file's name."""
+        answer, _ = self._request(ask.LoadProduct, SLOW_TIMEOUT_S, path=str(path), name=name)
         return ProductEntry.model_validate(answer)
 
     def record(self, on: bool) -> None:
-        """Begin or end recording telemetry at full rate."""
-        self._ask(ask.build_request(ask.SetRecording, client=self.client, on=on), SLOW_TIMEOUT_S)
+        """Start or stop recording telemetry at full rate."""
+        self._request(ask.SetRecording, SLOW_TIMEOUT_S, on=on)
 
     def clear_fault(self) -> None:
-        """End a fault's latch; closed devices are opened again."""
-        self._ask(ask.ClearFault(client=self.client), SLOW_TIMEOUT_S)
+        """Release the latched fault; closed devices are opened again."""
+        self._request(ask.ClearFault, SLOW_TIMEOUT_S)
 
     def shutdown(self) -> None:
         """Make the mirror safe and end the server."""
-        self._ask(ask.Shutdown(client=self.client))
+        self._request(ask.Shutdown)
 
 
 def connect(address: str, *, control: bool = False, take_over: bool = False, name: str = "") -> Connection:
@@ -592,20 +586,20 @@ def connect(address: str, *, control: bool = False, take_over: bool = False, nam
     address
         Name of a system that is served on this machine (``escape serve``), or ``tcp://host:port``.
     control
-        Ask for the right to write at once.
+        Acquire control at once.
     take_over
-        Take it from whoever has it; logged.
+        Take control from the client that has it; logged.
     name
-        Who this is, for the other clients; the program's name by default.
+        Name of this client, for the other clients; by default the program's name.
 
     Raises
     ------
     ServerGone
-        No server answers there.
+        No server answers at this address.
     LeaseHeld
-        Somebody else has the right to write.
+        Another client has control.
     ConfigError
-        The address means nothing, or there are no keys for it.
+        The address is invalid, or a key for it is missing.
     """
     endpoint = resolve(address)
     keys = client_keys(endpoint.requests)

@@ -1,8 +1,7 @@
-"""CURVE keys: who may reach a server from another machine, and which server is the right one.
+"""CURVE keys that authenticate servers and clients on different computers.
 
-Every user has one pair of keys, for serving and for connecting alike. Public keys are 40 characters of
-Z85 text (ZeroMQ RFC 32), made to be read over the telephone or sent by mail; the secret one never leaves
-its file.
+Every user has one key pair, for serving and for connecting. Public keys are 40 characters of Z85 text
+(ZeroMQ RFC 32); the secret key stays in its file.
 """
 
 from __future__ import annotations
@@ -26,24 +25,24 @@ _ALLOWED, _TRUSTED = "allowed", "servers"
 
 @dataclass(frozen=True, slots=True)
 class KeyPair:
-    """A user's keys, Z85 text."""
+    """A user's key pair, Z85 text."""
 
     public: bytes
     secret: bytes
 
 
 def keys_folder() -> Path:
-    """Where this user's keys are."""
+    """Folder of this user's keys."""
     return Path(platformdirs.user_config_dir("escape", appauthor=False)) / "keys"
 
 
 def make_keys(replace: bool = False) -> KeyPair:
-    """Make this user's keys; those that are there stay unless they are to be replaced.
+    """Create this user's key pair; an existing one is kept unless ``replace``.
 
     Raises
     ------
     StorageError
-        They cannot be written.
+        The files cannot be written.
     """
     known = None if replace else own_keys()
     if known is not None:
@@ -55,48 +54,50 @@ def make_keys(replace: bool = False) -> KeyPair:
 
 
 def own_keys() -> KeyPair | None:
-    """The user's keys, or ``None``: there are none.
+    """The user's key pair; ``None`` when there is none.
 
     Raises
     ------
     StorageError
-        Others may read the secret one.
+        Other users can read the secret key.
     ConfigError
-        They are damaged.
+        A file is damaged.
     """
     path = keys_folder() / "own.secret"
     try:
         if path.stat().st_mode & 0o077:
-            raise StorageError(f"{path}: others may read it; make new keys with 'escape keys make --replace'")
+            raise StorageError(
+                f"{path}: other users can read it; make new keys with 'escape keys make --replace'"
+            )
         return KeyPair(_check_key(_read(keys_folder() / "own.public")), _check_key(_read(path)))
     except FileNotFoundError:
         return None
 
 
 def allow(name: str, key: str) -> None:
-    """Let the client with this public key in to servers of this user.
+    """Allow the client with this public key to connect to servers of this user.
 
     Raises
     ------
     ConfigError
-        The name or the key means nothing.
+        The name or the key is malformed.
     """
     _write(_file(_ALLOWED, name), _check_key(key.strip().encode()))
 
 
 def trust(host: str, key: str) -> None:
-    """Take the server on a host for the right one when it has this public key.
+    """Trust the server on a host if it has this public key.
 
     Raises
     ------
     ConfigError
-        The name or the key means nothing.
+        The name or the key is malformed.
     """
     _write(_file(_TRUSTED, host), _check_key(key.strip().encode()))
 
 
-def forget(name: str) -> bool:
-    """Let a client in no longer, and trust no server of that name; false when there was neither."""
+def remove(name: str) -> bool:
+    """Remove an allowed client or a trusted server; false when there is none of that name."""
     paths = [_file(_ALLOWED, name), _file(_TRUSTED, name)]
     found = [path for path in paths if path.is_file()]
     for path in found:
@@ -105,38 +106,38 @@ def forget(name: str) -> bool:
 
 
 def allowed_keys() -> dict[str, bytes]:
-    """Public keys of the clients that are let in, by name; read again at every connection."""
+    """Public keys of the allowed clients by name, read from the files."""
     return _read_all(_ALLOWED)
 
 
 def trusted_keys() -> dict[str, bytes]:
-    """Public keys of servers, by host."""
+    """Public keys of the trusted servers by host."""
     return _read_all(_TRUSTED)
 
 
 def server_keys() -> KeyPair:
-    """The keys that a server needs for clients on other machines.
+    """Key pair of a server for clients on other computers.
 
     Raises
     ------
     ConfigError
-        There are none, or nobody is let in; says what to do.
+        There is no key pair, or no client is allowed.
     """
     own = own_keys()
     if own is None:
-        raise ConfigError("clients on other machines need keys; make them with 'escape keys make'")
+        raise ConfigError("clients on other computers need keys; make them with 'escape keys make'")
     if not allowed_keys():
-        raise ConfigError("no client is let in; add one with 'escape keys allow NAME KEY'")
+        raise ConfigError("no client is allowed; add one with 'escape keys allow NAME KEY'")
     return own
 
 
 def client_keys(address: str) -> tuple[bytes, bytes, bytes] | None:
-    """Server's public, own public and own secret key for an address; ``None`` on the same machine.
+    """Server's public, own public and own secret key for an address; ``None`` on the same computer.
 
     Raises
     ------
     ConfigError
-        A key is missing; says which and what to do.
+        A key is missing.
     """
     host = address.removeprefix("tcp://").rpartition(":")[0]
     trusted = trusted_keys().get(host)
@@ -145,29 +146,29 @@ def client_keys(address: str) -> tuple[bytes, bytes, bytes] | None:
     own = own_keys()
     if own is None:
         raise ConfigError(
-            f"{host} asks for a key; make one with 'escape keys make', and have it allowed there"
+            f"{host} requires a key; make one with 'escape keys make', and have it allowed there"
         )
     if trusted is None:
-        raise ConfigError(f"the key of {host} is not known; add it with 'escape keys trust {host} KEY'")
+        raise ConfigError(f"the key of {host} is unknown; add it with 'escape keys trust {host} KEY'")
     return trusted, own.public, own.secret
 
 
 def keys_hint(address: str, keys: tuple[bytes, bytes, bytes] | None) -> str:
-    """What keys may have to do with a server that does not answer: it tells strangers nothing."""
+    """Hint for an error message: a server does not reply to clients without an allowed key."""
     if address.startswith("ipc://"):
         return ""
     host = address.removeprefix("tcp://").rpartition(":")[0]
     if keys is None:
-        return f" If it asks for keys: escape keys trust {host} KEY"
+        return f" If it requires keys: escape keys trust {host} KEY"
     return (
-        f" Does it let this key in (there: escape keys allow NAME '{keys[1].decode()}'), and is its own "
-        "still the one that is trusted here (escape keys list)?"
+        f" Check that it allows this key (there: escape keys allow NAME '{keys[1].decode()}'), and that its "
+        "own key is the one that is trusted here (escape keys list)."
     )
 
 
 def _file(kind: str, name: str) -> Path:
     if not _NAME.fullmatch(name):
-        raise ConfigError(f"{name!r}: a name has letters, digits, '.', '_' and '-', at most 64")
+        raise ConfigError(f"{name!r} is not a valid name; use at most 64 letters, digits, '.', '_' and '-'")
     return keys_folder() / kind / f"{name}.key"
 
 
@@ -180,8 +181,8 @@ def _check_key(key: bytes) -> bytes:
         if len(key) == 40 and len(z85.decode(key)) == 32:
             return key
     except (KeyError, ValueError):
-        pass  # told below, as every other key that is none
-    raise ConfigError(f"{key[:50].decode(errors='replace')!r} is no key; a key has 40 characters")
+        pass  # reported below
+    raise ConfigError(f"{key[:50].decode(errors='replace')!r} is not a key; a key has 40 characters")
 
 
 def _read(path: Path) -> bytes:

@@ -1,4 +1,4 @@
-"""Requests that a client may send, validated before they are acted on, and the transfer of errors."""
+"""Requests of clients, with validation, and the transfer of errors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from escape_hw.config.system import MAX_GAIN
 from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Arguments
 
-#: Names that come from a client: products, procedures, people.
+#: Names of products, procedures and clients.
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w .+@:-]+$")]
 ClientId = Annotated[str, Field(min_length=8, max_length=64, pattern=r"^[0-9a-f-]+$")]
 #: A loop's gain, in the range of the configuration.
@@ -20,7 +20,7 @@ Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class Request(BaseModel):
-    """A request; ``client`` says whose."""
+    """A request; ``client`` is the number of the sender."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -31,13 +31,13 @@ R = TypeVar("R", bound=Request)
 
 
 def first_error(error: ValidationError) -> str:
-    """The first thing that is wrong with a request: where, and what."""
+    """Location and message of the first validation error."""
     first = error.errors(include_url=False, include_input=False)[0]
     return f"{'.'.join(map(str, first['loc'])) or 'the text'}: {first['msg']}"
 
 
 def build_request(kind: type[R], **fields: Any) -> R:
-    """A request of what a caller said.
+    """Build a request from a caller's arguments.
 
     Raises
     ------
@@ -50,9 +50,13 @@ def build_request(kind: type[R], **fields: Any) -> R:
         raise ConfigError(first_error(error)) from None
 
 
-# ---------------------------------------------------------------- to look
+# ---------------------------------------------------------------- read only
 class RegisterClient(Request):
-    """The first word: who speaks, and in which version. Answered with the state."""
+    """First request of a client: its name and its version of the protocol. Answered with the state.
+
+    The verb and ``schema_version`` are the same in all versions, so that a server can refuse another
+    version with a message that its client understands.
+    """
 
     verb: Literal["hello"] = "hello"
     schema_version: int
@@ -88,105 +92,105 @@ class GetLog(Request):
 
 
 class GetLatestSample(Request):
-    """The newest sample of a stream, for clients on another host; answered with its bytes."""
+    """Newest sample of a stream, for clients on another computer; answered with its bytes."""
 
-    verb: Literal["latest"] = "latest"
+    verb: Literal["latest_sample"] = "latest_sample"
     stream: Name
-    #: Nothing is sent again that the client has.
+    #: Index of the sample that the client has; only a newer one is sent.
     after: int = -1
 
 
 class PlanProcedure(Request):
-    """What a procedure would do; answered with :class:`~escape_hw.remote.state.Plan`. Nothing moves."""
+    """Plan a procedure; nothing moves. Answered with :class:`~escape_hw.remote.state.ProcedurePlan`."""
 
-    verb: Literal["check"] = "check"
+    verb: Literal["plan"] = "plan"
     procedure: Name
     arguments: Arguments = Field(default_factory=dict)
 
 
 # ---------------------------------------------------------------- the lease
 class AcquireLease(Request):
-    """Ask for the right to write; refused while somebody else holds it."""
+    """Acquire the lease; refused while another client holds it."""
 
-    verb: Literal["acquire"] = "acquire"
-    #: Take it from the holder; logged.
+    verb: Literal["acquire_lease"] = "acquire_lease"
+    #: Take it from its holder; logged.
     take_over: bool = False
 
 
 class ClientHeartbeat(Request):
-    """The holder lives."""
+    """Keeps the client registered and its lease valid."""
 
     verb: Literal["heartbeat"] = "heartbeat"
 
 
 class ReleaseLease(Request):
-    """Give the right to write back."""
+    """Release the lease."""
 
-    verb: Literal["release"] = "release"
+    verb: Literal["release_lease"] = "release_lease"
 
 
-# ---------------------------------------------------------------- safety: anybody, at any time
+# ---------------------------------------------------------------- safety: allowed to every client at any time
 class OpenLoop(Request):
-    """Open the loop and flatten the mirror; ends a procedure that needs the loop."""
+    """Open the loop and flatten the mirror; aborts a procedure that works in closed loop."""
 
     verb: Literal["open_loop"] = "open_loop"
 
 
 class Flatten(Request):
-    """Abort whatever goes on, open the loop, ramp the mirror flat."""
+    """Abort all activity, open the loop, ramp the mirror flat."""
 
     verb: Literal["flatten"] = "flatten"
 
 
 class AbortProcedure(Request):
-    """Stop the running procedure; what was measured is kept."""
+    """Stop the running procedure; the measured data are saved."""
 
-    verb: Literal["abort"] = "abort"
+    verb: Literal["abort_procedure"] = "abort_procedure"
 
 
-# ---------------------------------------------------------------- to write: the lease's holder only
+# ---------------------------------------------------------------- control: needs the lease
 class StartProcedure(Request):
-    """Start a procedure; answered with its number."""
+    """Start a procedure; answered with the number of the run."""
 
-    verb: Literal["start"] = "start"
+    verb: Literal["start_procedure"] = "start_procedure"
     procedure: Name
     arguments: Arguments = Field(default_factory=dict)
 
 
 class PauseProcedure(Request):
-    """Halt the running procedure between two steps, mirror flat or loop closed as before."""
+    """Pause the running procedure between two steps, mirror flat."""
 
-    verb: Literal["pause"] = "pause"
+    verb: Literal["pause_procedure"] = "pause_procedure"
 
 
 class ResumeProcedure(Request):
-    """Go on with a halted procedure."""
+    """Resume a paused procedure."""
 
-    verb: Literal["resume"] = "resume"
+    verb: Literal["resume_procedure"] = "resume_procedure"
 
 
-class CloseLoop(Request):
+class _LoopRequest(Request):
+    gain: Gain | None = None
+    leak: Share | None = None
+    dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
+
+
+class CloseLoop(_LoopRequest):
     """Close the loop on a matrix until it is opened."""
 
     verb: Literal["close_loop"] = "close_loop"
     matrix: Name
-    gain: Gain | None = None
-    leak: Share | None = None
-    dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
 
 
-class SetLoop(Request):
-    """Other parameters for the loop, closed or not; what is absent stays. Changes without a bump."""
+class SetLoop(_LoopRequest):
+    """Change parameters of the loop, closed or not; absent ones stay. The transition is bumpless."""
 
     verb: Literal["set_loop"] = "set_loop"
     matrix: Name | None = None
-    gain: Gain | None = None
-    leak: Share | None = None
-    dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
 
 
 class LoadProduct(Request):
-    """Load a FITS product into the engine; the path must lie where the server may read."""
+    """Load a FITS product; the path must be in a folder that the server may read."""
 
     verb: Literal["load_product"] = "load_product"
     path: Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00]+$")]
@@ -194,14 +198,14 @@ class LoadProduct(Request):
 
 
 class SetRecording(Request):
-    """Begin or end recording telemetry at full rate."""
+    """Start or stop recording telemetry at full rate."""
 
-    verb: Literal["record"] = "record"
+    verb: Literal["set_recording"] = "set_recording"
     on: bool
 
 
 class ClearFault(Request):
-    """The operator has looked: end the fault's latch, and open the devices again if they were closed."""
+    """Release the latched fault and open the devices again."""
 
     verb: Literal["clear_fault"] = "clear_fault"
 
@@ -220,33 +224,23 @@ AnyRequest = Annotated[
     Field(discriminator="verb"),
 ]  # fmt: skip
 
-#: Checks bytes from the wire; raises :class:`pydantic.ValidationError`.
+#: Validates requests; raises :class:`pydantic.ValidationError`.
 REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)
 
 #: Requests that need the lease.
 LEASE_REQUESTS = (
-    StartProcedure,
-    PauseProcedure,
-    ResumeProcedure,
-    CloseLoop,
-    SetLoop,
-    LoadProduct,
-    SetRecording,
-    ClearFault,
-    Shutdown,
-)
-#: Those after which the state is another one.
+    StartProcedure, PauseProcedure, ResumeProcedure, CloseLoop, SetLoop, LoadProduct, SetRecording,
+    ClearFault, Shutdown,
+)  # fmt: skip
+#: Requests that are allowed to every client at any time.
+SAFETY_REQUESTS = (OpenLoop, Flatten, AbortProcedure)
+#: Requests that change the state.
 STATE_CHANGING_REQUESTS = (
-    *(kind for kind in LEASE_REQUESTS if kind is not Shutdown),
-    AcquireLease,
-    ReleaseLease,
-    OpenLoop,
-    Flatten,
-    AbortProcedure,
-)
+    *(kind for kind in LEASE_REQUESTS if kind is not Shutdown), AcquireLease, ReleaseLease, *SAFETY_REQUESTS,
+)  # fmt: skip
 
 
-#: The errors that keep their class across the wire, by name; whatever else is raised arrives as the root.
+#: Errors that keep their class on the wire, by name; every other one arrives as :class:`EscapeError`.
 _KNOWN = {
     name: kind
     for name, kind in vars(errors).items()
@@ -255,7 +249,7 @@ _KNOWN = {
 
 
 def error_to_document(error: BaseException) -> dict[str, str]:
-    """Type and message of an error; one that is not ESCAPE's own is called a defect."""
+    """Type and message of an error; an exception that is none of ESCAPE is reported as a defect."""
     if isinstance(error, errors.EscapeError):
         return {"type": type(error).__name__, "message": str(error)}
     return {
@@ -265,7 +259,7 @@ def error_to_document(error: BaseException) -> dict[str, str]:
 
 
 def error_from_document(document: dict[str, Any]) -> errors.EscapeError:
-    """The exception to raise here for an error that was raised there."""
+    """The exception to raise in the client for an error of the server."""
     kind = _KNOWN.get(str(document.get("type")), errors.EscapeError)
     message = str(document.get("message", "the server gave no reason"))
     if issubclass(kind, errors.DeviceError):

@@ -1,33 +1,63 @@
-"""What a server tells of itself: one document, the same for every screen."""
+"""Documents that a server sends to its clients: state, runs, products, geometry, procedures, log lines."""
 
 from __future__ import annotations
 
+import warnings
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-#: Version of the documents below; a client of another version is refused.
-SCHEMA = 1
+from escape_hw.api.representation import table_html
+
+#: Version of these documents and of the requests; a client of another version is refused.
+SCHEMA = 2
+
+
+#: Attributes of version 0.1.0 and their present names, by class.
+_RENAMED = {
+    "FaultState": {"way_out": "remedy"},
+    "FrameCounters": {"lost": "lost_frames"},
+    "MirrorState": {"clipped": "saturated_share", "flattened": "flatten_count"},
+    "LatencyState": {"largest": "max"},
+    "LoopState": {"modes": "n_modes"},
+    "ActiveRun": {"done": "completed"},
+    "Geometry": {"places_m": "positions_m"},
+    "State": {
+        "light": "illumination", "procedure": "active_run", "last": "last_run", "telemetry": "recording",
+        "geometries": "geometry_version", "refused": "refused_requests",
+    },
+}  # fmt: skip
 
 
 class StateDocument(BaseModel):
-    """A part of the state: immutable, and nothing unknown in it."""
+    """Immutable document; unknown keys are an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Attributes of version 0.1.0, with a deprecation message."""
+            new = _RENAMED.get(type(self).__name__, {}).get(name)
+            if new is None:
+                return super().__getattr__(name)
+            message = f"{type(self).__name__}.{name} is now called {new}"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            return getattr(self, new)
+
 
 class Phase(StrEnum):
-    """What the engine, the process that owns the devices, is doing."""
+    """Activity of the engine, the process that owns the devices."""
 
     STARTING = "starting"
-    #: Devices open, mirror flat, frames watched.
+    #: Devices open, mirror flat, frames read.
     IDLE = "idle"
-    #: The loop is closed and nothing else goes on.
+    #: The loop is closed outside procedures.
     LOOP = "loop"
     #: A procedure runs, in open or closed loop.
     PROCEDURE = "procedure"
-    #: Mirror made safe after a fault; latched until somebody clears it.
+    #: Mirror made safe after a fault, which is latched until a client clears it.
     FAULT = "fault"
     STOPPED = "stopped"
 
@@ -36,7 +66,7 @@ class DeviceHealth(StrEnum):
     """A device's condition."""
 
     OK = "ok"
-    #: Nothing heard for longer than its period.
+    #: No frame for longer than the time-out.
     STALE = "stale"
     LOST = "lost"
     FAULT = "fault"
@@ -49,11 +79,11 @@ class FaultState(StateDocument):
     reason: str
     at_utc: str
     #: What the operator can do.
-    way_out: str = ""
+    remedy: str = ""
 
 
 class Lease(StateDocument):
-    """Who may write."""
+    """The client in control."""
 
     client: str
     name: str
@@ -72,26 +102,26 @@ class DeviceState(StateDocument):
     serial: str
     simulated: bool
     health: DeviceHealth
-    #: Worth showing, units in the key: ``{"temperature_c": 31.2, "frame_rate_hz": 500.0}``.
+    #: Properties for display, units in the key: ``{"temperature_c": 31.2, "frame_rate_hz": 500.0}``.
     facts: dict[str, float | str] = Field(default_factory=dict)
     message: str = ""
 
 
 class FrameCounters(StateDocument):
-    """Frames, counted."""
+    """Rate and number of frames."""
 
     frame_hz: float = 0.0
     frames: int = 0
-    #: Frames the camera made and nobody got, of the loop or procedure that runs or ran last.
-    lost: int = 0
+    #: Frames that the camera lost in the present or last loop or procedure.
+    lost_frames: int = 0
 
 
 class Illumination(StateDocument):
-    """What the sensor's camera sees."""
+    """Illumination of the sensor's camera."""
 
-    #: Share of pixels at the top of their range, 0 to 1.
+    #: Share of saturated pixels, 0 to 1.
     saturated: float = 0.0
-    #: Brightest pixel as share of the range.
+    #: Brightest pixel as share of full scale.
     peak: float = 0.0
 
 
@@ -100,19 +130,19 @@ class MirrorState(StateDocument):
 
     rms: float = 0.0
     peak: float = 0.0
-    #: Share of the actuators held at a limit, mean over the last second.
-    clipped: float = 0.0
-    #: How often it was flattened: no loop is the same one before and after.
-    flattened: int = 0
+    #: Share of the actuators at a limit, mean over the last second.
+    saturated_share: float = 0.0
+    #: Number of times that the mirror was flattened; a loop does not continue across a flattening.
+    flatten_count: int = 0
 
 
 class LatencyState(StateDocument):
-    """Microseconds from a frame in hand to its command sent, and between frames, last second."""
+    """Time from frame received to command sent and jitter of the frame interval, last second, in µs."""
 
     p50: float = 0.0
     p99: float = 0.0
-    largest: float = 0.0
-    #: 99th percentile of the deviation of the frames' spacing from its median.
+    max: float = 0.0
+    #: 99th percentile of the deviation of the frame interval from its median.
     jitter_p99: float = 0.0
 
 
@@ -125,9 +155,9 @@ class LoopState(StateDocument):
     gain: float = 0.0
     leak: float = 0.0
     dropped_modes: int = 0
-    modes: int = 0
+    n_modes: int = 0
     residual_nm: float = 0.0
-    #: Running Strehl ratio of the science camera by its peak, where there is one and a model PSF.
+    #: Running Strehl ratio (peak), with a science camera and a model PSF.
     strehl: float | None = None
     strehl_sigma: float | None = None
 
@@ -141,17 +171,17 @@ class Finish(StrEnum):
 
 
 class ActiveRun(StateDocument):
-    """The procedure that runs."""
+    """The run of a procedure."""
 
     id: int
     name: str
     arguments: dict[str, Any]
     stage: str = ""
-    done: int = 0
+    completed: int = 0
     total: int = 0
     unit: str = "frame"
     elapsed_s: float = 0.0
-    #: Seconds left in this stage; ``None``: not known yet.
+    #: Seconds left in this stage; ``None`` while unknown.
     remaining_s: float | None = None
     metrics: dict[str, float] = Field(default_factory=dict)
     paused: bool = False
@@ -159,7 +189,7 @@ class ActiveRun(StateDocument):
 
 
 class FinishedRun(StateDocument):
-    """A procedure that ended."""
+    """A run that ended."""
 
     id: int
     name: str
@@ -167,44 +197,44 @@ class FinishedRun(StateDocument):
     message: str = ""
     #: Run folder.
     folder: str = ""
-    #: Name -> path.
+    #: Path by name.
     products: dict[str, str] = Field(default_factory=dict)
     #: The run's ``result.json``.
     document: dict[str, Any] = Field(default_factory=dict)
 
 
 class ProductEntry(StateDocument):
-    """A matrix or PSF that the engine holds, by name."""
+    """A product that requests may name."""
 
     name: str
     #: ``matrix``, ``gains``, ``psf``.
     kind: str
     path: str
-    #: One line for a list: method, frames, modes.
+    #: Method, frames and modes, in one line.
     summary: str = ""
 
 
 class RecordingState(StateDocument):
-    """Recording at full rate."""
+    """Recording of telemetry at full rate; numbers of entries."""
 
     recording: bool = False
     path: str = ""
     written: int = 0
-    #: Frames that were not written because the disk was behind.
+    #: Entries that were not written because the disk was too slow.
     dropped: int = 0
-    #: Why the last recording ended by itself: a full disk.
+    #: Why the last recording ended without a request, such as a full disk.
     fault: str = ""
 
 
 class DiskState(StateDocument):
-    """Where runs go."""
+    """Disk of the run folders."""
 
     folder: str = ""
     free_gb: float = 0.0
 
 
 class StreamEntry(StateDocument):
-    """A stream and the shared memory it lies in."""
+    """A stream and its shared memory."""
 
     name: str
     segment: str
@@ -212,10 +242,10 @@ class StreamEntry(StateDocument):
 
 
 class State(StateDocument):
-    """Everything a screen shows, but for the pictures."""
+    """State of a server; arrays are in its streams."""
 
     schema_version: int = SCHEMA
-    #: Counts up with every change.
+    #: Number of this document.
     serial: int = 0
     at_utc: str = ""
     server_pid: int = 0
@@ -229,28 +259,45 @@ class State(StateDocument):
     lease: Lease | None = None
     devices: tuple[DeviceState, ...] = ()
     rates: FrameCounters = FrameCounters()
-    light: Illumination = Illumination()
+    illumination: Illumination = Illumination()
     mirror: MirrorState = MirrorState()
     latency: LatencyState = LatencyState()
     loop: LoopState = LoopState()
-    procedure: ActiveRun | None = None
-    last: FinishedRun | None = None
+    active_run: ActiveRun | None = None
+    last_run: FinishedRun | None = None
     products: tuple[ProductEntry, ...] = ()
-    telemetry: RecordingState = RecordingState()
+    recording: RecordingState = RecordingState()
     disk: DiskState = DiskState()
     streams: tuple[StreamEntry, ...] = ()
-    #: Counts up whenever the sensor's geometry changes: time to ask for it again.
-    geometries: int = 0
+    #: Increases whenever the sensor's geometry changes.
+    geometry_version: int = 0
     clients: int = 0
-    #: Messages that were no requests, or none that may be made: malformed, too large, without the lease.
-    refused: int = 0
-    #: What the server found when it started: a crash before, a calibration that can be resumed.
+    #: Messages that were refused: malformed, too large, without the lease.
+    refused_requests: int = 0
+    #: Findings at the start, such as a crash of the previous server or a run that can be resumed.
     notes: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
-        from escape_hw.remote.html import state_html
-
-        return state_html(self)
+        loop, running, lease, fault = self.loop, self.active_run, self.lease, self.fault
+        rows: dict[str, object] = {
+            "system": f"{self.system} ({'SIMULATED' if self.simulated else 'HARDWARE'})",
+            "phase": self.phase.value,
+        }
+        if fault is not None:
+            rows["FAULT"] = f"{fault.reason}. {fault.remedy}"
+        if running is not None:
+            rows["running"] = (
+                f"{running.name}: {running.stage}, {running.completed} of {running.total} {running.unit}s"
+            )
+        if loop.closed:
+            rows["loop"] = f"closed on {loop.matrix}, gain {loop.gain:g}, residual {loop.residual_nm:.0f} nm"
+        rows["camera"] = f"{self.rates.frame_hz:.1f} Hz, {self.rates.lost_frames} frames lost"
+        mirror = self.mirror
+        rows["mirror"] = f"rms {100 * mirror.rms:.2f} %, peak {100 * mirror.peak:.2f} % of the stroke"
+        rows["in control"] = "no client" if lease is None else f"{lease.name} on {lease.host}"
+        rows["devices"] = ", ".join(f"{one.name} {one.health.value}" for one in self.devices)
+        rows["server"] = f"process {self.server_pid}, ESCAPE {self.version}"
+        return table_html(rows, "Server")
 
 
 class LogLine(StateDocument):
@@ -264,14 +311,14 @@ class LogLine(StateDocument):
 
 
 class Geometry(StateDocument):
-    """Where slopes and actuators stand, for maps."""
+    """Positions of the sub-apertures and actuators, for maps."""
 
-    #: Valid sub-apertures, rows of 0 and 1; slopes run through them row by row, all x and then all y.
+    #: Valid sub-apertures, rows of 0 and 1; slopes follow them row by row, all x and then all y.
     valid: tuple[str, ...] = ()
-    #: Actuators on their grid, rows of 0 and 1; empty when they stand on none.
+    #: Actuators on a regular grid, rows of 0 and 1; empty without such a grid.
     layout: tuple[str, ...] = ()
-    #: Places (x, y) in metres of actuators without a grid.
-    places_m: tuple[tuple[float, float], ...] = ()
+    #: Positions (x, y) in metres of actuators without a regular grid.
+    positions_m: tuple[tuple[float, float], ...] = ()
     #: Sub-aperture or pupil outlines on the camera: (x, y, half width) in pixels each.
     outlines_px: tuple[tuple[float, float, float], ...] = ()
     n_modes: int = 0
@@ -286,7 +333,7 @@ class ProcedurePlan(StateDocument):
 
     name: str
     arguments: dict[str, Any]
-    #: Frames it will take, and seconds at the camera's rate.
+    #: Number of frames, and seconds at the present frame rate.
     frames: int
     seconds: float
     #: Largest poke of an actuator, as fraction of full stroke.
@@ -294,9 +341,16 @@ class ProcedurePlan(StateDocument):
     warnings: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
-        from escape_hw.remote.html import plan_html
-
-        return plan_html(self)
+        given = {key: value for key, value in self.arguments.items() if value is not None}
+        rows: dict[str, object] = {
+            "frames": self.frames,
+            "at the camera's rate": f"{self.seconds:.1f} s",
+            "largest poke": f"{100 * self.stroke:.3g} % of the stroke" if self.stroke else "none",
+            "arguments": ", ".join(f"{key} {value}" for key, value in given.items()),
+        }
+        if self.warnings:
+            rows["warnings"] = "; ".join(self.warnings)
+        return table_html(rows, f"Plan of {self.name}")
 
 
 class ProcedureParameter(StateDocument):
@@ -324,6 +378,9 @@ class ProcedureEntry(StateDocument):
     parameters: tuple[ProcedureParameter, ...] = ()
 
     def _repr_html_(self) -> str:
-        from escape_hw.remote.html import procedure_html
-
-        return procedure_html(self)
+        rows = {
+            one.name: one.help
+            + ("" if one.default is None else f" Default: {one.default} {one.unit}".rstrip())
+            for one in self.parameters
+        }
+        return table_html(rows, f"{self.name}: {self.help}")

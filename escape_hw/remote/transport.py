@@ -1,4 +1,4 @@
-"""The client's end of the wire: one thread owns the sockets, callers wait with a deadline."""
+"""ZeroMQ endpoint of a client: one thread owns the sockets, and callers wait with a time-out."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ import zmq
 from escape_hw.errors import ServerGone
 from escape_hw.remote.address import Endpoint
 from escape_hw.remote.requests import error_from_document
+from escape_hw.supervision import BackgroundThread
 
 log = logging.getLogger(__name__)
 
 _POLL_MS = 500
-#: Number of a request whose answer nobody waits for.
+#: Identifier of heartbeats, whose reply no caller waits for.
 _HEARTBEAT_ID = b"0"
-#: Largest answer that is taken, bytes.
+#: Largest reply that is accepted, bytes.
 _LARGEST = 256 << 20
 
-#: The answer, the bytes beside it, and the number of the state that holds what was done.
+#: The answer, its bytes, and the serial number of the state that shows the effect of the request.
 Reply = tuple[Any, bytes, int]
 Keys = tuple[bytes, bytes, bytes]
 
@@ -39,14 +40,14 @@ class ClientTransport:
     Parameters
     ----------
     endpoint
-        Where it listens.
+        Addresses of the server.
     on_event
-        Gets topic and document of every event, in the link's thread.
-    beat
-        Gives a message to be sent every ``heartbeat_s`` seconds, or ``None``; is told whether the server refused
-        the last one.
+        Called with topic and document of every event, in the thread of the sockets.
+    heartbeat
+        Returns the message to send every ``heartbeat_s`` seconds, or ``None``. Its argument is whether the
+        server refused the last one.
     keys
-        The server's public key, this client's public and secret key; ``None`` on the same machine.
+        The server's public key, this client's public and secret key; ``None`` on the same computer.
     """
 
     def __init__(
@@ -66,16 +67,16 @@ class ClientTransport:
             self._context.socket(zmq.PAIR),
             self._context.socket(zmq.PAIR),
         )
-        self._wake_receiver.bind("inproc://bell")
-        self._wake_sender.connect("inproc://bell")
+        self._wake_receiver.bind("inproc://wake")
+        self._wake_sender.connect("inproc://wake")
         self._lock = threading.Lock()
         self._outbox: deque[tuple[bytes, bytes]] = deque()
         self._waiting: dict[bytes, Future[Reply]] = {}
         self._numbers = itertools.count(1)
         self._ending = self._heartbeat_refused = False
-        #: When the server was last heard of, monotonic seconds.
+        #: Time of the last message of the server, monotonic seconds.
         self.last_message_s = 0.0
-        self._thread = threading.Thread(target=self._run, name="escape-link", daemon=True)
+        self._thread = BackgroundThread("escape client", self._run)
         self._thread.start()
 
     def _socket(self, kind: int, address: str, keys: Keys | None) -> zmq.Socket[bytes]:
@@ -85,22 +86,22 @@ class ClientTransport:
         socket.setsockopt(zmq.RECONNECT_IVL, 100)
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
         if kind == zmq.DEALER:
-            # The server tells connections apart by this; nobody else learns it. It outlives a reconnect.
+            # Identifies the connection, also after a reconnection; unknown to other clients.
             socket.setsockopt(zmq.ROUTING_ID, b"c" + os.urandom(16))
         if keys is not None:
             socket.curve_serverkey, socket.curve_publickey, socket.curve_secretkey = keys
         socket.connect(address)
         return socket
 
-    def ask(self, message: Mapping[str, Any], timeout_s: float) -> Reply:
-        """Send a request and wait for its answer.
+    def send_request(self, message: Mapping[str, Any], timeout_s: float) -> Reply:
+        """Send a request and wait for its reply.
 
         Raises
         ------
         ServerGone
-            No answer in time.
+            No reply in time.
         EscapeError
-            What the server raised.
+            The error of the server.
         """
         answer: Future[Reply] = Future()
         number = str(next(self._numbers)).encode()
@@ -114,14 +115,14 @@ class ClientTransport:
             return answer.result(timeout_s)
         except FutureTimeoutError:
             raise ServerGone(
-                f"no answer to '{message.get('verb')}' within {timeout_s:g} s; is the server still there?"
+                f"no reply to '{message.get('verb')}' within {timeout_s:g} s; check that the server runs"
             ) from None
         finally:
             with self._lock:
                 self._waiting.pop(number, None)
 
     def close(self) -> None:
-        """Hang up; whoever waits for an answer gets none."""
+        """Close the connection; waiting callers get no reply."""
         with self._lock:
             if self._ending:
                 return
@@ -142,7 +143,7 @@ class ClientTransport:
             if self._wake_receiver in ready:
                 self._wake_receiver.recv()
             self._send_all()
-            # An event that was sent before an answer is known before it.
+            # Events first: one that was sent before a reply is handled before it.
             if self._events in ready:
                 self._receive_events()
             if self._requests in ready:
@@ -170,7 +171,7 @@ class ClientTransport:
         try:
             self._requests.send_multipart([number, text], zmq.NOBLOCK)
         except zmq.Again:
-            log.debug("the server takes nothing; request %s is dropped", number)
+            log.debug("the server accepts no messages; request %s is dropped", number)
 
     def _receive_reply(self) -> None:
         parts = self._requests.recv_multipart()
@@ -190,7 +191,7 @@ class ClientTransport:
             else:
                 answer.set_exception(error_from_document(reply["error"]))
         except (IndexError, KeyError, ValueError) as error:
-            invalid_reply = ServerGone(f"the server's answer makes no sense: {error!r}")
+            invalid_reply = ServerGone(f"malformed reply of the server: {error!r}")
             if answer is None:
                 log.warning("%s", invalid_reply)
             else:
@@ -208,5 +209,5 @@ class ClientTransport:
         try:
             self._on_event(parts[0].decode(), json.loads(parts[1]))
         except Exception as error:
-            # One event that makes no sense must not end the connection.
-            log.warning("an event was not understood: %s: %s", type(error).__name__, error)
+            # A malformed event must not end the connection.
+            log.warning("malformed event: %s: %s", type(error).__name__, error)

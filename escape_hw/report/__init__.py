@@ -1,1 +1,4 @@
-"""Tables, figures and report.html of one run folder. The paper's tables and figures are in paper/."""
+"""Tables, figures and ``report.html`` of one run folder.
+
+Tables and figures of the paper are in ``escape_hw.paper``.
+"""

@@ -1,1 +1,4 @@
-"""What runs on an open system: the System class of scripts, the procedures that command line and server share, sweeps, and tools for the computer and single devices. Numerics are in calibration/."""
+"""The ``System`` class of scripts, the procedures shared by command line and server, sweeps, and device tools.
+
+Numerics are in ``escape_hw.calibration``.
+"""

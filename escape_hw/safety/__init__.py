@@ -1,1 +1,4 @@
-"""Limits of mirror commands and the guard that enforces them. Processes that supervise the engine are in escape_hw.server."""
+"""Limits of mirror commands, and the guard that enforces them on every command.
+
+Supervision of processes (watchdog, fail-safe) is in ``escape_hw.server.safety``.
+"""

@@ -1,4 +1,4 @@
-"""The guard between a requested command and the mirror: what passes obeys every limit."""
+"""Guard between a requested command and the mirror: a command that passes obeys every limit."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from escape_hw.errors import CommandRejected
 from escape_hw.safety.limits import MirrorLimits
 
-#: Head-room for rounding, so that a command at a limit is not touched again.
+#: Tolerance for rounding: a command exactly at a limit passes unchanged.
 _ROUNDING = 1e-12
-#: Nothing this far beyond full stroke means anything; bounding it keeps sums and products finite.
+#: Commands are first clipped to this magnitude, which keeps sums and products finite.
 _MAX_MAGNITUDE = 1e3
 
 
@@ -24,15 +24,15 @@ class GuardReport:
     Parameters
     ----------
     clipped
-        Actuators asked to go beyond ``max_stroke``.
+        Number of actuators whose command exceeded ``max_stroke``.
     slewed
-        Actuators that could not go all the way in one command.
+        Number of actuators whose change exceeded ``max_slew``.
     disabled
-        Disabled actuators that were asked to move.
+        Number of disabled actuators with a non-zero command.
     scale
-        Factor that brought the shape within ``max_neighbour`` and ``max_mean``, 1 if not needed.
+        Factor applied to the shape to respect ``max_neighbour`` and ``max_mean``; 1 if not needed.
     mean_removed
-        Mean taken off to respect ``max_mean``, fraction of full stroke.
+        Mean subtracted to respect ``max_mean``, fraction of full stroke.
     """
 
     clipped: int = 0
@@ -43,7 +43,7 @@ class GuardReport:
 
     @property
     def is_unchanged(self) -> bool:
-        """True when the mirror gets exactly what was asked for."""
+        """True when the command was sent as requested."""
         return self == _UNCHANGED
 
 
@@ -51,21 +51,20 @@ _UNCHANGED = GuardReport()
 
 
 class CommandGuard:
-    """Checks and limits commands for one mirror; remembers the last shape sent.
+    """Validates and limits the commands of one mirror, and stores the last shape sent.
 
-    Every rule is convex, and the last shape obeys them all. A command that breaks a rule is first
-    made legal by itself (mean, stroke, then a scaling, which needs no iteration because zero obeys
-    every rule); the slew rule then decides how far towards it this command may go. So the result
-    always obeys, and repeating a command always arrives.
+    The set of legal shapes is convex and contains zero. A command outside it is brought inside without
+    iteration: the mean is reduced, the stroke is clipped, and the shape is scaled. The slew rule then
+    limits the step from the last shape towards this legal shape. The result therefore obeys every rule,
+    and repeating a command converges to its legal shape.
 
-    When a mirror is found in a shape that breaks a rule (see :meth:`reset`), no single command
-    can obey both the slew rule and the broken one. Slew wins, and each command breaks the other
-    rule by less than the one before.
+    If the last shape breaks a rule (see :meth:`reset`), no single command can satisfy both that rule and
+    the slew rule. The slew rule has priority, and each command reduces the violation of the other rule.
 
     Parameters
     ----------
     device
-        Name used in error messages.
+        Device name for error messages.
     n_act
         Number of actuators.
     limits
@@ -97,11 +96,11 @@ class CommandGuard:
         n_enabled = int(self._enabled.sum())
         self._mean_weights = self._enabled / n_enabled if n_enabled else np.zeros(n_act)
         self.last = _read_only(np.zeros(n_act))
-        # Imported here: it brings a compiler along, which those who only read a configuration do without.
+        # Imported here because numba is slow to import and reading a configuration does not need it.
         from escape_hw.safety.limit_check import obeys_limits
 
         self._obeys_limits = obeys_limits
-        # Stroke holds exactly, the other rules to within rounding; what is off is infinite.
+        # The stroke limit is exact, the others have a tolerance; a rule that is off has an infinite limit.
         off, mean = math.inf, limits.max_mean is not None
         neighbours = limits.max_neighbour is not None
         none = np.empty(0, dtype=np.intp)
@@ -121,25 +120,25 @@ class CommandGuard:
         Returns
         -------
         ndarray of float64, ``(n_act,)``
-            A fresh C-contiguous copy.
+            A new C-contiguous array.
 
         Raises
         ------
         CommandRejected
-            Wrong type or shape, or any value that is not finite (its index is named).
+            Wrong type or shape, or a value that is not finite; the message gives its index.
         """
-        # A caller that has numpy raise on overflow must still get CommandRejected.
+        # Raise CommandRejected even where the caller lets numpy raise on overflow.
         with np.errstate(all="ignore"):
             return self._validated(command)
 
     def limit(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
-        """Limit a command; the result obeys every rule at once. Remembers nothing.
+        """Limit a command so that it obeys every rule. Does not change the last shape.
 
         Returns
         -------
         safe : ndarray of float64, ``(n_act,)``
-            Read-only. Bit for bit what was asked for when that obeys every rule; otherwise every
-            rule is obeyed to within rounding (1e-12), stroke exactly.
+            Read-only. Identical to the command if that obeys every rule; otherwise every rule is obeyed
+            to within rounding (1e-12), and the stroke limit exactly.
         report : GuardReport
 
         Raises
@@ -156,7 +155,7 @@ class CommandGuard:
             return _read_only(safe), GuardReport(clipped, slewed, disabled, scale, removed)
 
     def set_last(self, shape: NDArray[np.float64]) -> None:
-        """Remember a shape from :meth:`limit` as the one that the mirror has now."""
+        """Store a shape from :meth:`limit` as the present shape of the mirror."""
         self.last = shape
 
     def __call__(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
@@ -166,7 +165,7 @@ class CommandGuard:
         return safe, report
 
     def reset(self, shape: ArrayLike | None = None) -> None:
-        """Tell the guard which shape the mirror really has; zeros when not given.
+        """Set the present shape of the mirror, by default zeros; it may break the limits.
 
         Raises
         ------
@@ -176,11 +175,11 @@ class CommandGuard:
         self.last = _read_only(np.zeros(self.n_act) if shape is None else self.validate(shape))
 
     def is_legal(self, shape: NDArray[np.float64]) -> bool:
-        """True when ``shape`` obeys every rule, counted from the last shape sent."""
+        """True when ``shape`` obeys every rule, the slew rule relative to the last shape."""
         return bool(self._obeys_limits(shape, self.last, *self._rules))
 
     def find_violation(self, shape: NDArray[np.float64]) -> str | None:
-        """The first rule that ``shape`` breaks by itself (slew apart), in words, or ``None``."""
+        """Message for the first rule other than slew that ``shape`` breaks, or ``None``."""
         lim = self.limits
         peak = _peak(shape)
         if peak > lim.max_stroke:
@@ -200,10 +199,10 @@ class CommandGuard:
         return None
 
     def largest_legal_scale(self, shape: ArrayLike) -> float:
-        """Largest factor, at most 1, with which a shape breaks no rule by itself (slew apart).
+        """Largest factor up to 1 at which the scaled shape obeys every rule except slew.
 
-        A shape scaled by it keeps its form, where :meth:`limit` cuts single actuators off. Disabled
-        actuators do not count: no factor makes them legal.
+        Scaling preserves the form of a shape, whereas :meth:`limit` clips single actuators. Disabled
+        actuators are ignored.
 
         Raises
         ------
@@ -227,13 +226,13 @@ class CommandGuard:
                 self.device, f"command has shape {asked.shape}; this mirror takes ({self.n_act},)"
             )
         wanted = np.array(asked, dtype=np.float64, order="C")
-        # The sum of squares is the cheapest test that one NaN or infinity cannot pass.
+        # One pass: the sum of squares is not finite if any element is not.
         if not math.isfinite(wanted.dot(wanted)):
             self._require_finite(wanted)
         return wanted
 
     def _as_array(self, command: ArrayLike) -> NDArray[np.generic]:
-        """Make an array of it, and whatever goes wrong on the way a :class:`CommandRejected`."""
+        """Convert to an array; any failure becomes a :class:`CommandRejected`."""
         try:
             if np.ma.is_masked(command):
                 raise CommandRejected(self.device, "command has masked elements; fill them first")
@@ -251,7 +250,7 @@ class CommandGuard:
             raise CommandRejected(
                 self.device,
                 f"actuator {bad[0]} is {wanted[bad[0]]} ({bad.size} of {self.n_act} not finite); "
-                "the whole command is refused and the last shape kept",
+                "the command is rejected and the last shape kept",
             )
 
     def _worst_step(self, shape: NDArray[np.float64]) -> float:
@@ -260,7 +259,7 @@ class CommandGuard:
     def _apply_static_limits(
         self, wanted: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], int, int, float, float]:
-        """Make a shape obey every rule but slew.
+        """Bring a shape within every rule except slew.
 
         Returns
         -------
@@ -282,7 +281,7 @@ class CommandGuard:
         return (shape if scale == 1.0 else shape * scale), clipped, disabled, scale, removed
 
     def _scale(self, shape: NDArray[np.float64]) -> float:
-        """Largest factor up to 1 that makes ``shape`` obey the neighbour and the mean rule."""
+        """Largest factor up to 1 at which ``shape`` obeys the neighbour and mean rules."""
         lim, scale = self.limits, 1.0
         if lim.max_mean is not None:
             mean = abs(float(shape.dot(self._mean_weights)))
@@ -293,11 +292,10 @@ class CommandGuard:
         return scale
 
     def _apply_slew_limit(self, legal: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-        """Go from the last shape towards a legal one as far as the slew rule allows.
+        """Step from the last shape towards a legal one as far as the slew rule allows.
 
-        Each actuator goes as far as it may, so that one far away does not hold the others back.
-        Where that breaks a rule (the mean may, as the far ones lag), all move in proportion: a
-        point on the straight line between two legal shapes is legal.
+        Each actuator moves by at most the slew limit. If the result breaks another rule (for example the
+        mean), the whole step is scaled instead: a point between two legal shapes is legal by convexity.
         """
         slew = self.limits.max_slew
         if slew is None:
@@ -313,7 +311,7 @@ class CommandGuard:
         return self._within_stroke(self.last + move * (slew / far.max())), slewed
 
     def _within_stroke(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Take off what rounding added beyond the stroke (or beyond the last shape, if that is)."""
+        """Remove rounding beyond the stroke limit, or beyond the last shape if that exceeds the limit."""
         bound = max(self.limits.max_stroke, _peak(self.last))
         return _clamp(shape, bound)
 
@@ -323,11 +321,11 @@ def _peak(values: NDArray[np.float64]) -> float:
 
 
 def _clamp(values: NDArray[np.float64], bound: float) -> NDArray[np.float64]:
-    """Clip to ``-bound .. bound`` (several times faster than ``np.clip`` on so few values)."""
+    """Clip to ``-bound .. bound``; several times faster than ``np.clip`` on small arrays."""
     return np.minimum(np.maximum(values, -bound), bound)
 
 
 def _read_only(shape: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Make an array read-only: caller, driver and guard share it, and none may change it."""
+    """Make an array read-only, because caller, driver and guard share it."""
     shape.setflags(write=False)
     return shape

@@ -1,4 +1,4 @@
-"""Whether a command obeys every limit, in one compiled pass: most do, and a loop waits for the answer."""
+"""Compiled check of a command against every limit, for the hot path of the loop."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def obeys_limits(  # type: ignore[no-untyped-def]
     max_mean,
     max_neighbour,
 ):  # pragma: no cover
-    """True when a shape ``(n_act,)`` obeys; what is not a number does not.
+    """Whether a shape ``(n_act,)`` obeys every limit; NaN does not.
 
-    Parameters are those of :class:`~escape_hw.safety.guard.CommandGuard`, limits with head-room for rounding
-    and infinite where a rule is off; ``mean_weights (n_act,)`` is empty where there is none for the mean.
+    Parameters as in :class:`~escape_hw.safety.guard.CommandGuard`. Limits include the tolerance for rounding
+    and are infinite where a rule is off; ``mean_weights (n_act,)`` is empty if the mean rule is off.
     """
     for i in range(shape.size):
         if not (abs(shape[i]) <= max_stroke and abs(shape[i] - last[i]) <= max_slew):

@@ -1,4 +1,4 @@
-"""Limits that every command to a deformable mirror obeys."""
+"""Limits of mirror commands, and pairs of adjacent actuators."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class MirrorLimits:
     Raises
     ------
     ValueError
-        A limit is not a positive number, or ``disabled`` holds anything but indices.
+        A limit is not a positive number, or ``disabled`` contains something other than indices.
     """
 
     max_stroke: float = 1.0
@@ -60,18 +60,17 @@ def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:
     Parameters
     ----------
     layout
-        Boolean map ``(rows, cols)`` that is true where an actuator stands; actuators are
-        numbered in row-major order.
+        Boolean map ``(rows, cols)``, true where there is an actuator; numbered in row-major order.
 
     Returns
     -------
     ndarray of int, ``(n_pairs, 2)``
-        Every horizontal and vertical neighbour pair once.
+        Every horizontal and vertical pair once.
 
     Raises
     ------
     ValueError
-        The layout is not a map of two dimensions.
+        The layout is not two-dimensional.
     """
     if layout.ndim != 2:
         raise ValueError(f"layout has shape {layout.shape}; it must be a map (rows, columns)")
@@ -87,16 +86,16 @@ def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def nearest_pairs(positions: NDArray[np.float64], max_distance: float = 1.3) -> NDArray[np.intp]:
-    """Pairs of adjacent actuators anywhere on a mirror, by their distance.
+    """Pairs of adjacent actuators by distance, for any layout.
 
-    On a square grid these are the pairs of :func:`neighbour_pairs`, for diagonals are 1.41 pitches.
+    On a square grid these are the pairs of :func:`neighbour_pairs`, because a diagonal is 1.41 pitches long.
 
     Parameters
     ----------
     positions
         Actuator positions ``(n_act, 2)``.
-    reach
-        Largest distance of a pair, in units of the usual distance (median) to the nearest actuator.
+    max_distance
+        Largest distance of a pair, in units of the median distance to the nearest actuator.
 
     Returns
     -------
@@ -106,7 +105,7 @@ def nearest_pairs(positions: NDArray[np.float64], max_distance: float = 1.3) -> 
     Raises
     ------
     ValueError
-        The positions are not pairs of finite coordinates, or two actuators stand in one place.
+        The positions are not finite ``(n_act, 2)``, or two actuators have the same position.
     """
     at = np.asarray(positions, dtype=float)
     if at.ndim != 2 or at.shape[1] != 2 or not np.isfinite(at).all():
@@ -118,5 +117,5 @@ def nearest_pairs(positions: NDArray[np.float64], max_distance: float = 1.3) -> 
     nearest = distance.min(axis=1)
     if not nearest.min() > 0:
         one = int(nearest.argmin())
-        raise ValueError(f"actuators {one} and {int(distance[one].argmin())} stand in the same place")
+        raise ValueError(f"actuators {one} and {int(distance[one].argmin())} have the same position")
     return np.argwhere(np.triu(distance <= max_distance * np.median(nearest))).astype(np.intp)

@@ -1,1 +1,5 @@
-"""The server: a front-end process that clients connect to and an engine process that owns the devices. Clients and the messages they exchange with a server are in escape_hw.remote."""
+"""The server of a system.
+
+The front end serves the clients, the engine owns the devices, and the fail-safe process flattens the mirror
+when the engine dies. The clients' side and the messages are in :mod:`escape_hw.remote`.
+"""

@@ -1,1 +1,4 @@
-"""Shared-memory rings of arrays, their readers, timing histograms and the recorder. Streams of other packages (milk, pyRTC) are in escape_hw.io.interchange."""
+"""Arrays in shared memory: rings, their camera, timing, recording.
+
+Streams of other packages (milk, pyRTC) are in :mod:`escape_hw.io.interchange`.
+"""

@@ -1,4 +1,4 @@
-"""Waking a process that sleeps on a word of shared memory (Linux: futex)."""
+"""Waiting on a word of shared memory, and waking the waiting processes (Linux futex)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
-#: Number of the system call by machine.
+#: Number of the system call by architecture.
 _NUMBERS: Final = {"x86_64": 202, "aarch64": 98}
 _WAIT, _WAKE, _ALL = 0, 1, 2**31 - 1
-#: Seconds between two looks where the system knows no such call.
+#: Polling period on systems without futex.
 _POLL_S = 0.0002
 
 _NUMBER = _NUMBERS.get(platform.machine()) if sys.platform.startswith("linux") else None
@@ -27,30 +27,30 @@ class _Timespec(ctypes.Structure):
 
 
 def futex_address(memory: mmap.mmap, word: int) -> int:
-    """Address of the half of a word of 64 bits that changes with every count.
+    """Address of the low half of a 64-bit counter.
 
     Parameters
     ----------
     memory
-        Shared.
+        Shared memory.
     word
-        Place of the word, in words.
+        Offset of the counter, in words.
     """
     start = np.frombuffer(memory, np.uint8, 1).ctypes.data
     return start + 8 * word + (0 if sys.byteorder == "little" else 4)
 
 
 def futex_wait(address: int, value: int, timeout_s: float) -> None:
-    """Sleep until somebody calls :func:`futex_wake` on a word of 32 bits, unless it differs from ``value`` already.
+    """Sleep until :func:`futex_wake` is called for a 32-bit word, unless it differs from ``value``.
 
-    It may return early for no reason. Other threads of Python run meanwhile.
+    May return spuriously. Releases the interpreter lock.
 
     Parameters
     ----------
     address
-        Of the word, in memory that is shared.
+        Address of the word, in shared memory.
     value
-        What the word was when the caller looked.
+        Value that the caller has read.
     timeout_s
         Longest sleep.
     """
@@ -63,12 +63,12 @@ def futex_wait(address: int, value: int, timeout_s: float) -> None:
 
 
 def futex_wake(address: int) -> None:
-    """Wake all who sleep on a word; a microsecond, whether anybody sleeps or not.
+    """Wake all processes that wait on a word; takes about a microsecond.
 
     Raises
     ------
     OSError
-        The address is none of shared memory.
+        The address is not in shared memory.
     """
     if _syscall is not None and _syscall(_NUMBER, ctypes.c_void_p(address), _WAKE, _ALL, None, None, 0) < 0:
         error = ctypes.get_errno()

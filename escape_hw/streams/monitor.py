@@ -1,4 +1,4 @@
-"""What flows through the streams of this computer, for a table."""
+"""Rates and intervals of the streams of this computer."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from escape_hw.streams.timing import percentiles_of
 
 @dataclass(frozen=True, slots=True)
 class StreamStatus:
-    """One stream; rates and percentiles are those since it was looked at before, NaN at first.
+    """Status of one stream. Rate and percentiles cover the time since the previous call; NaN at first.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class StreamStatus:
     age_s
         Seconds since the newest entry; NaN before the first.
     interval_us
-        Median, 99th percentile and the largest spacing of entries.
+        Median, 99th percentile and maximum of the interval between entries.
     """
 
     system: str
@@ -47,12 +47,12 @@ class StreamStatus:
 
 @dataclass(slots=True)
 class StreamMonitor:
-    """Looks at all streams of this user, time after time."""
+    """Measures all streams of this user between two calls."""
 
     _previous: dict[str, RingStats] = field(default_factory=dict)
 
     def rows(self) -> tuple[StreamStatus, ...]:
-        """The streams there are now, living and dead."""
+        """Status of all streams, also of those whose process is dead."""
         found = segments.segments()
         users = segments.readers(one.name for one in found)
         now = {one.name: self._status(one, users) for one in found}
@@ -77,7 +77,7 @@ class StreamMonitor:
 
 
 def _rate(before: RingStats, now: RingStats) -> float:
-    """Entries per second by the entries' own times: whoever looks may have been held up meanwhile."""
+    """Entries per second by the entries' own times, since this process may be delayed."""
     entries, elapsed_ns = now.written - before.written, now.arrived_ns - before.arrived_ns
     return 1e9 * entries / elapsed_ns if entries and elapsed_ns > 0 else 0.0
 

@@ -1,4 +1,4 @@
-"""Telling the operating system that a thread must not wait: processor, priority, memory that stays."""
+"""Real-time settings of a thread: processor affinity, priority, locked memory."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
-#: Above all that is usual, below the kernel's own threads.
+#: Above ordinary threads, below the kernel's own.
 PRIORITY = 40
-#: Seconds after which another Python thread gives way: at most so long may one hold up the loop.
+#: Switch interval of Python threads: the longest delay of the loop by another thread.
 SWITCH_INTERVAL_S = 0.0005
 _LOCK_PRESENT = 1
 _ISOLATED = Path("/sys/devices/system/cpu/isolated")
 
 
 def isolated_cpus(path: Path = _ISOLATED) -> tuple[int, ...]:
-    """Processors that this machine keeps free of everything else (boot option ``isolcpus``)."""
+    """Processors that are isolated from the scheduler (boot option ``isolcpus``)."""
     try:
         parts = [part.split("-") for part in path.read_text().strip().split(",") if part]
         return tuple(cpu for ends in parts for cpu in range(int(ends[0]), int(ends[-1]) + 1))
@@ -31,32 +31,32 @@ def isolated_cpus(path: Path = _ISOLATED) -> tuple[int, ...]:
 def realtime_thread(
     cpus: Collection[int] | None = None, priority: int = PRIORITY
 ) -> Iterator[tuple[str, ...]]:
-    """Run this thread before others, as far as the machine allows, and give up all of it in the end.
+    """Context manager: run this thread with real-time settings, as far as the system permits.
 
-    Threads and processes that it starts do not inherit the priority.
+    All settings are restored at the end. Threads and processes that it starts do not inherit the priority.
 
     Parameters
     ----------
     cpus
-        Processors to run on; ``None``: any.
+        Processors to run on; ``None`` for any.
     priority
-        Of SCHED_FIFO, 1 to 99; 0 leaves it.
+        SCHED_FIFO priority, 1 to 99; 0 leaves it unchanged.
 
     Yields
     ------
     tuple of str
-        What was not allowed, in words for the state; empty when all was.
+        Messages on settings that were refused; empty when all were applied.
     """
     notes: list[str] = []
     with contextlib.ExitStack() as undo:
-        # What there is now is looked at no more when garbage is collected, or that takes milliseconds.
+        # Exclude existing objects from garbage collection, which would take milliseconds.
         gc.freeze()
         undo.callback(gc.unfreeze)
         interval = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         undo.callback(sys.setswitchinterval, interval)
         if cpus is not None:
-            _attempt(notes, "processors cannot be chosen", lambda: _pin_to_cpus(frozenset(cpus), undo))
+            _attempt(notes, "processor affinity refused", lambda: _pin_to_cpus(frozenset(cpus), undo))
         if priority:
             _attempt(
                 notes, "no real-time priority (allow it with 'rtprio' in /etc/security/limits.d)",
@@ -89,7 +89,7 @@ def _raise_priority(priority: int, undo: contextlib.ExitStack) -> None:
 
 
 def _lock_memory(undo: contextlib.ExitStack) -> None:
-    """Keep what is in memory now there; what is mapped later is not held, or large runs would fail."""
+    """Lock the present memory; later mappings are not locked, or large runs would fail."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(_LOCK_PRESENT):
         error = ctypes.get_errno()

@@ -19,20 +19,21 @@ from escape_hw.streams import layout, segments
 from escape_hw.streams.futex import futex_address, futex_wait, futex_wake
 from escape_hw.streams.segments import StreamUnavailable
 from escape_hw.streams.timing import BINS, bin_of
+from escape_hw.supervision import is_alive
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """One entry of a stream, copied out of its memory.
+    """One entry of a stream, copied from shared memory.
 
     Parameters
     ----------
     index
         Number of the entry; of frame streams the frame's index.
     exposed_ns, arrived_ns
-        When it was taken and when it was written, monotonic nanoseconds.
+        Times of exposure and of writing, monotonic nanoseconds.
     data
-        The entry's own array.
+        Array.
     meta
         Short description of the entry: ``{"stage": ..., "frames": ...}``.
     """
@@ -45,59 +46,50 @@ class Sample:
     __repr__ = short_repr
 
 
-#: How often a reader that was overtaken while it copied tries again.
+#: Attempts to copy an entry while the writer overwrites it.
 _TRIES = 16
 _NO_META: Mapping[str, float | str] = {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RingStats:
-    """What a ring tells of itself.
+    """Statistics of a ring.
 
     Parameters
     ----------
     written
-        Entries written since it was made.
-    index, shape, dtype, arrived_ns
+        Entries written since its creation.
+    shape, dtype, arrived_ns
         Of the newest entry; an empty shape, ``""`` and 0 before the first.
     intervals
-        How often the spacing of two entries fell in each bin of
-        :mod:`~escape_hw.streams.timing` ``(BINS,)``; the difference of two such counts is the
-        time between.
-    closed
-        Whether the writer has said goodbye.
+        Histogram of the intervals between entries in the bins of :mod:`~escape_hw.streams.timing`
+        ``(BINS,)``, since its creation.
     """
 
-    name: str
-    pid: int
-    slots: int
-    capacity: int
     written: int
-    index: int
     shape: tuple[int, ...]
     dtype: str
     arrived_ns: int
     intervals: NDArray[np.uint64]
-    closed: bool
 
 
 class RingReader:
-    """The reading end of a stream.
+    """Reader of a stream.
 
     Parameters
     ----------
     name
-        The segment's name.
+        Name of the segment.
 
     Attributes
     ----------
     missed
-        Entries that :meth:`next` found overwritten.
+        Entries that were overwritten before :meth:`next` read them.
 
     Raises
     ------
     StreamGone
-        There is no such ring.
+        The ring does not exist.
     """
 
     def __init__(self, name: str) -> None:
@@ -109,7 +101,7 @@ class RingReader:
         self._stride = layout.slot_bytes(self.capacity)
         if len(self._memory) != layout.HEADER_BYTES + self.slots * self._stride:
             self._memory.close()
-            raise StreamUnavailable(f"{name} has not the size that its header tells; restart its server")
+            raise StreamUnavailable(f"{name} does not have the size in its header; restart its server")
         self._words = memoryview(self._memory).cast("Q")
         self._futex = futex_address(self._memory, layout.WRITTEN)
         self._next = 0
@@ -122,41 +114,39 @@ class RingReader:
 
     @property
     def closed(self) -> bool:
-        """Whether the writer has said goodbye."""
+        """Whether the writer has closed the ring."""
         return bool(self._words[layout.CLOSED])
 
     @property
     def alive(self) -> bool:
-        """Whether the writer has not said goodbye and its process lives; reads a file of the system."""
-        return not self.closed and segments.process_start(self.pid) == self._started
+        """Whether the ring is not closed and the writer's process is alive; reads a system file."""
+        return not self.closed and is_alive(self.pid, self._started)
 
     def latest(self, after: int = -1) -> Sample | None:
-        """The newest entry.
+        """The newest entry; ``None`` when there is no new one.
 
         Parameters
         ----------
         after
-            Index of the entry that the caller has; ``None`` is returned while it is the newest.
-            After a restart of the camera indices begin anew, so that another index counts as newer,
-            be it smaller.
+            Index of the entry that the caller has. A smaller index counts as newer as well, since indices
+            start again after a restart of the camera.
         """
         for _ in range(_TRIES):
             count = self.written
             if count == 0:
                 return None
             number = count - 1
-            if self._index(number) == after:
+            if self._entry(number)[0] == after:
                 if self.written == count:
                     return None
-                # One more was written meanwhile.
-                continue
+                continue  # another entry was written meanwhile
             sample = self._copy(number)
             if sample is not None:
                 return sample
         return None
 
     def next(self) -> Sample | None:
-        """The entry after the one this method gave before, the oldest at first; ``None``: not yet there.
+        """The next entry in order, the oldest at first; ``None`` when there is none yet.
 
         Entries that were overwritten before they could be read are counted in :attr:`missed`.
         """
@@ -164,7 +154,7 @@ class RingReader:
             count = self.written
             if self._next >= count:
                 return None
-            # The slot of the oldest entry is the next to be written to.
+            # The slot of the oldest entry is written next.
             oldest = max(0, count - self.slots + 1)
             if self._next < oldest:
                 self.missed += oldest - self._next
@@ -176,19 +166,19 @@ class RingReader:
         return None
 
     def wait(self, after: int, timeout_s: float) -> bool:
-        """Sleep until an entry is written.
+        """Wait until an entry is written.
 
         Parameters
         ----------
         after
-            What :attr:`written` was when the caller looked.
+            Value of :attr:`written` that the caller has read.
         timeout_s
-            Longest sleep.
+            Longest wait.
 
         Returns
         -------
         bool
-            Whether there is one; false when the time is up or the ring was closed.
+            Whether there is a new entry; false after the time-out or when the ring was closed.
         """
         until = time.monotonic() + timeout_s
         while self.written == after and not self.closed:
@@ -200,37 +190,34 @@ class RingReader:
 
     @property
     def written_at(self) -> int:
-        """Address of the word of 64 bits that counts the entries."""
+        """Address of the 64-bit counter of the entries."""
         return self._futex - self._futex % 8
 
     @property
     def position(self) -> int:
-        """Number of the entry that :meth:`next` gives next, counted from 0 over the life of the ring."""
+        """Number of the entry that :meth:`next` returns next, counted from 0 since creation."""
         return self._next
 
     def seek(self, number: int) -> None:
-        """Let :meth:`next` go on with an entry by its number."""
+        """Let :meth:`next` continue with this entry number."""
         self._next = number
 
     def seek_newest(self) -> None:
-        """Let :meth:`next` begin with what is written from now on."""
+        """Let :meth:`next` continue with entries that are written from now on."""
         self.seek(self.written)
 
     def stats(self) -> RingStats:
-        """What the ring tells of itself, without copying an entry."""
+        """Statistics, without copying an entry."""
         count = self.written
         entry = self._entry(count - 1) if count else (0,) * 12
-        index, arrived, code, dimensions = entry[0], entry[2], entry[4], entry[5]
+        arrived, code, dimensions = entry[2], entry[4], entry[5]
         shape = entry[8 : 8 + min(dimensions, layout.MAX_DIMENSIONS)]
         dtype = layout.DTYPES[code % len(layout.DTYPES)].str[1:] if count else ""
         intervals = np.array(self._words[layout.INTERVALS : layout.INTERVALS + BINS], dtype=np.uint64)
-        return RingStats(
-            self.name, self.pid, self.slots, self.capacity, count, index, shape, dtype, arrived, intervals,
-            self.closed,
-        )  # fmt: skip
+        return RingStats(count, shape, dtype, arrived, intervals)
 
     def close(self) -> None:
-        """Let go of the memory; the ring lives on."""
+        """Unmap the memory; the ring stays."""
         self._words.release()
         self._memory.close()
 
@@ -246,21 +233,17 @@ class RingReader:
         return layout.HEADER_BYTES + (number % self.slots) * self._stride
 
     def _entry(self, number: int) -> tuple[int, ...]:
-        entry: tuple[int, ...] = layout.ENTRY.unpack_from(self._memory, self._at(number) + layout.ENTRY_AT)
-        return entry
-
-    def _index(self, number: int) -> int:
-        return int(self._entry(number)[0])
+        return layout.ENTRY.unpack_from(self._memory, self._at(number) + layout.ENTRY_AT)
 
     def _copy(self, number: int) -> Sample | None:
-        """An entry by its number, or ``None`` when it was overwritten before or meanwhile."""
+        """Copy an entry by its number; ``None`` when it was overwritten."""
         at = self._at(number)
         word = at >> 3
         if self._words[word + layout.ENDED] != number + 1:
             return None
         entry = self._entry(number)
         index, exposed, arrived, size, code, dimensions, meta_bytes = entry[:7]
-        # What is being overwritten may say anything.
+        # An entry that is being overwritten may contain any values.
         if size > self.capacity or code >= len(layout.DTYPES) or dimensions > layout.MAX_DIMENSIONS:
             return None
         dtype, shape = layout.DTYPES[code], entry[8 : 8 + dimensions]
@@ -277,13 +260,13 @@ class RingReader:
 
 
 class ReaderCache:
-    """One open reader for each stream that was looked at, exchanged when its segment is another one."""
+    """One open reader per stream, replaced when the stream's segment changes."""
 
     def __init__(self) -> None:
         self._readers: dict[str, RingReader] = {}
 
     def reader(self, stream: str, segment: str | None) -> RingReader | None:
-        """The reader of a stream that lies in a segment; ``None`` where there is none."""
+        """The reader of a stream in a segment; ``None`` when it is not available."""
         known = self._readers.get(stream)
         if known is not None and known.name == segment and not known.closed:
             return known
@@ -299,39 +282,39 @@ class ReaderCache:
         return self._readers[stream]
 
     def close(self) -> None:
-        """Let go of the rings."""
+        """Close all readers."""
         for reader in self._readers.values():
             reader.close()
         self._readers.clear()
 
 
-__all__ = ["SLOTS", "RingReader", "RingStats", "RingWriter"]
-
-#: Entries that a ring keeps.
+#: Default number of entries of a ring.
 SLOTS = 8
 
 
 class RingWriter:
-    """The writing end of a stream; for one thread of one process.
+    """Writer of a stream, for one thread of one process.
 
     Parameters
     ----------
     name
         See :func:`~escape_hw.streams.segments.segment_name`.
     capacity_bytes
-        Size of the largest array.
+        Size of the largest array, bytes.
     slots
-        Entries kept. A reader has the time of this many entries, less one, to copy the newest.
+        Number of entries. A reader must copy an entry before ``slots - 1`` further ones are written.
 
     Raises
     ------
     StorageError
-        The memory is not to be had.
+        Shared memory is not available.
     """
 
     def __init__(self, name: str, capacity_bytes: int, slots: int = SLOTS) -> None:
         if capacity_bytes < 1 or slots < 2:
-            raise ValueError(f"a ring of {slots} slots of {capacity_bytes} bytes is none")
+            raise ValueError(
+                f"{slots} slots of {capacity_bytes} bytes: a ring needs at least 2 slots of 1 byte"
+            )
         self.name, self.capacity, self.slots = name, capacity_bytes, slots
         self._stride = layout.slot_bytes(capacity_bytes)
         size = layout.HEADER_BYTES + slots * self._stride
@@ -351,23 +334,23 @@ class RingWriter:
     def write(
         self, data: NDArray[Any], index: int, exposed_ns: int = 0, arrived_ns: int = 0, meta: bytes = b""
     ) -> None:
-        """Publish an array; takes a copy and never waits.
+        """Write a copy of an array; never blocks.
 
         Parameters
         ----------
         data
-            At most four dimensions of booleans, integers or floats, at most the capacity.
+            Booleans, integers or floats, up to four dimensions and the capacity.
         index
-            Number of the entry, for its readers.
+            Index of the entry.
         exposed_ns, arrived_ns
-            When it was taken and when it is written, monotonic nanoseconds; 0: unknown, and now.
+            Times of exposure (0: unknown) and of writing (0: now), monotonic nanoseconds.
         meta
             JSON object of at most 256 bytes.
 
         Raises
         ------
         ValueError
-            The array or the meta does not fit the ring; nothing is written.
+            The array or the metadata does not fit; nothing is written.
         StreamGone
             The ring is closed.
         """
@@ -397,16 +380,16 @@ class RingWriter:
         self._last_ns = now
 
     def _view(self, slot: int, data: NDArray[Any]) -> NDArray[Any]:
-        """A slot's payload as an array like ``data``; made once while the shape stays."""
+        """The payload of a slot as an array like ``data``; cached while the shape stays."""
         view = self._views[slot]
         if view is not None and view.shape == data.shape and view.dtype == data.dtype:
             return view
         if not self._open:
-            raise StreamUnavailable(f"{self.name}: written to after it was closed")
+            raise StreamUnavailable(f"{self.name}: the ring is closed")
         if data.nbytes > self.capacity or data.ndim > layout.MAX_DIMENSIONS:
             raise ValueError(
                 f"{self.name}: an array {data.shape} of {data.dtype} does not fit; "
-                f"{self.capacity} bytes and {layout.MAX_DIMENSIONS} dimensions are the most"
+                f"at most {self.capacity} bytes and {layout.MAX_DIMENSIONS} dimensions"
             )
         if data.dtype not in self._codes:
             raise ValueError(f"{self.name}: arrays of {data.dtype} cannot be streamed")
@@ -415,9 +398,9 @@ class RingWriter:
         return view
 
     def close(self) -> None:
-        """Say goodbye to the readers and remove the segment; may be repeated.
+        """Mark the ring as closed and remove the segment; may be repeated.
 
-        A process that was forked off the writer's own does not remove it.
+        A forked child of the writer's process does not remove it.
         """
         if not self._open:
             return

@@ -1,4 +1,4 @@
-"""Camera whose frames another process writes into a ring."""
+"""Camera whose frames another process writes to a ring."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
 from escape_hw.errors import DeviceLost, FrameTimeout, SettingRejected
 from escape_hw.streams.ring import RingReader, Sample
 
-#: Looks between two of which the caller may see to the time: about ten microseconds.
+#: Polls per call of :func:`wait_for_change`, about ten microseconds.
 POLLS = 8000
 
 
 @intrinsic
 def _load_atomic(typing_context: Any, address: Any) -> Any:
-    """The word of 64 bits at an address, as it is now: a compiler would look once and believe it for ever."""
+    """Atomic load of a 64-bit word; a compiler would hoist an ordinary load out of the loop."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         word = ir.IntType(64)
@@ -32,7 +32,7 @@ def _load_atomic(typing_context: Any, address: Any) -> Any:
 
 @njit("b1(u8, u8, u8)", nogil=True)
 def wait_for_change(address, value, n_polls):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Whether the word at an address differs from a value, looking so many times at most."""
+    """Poll a word up to ``n_polls`` times; whether it differs from ``value``."""
     for _ in range(n_polls):
         if _load_atomic(address) != value:  # type: ignore[call-arg]
             return np.bool_(True)
@@ -40,22 +40,22 @@ def wait_for_change(address, value, n_polls):  # type: ignore[no-untyped-def]  #
 
 
 class RingCamera(Camera):
-    """Delivers the frames of a ring in their order.
+    """Delivers the frames of a ring in order.
 
-    A loop that was held up catches up with the frames that wait, so that telemetry has no gaps; when these
-    fill the ring, it goes on with the newest, and those in between count as lost.
+    A delayed loop catches up with the waiting frames, so that telemetry has no gaps. When they fill the ring,
+    it continues with the newest, and the frames in between count as lost.
 
     Parameters
     ----------
     name
         Its key in ``[devices]``.
     segment
-        The ring.
+        Name of the ring's segment.
     info, settings
-        What the writing process knows of the camera; the settings cannot be changed from here.
+        Properties of the camera of the writing process. The settings cannot be changed here.
     spin_s
-        So long before and after a frame is due it is looked for without sleeping, since to be woken takes
-        longer than to answer a frame. Costs twice that share of a processor; 0: always asleep.
+        Time before and after the expected arrival of a frame in which it is polled for without sleeping,
+        since waking up takes longer than processing a frame. 0: always sleep.
     """
 
     def __init__(
@@ -69,12 +69,12 @@ class RingCamera(Camera):
 
     @property
     def info(self) -> CameraInfo:
-        """See the base class."""
+        """Properties of the camera."""
         return self._info
 
     @property
     def settings(self) -> CameraSettings:
-        """See the base class."""
+        """The settings of the writing process."""
         return self._settings
 
     def _open(self) -> None:
@@ -87,18 +87,18 @@ class RingCamera(Camera):
 
     def _check(self, want: CameraSettings) -> CameraSettings:
         if want != self._settings:
-            raise SettingRejected(self.name, "its settings belong to the process that writes its frames")
+            raise SettingRejected(self.name, "the settings belong to the process that writes the frames")
         return want
 
     def _configure(self, settings: CameraSettings) -> None:
-        """Nothing to do: only the settings in force pass ``_check``."""
+        """Does nothing: ``_check`` accepts the present settings only."""
 
     def _start(self) -> None:
         self._ring.seek(self._ring.written)
         self._next_number = self._ring.position
 
     def _stop(self) -> None:
-        """Nothing to do: the frames are another process's."""
+        """Does nothing: the frames belong to another process."""
 
     def _next_frame(self, timeout_s: float) -> Frame:
         ring, until = self._ring, time.monotonic() + timeout_s
@@ -113,7 +113,7 @@ class RingCamera(Camera):
                 return Frame(sample.data, sample.index, sample.exposed_ns, sample.arrived_ns)
 
     def _wait_for_entry(self, ring: RingReader, timeout_s: float) -> bool:
-        """Wait for an entry: asleep, and awake around the time when it is due."""
+        """Wait for an entry: sleep, and poll around its expected arrival."""
         if self._spin_s <= 0:
             return ring.wait(self._next_number, timeout_s)
         due = self._last_arrival_s + 1 / self._settings.frame_rate_hz
@@ -126,7 +126,7 @@ class RingCamera(Camera):
         return ring.wait(self._next_number, max(timeout_s, 0.0))
 
     def _take_entry(self, ring: RingReader) -> Sample | None:
-        """The next entry, or the newest when too many wait."""
+        """The next entry, or the newest when the ring is nearly full."""
         if ring.written - self._next_number > ring.slots - 2:
             ring.seek(ring.written - 1)
         sample = ring.next()
@@ -138,5 +138,5 @@ class RingCamera(Camera):
     @property
     def _ring(self) -> RingReader:
         if self._reader is None:
-            raise DeviceLost(self.name, "its ring is closed")
+            raise DeviceLost(self.name, "the ring is closed")
         return self._reader

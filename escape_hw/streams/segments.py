@@ -1,9 +1,9 @@
-"""Segments of shared memory: their names, whose they are, and clearing up after the dead.
+"""Segments of shared memory: names, owners, and removal after their process has died.
 
-A segment is a file in ``/dev/shm``, mapped. It gets its name only when its header stands, so that
-nobody sees half of one, and a process that is killed before leaves nothing. Its name carries the
-user and the process that owns it; the header carries when that process began, since process
-numbers come round again.
+A segment is a mapped file in ``/dev/shm``. It is named only after its header is written, so that no
+process sees an incomplete one, and a process that is killed before leaves none. The name contains the
+user and the process of the owner; the header contains the start time of that process, since process
+numbers are reused.
 """
 
 from __future__ import annotations
@@ -18,35 +18,36 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from escape_hw.errors import EscapeError, StorageError
+from escape_hw.supervision import is_alive, process_start
 
-#: Where segments lie.
+#: Folder of the segments.
 SHARED = Path("/dev/shm")
 #: The first eight bytes of a segment.
 MAGIC = int.from_bytes(b"ESCRING\0", "little")
 #: Version of the layout; a segment of another version is refused.
 SCHEMA = 1
-#: Magic, schema, owner's process and its start: the same in every version of the layout.
+#: Magic, schema, owner's process and its start time; the same in every version of the layout.
 IDENTITY = struct.Struct("=QQQQ")
 
 _NAME = re.compile(r"escape-(?P<uid>\d+)-(?P<system>[A-Za-z0-9._-]+)-(?P<pid>\d+)-(?P<stream>[A-Za-z0-9_]+)")
 
 
 class StreamUnavailable(EscapeError):
-    """A stream's memory is not there (any more), or is not what it should be."""
+    """The memory of a stream does not exist, is closed, or is not valid."""
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A segment that was found.
+    """A segment of shared memory.
 
     Parameters
     ----------
     name
         ``escape-<uid>-<system>-<pid>-<stream>``, a file in :data:`SHARED`.
     pid, started
-        Its owner, and when that began in clock ticks after boot.
+        Process of the owner, and its start time in clock ticks after boot.
     alive
-        Whether that very process lives.
+        Whether that process is alive.
     """
 
     name: str
@@ -59,38 +60,27 @@ class Segment:
 
 
 def segment_name(system: str, stream: str, pid: int | None = None) -> str:
-    """Name of the segment of a stream; of this process by default."""
+    """Name of a stream's segment; by default owned by this process."""
     system = re.sub(r"[^A-Za-z0-9._-]", "_", system)
     return f"escape-{os.getuid()}-{system}-{os.getpid() if pid is None else pid}-{stream}"
 
 
-def process_start(pid: int) -> int | None:
-    """When a process began, in clock ticks after boot; ``None``: there is none (or only its remains)."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
-    except OSError:
-        return None
-    # The command's name stands in brackets and may hold anything.
-    fields = text[text.rindex(")") + 2 :].split()
-    return None if fields[0] in "ZX" else int(fields[19])
-
-
 def create(name: str, size: int, fill: struct.Struct, *header: int) -> mmap.mmap:
-    """Make a segment: its memory taken, its header written, and then its name.
+    """Create a segment: allocate its memory, write its header, then link its name.
 
     Parameters
     ----------
     name
-        Its name; one that a dead process left under it is removed.
+        Name; a segment of that name of a dead process is removed.
     size
-        Bytes; they are taken now, since writing to memory that is not there kills the process.
+        Bytes. They are allocated now, since writing to memory that is not available kills the process.
     fill, header
-        The layout's own part of the header, which follows :data:`IDENTITY`.
+        Format and values of the layout's part of the header, which follows :data:`IDENTITY`.
 
     Raises
     ------
     StorageError
-        No room in shared memory, or the name is taken by a living process.
+        Shared memory is full, or a living process owns a segment of that name.
     """
     path = SHARED / name
     try:
@@ -105,16 +95,16 @@ def create(name: str, size: int, fill: struct.Struct, *header: int) -> mmap.mmap
             os.close(handle)
     except OSError as error:
         raise StorageError(
-            f"{path}: {size / 1e6:.1f} MB of shared memory cannot be had ({error.strerror or error}); "
-            "see what lies there with 'escape streams', clear up after dead servers with 'escape streams "
-            "--reap', or make /dev/shm larger"
+            f"{path}: {size / 1e6:.1f} MB of shared memory are not available ({error.strerror or error}); "
+            "list the segments with 'escape streams', remove those of dead servers with 'escape streams "
+            "--reap', or enlarge /dev/shm"
         ) from error
     return memory
 
 
 def _link_name(handle: int, path: Path) -> None:
     source = f"/proc/self/fd/{handle}"
-    # With a folder given, which the whole path overrides, Python follows the link to the file itself.
+    # With src_dir_fd, which the absolute path overrides, Python follows the link to the file itself.
     try:
         os.link(source, path, src_dir_fd=handle)
     except FileExistsError:
@@ -131,19 +121,19 @@ def attach(name: str) -> mmap.mmap:
     Raises
     ------
     StreamGone
-        It is not there, another user's, of another version, or no segment at all.
+        It does not exist, belongs to another user, has another version, or is no segment.
     """
     path = SHARED / name
     if not _NAME.fullmatch(name):
         raise StreamUnavailable(
-            f"'{name}' is no name of a stream's memory; 'escape streams' lists those there are"
+            f"'{name}' is not the name of a segment; 'escape streams' lists the existing ones"
         )
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
             status = os.fstat(handle)
             if status.st_uid not in (os.getuid(), 0):
-                raise StreamUnavailable(f"{path} belongs to user {status.st_uid}; it is not read")
+                raise StreamUnavailable(f"{path} belongs to user {status.st_uid} and is not read")
             memory = mmap.mmap(handle, status.st_size, flags=mmap.MAP_SHARED, prot=mmap.PROT_READ)
         finally:
             os.close(handle)
@@ -153,22 +143,22 @@ def attach(name: str) -> mmap.mmap:
     if (magic, schema) != (MAGIC, SCHEMA):
         memory.close()
         raise StreamUnavailable(
-            f"{path} is of version {schema}, this program reads {SCHEMA}; "
+            f"{path} has version {schema}, this program reads version {SCHEMA}; "
             "use the same version of escape-hw as its server"
             if magic == MAGIC
-            else f"{path} is no stream of ESCAPE"
+            else f"{path} is not a stream of ESCAPE"
         )
     return memory
 
 
 def remove(name: str) -> None:
-    """Take a segment's name away; those who have it mapped keep what they see."""
+    """Remove the name of a segment; processes that have it mapped keep their mapping."""
     with contextlib.suppress(FileNotFoundError):
         (SHARED / name).unlink()
 
 
 def read_identity(name: str) -> Segment | None:
-    """What a segment says of itself; ``None`` when it is none, or has gone."""
+    """Name and owner of a segment; ``None`` when it does not exist or is not valid."""
     parts = _NAME.fullmatch(name)
     if parts is None:
         return None
@@ -180,7 +170,7 @@ def read_identity(name: str) -> Segment | None:
     if len(head) < IDENTITY.size or IDENTITY.unpack(head)[0] != MAGIC:
         return None
     _, _, pid, started = IDENTITY.unpack(head)
-    alive = process_start(pid) == started
+    alive = is_alive(pid, started)
     return Segment(name, parts["system"], parts["stream"], pid, started, size, alive)
 
 
@@ -189,7 +179,7 @@ def _no_link(path: str, flags: int) -> int:
 
 
 def segments(system: str | None = None, pid: int | None = None) -> tuple[Segment, ...]:
-    """The segments of this user, those of one system or one process where that is given."""
+    """Segments of this user; of one system or one process where given."""
     mine = sorted(path.name for path in SHARED.glob(f"escape-{os.getuid()}-*"))
     found = (read_identity(name) for name in mine)
     return tuple(
@@ -199,7 +189,7 @@ def segments(system: str | None = None, pid: int | None = None) -> tuple[Segment
 
 
 def remove_orphaned(pid: int | None = None) -> tuple[Segment, ...]:
-    """Remove the segments whose owner is dead, of one process or of all; says which."""
+    """Remove the segments of dead processes, of one process or of all; returns them."""
     dead = tuple(one for one in segments(pid=pid) if not one.alive)
     for one in dead:
         remove(one.name)
@@ -207,7 +197,7 @@ def remove_orphaned(pid: int | None = None) -> tuple[Segment, ...]:
 
 
 def readers(names: Iterable[str]) -> dict[str, tuple[int, ...]]:
-    """Processes of this user that have each segment mapped, its owner apart."""
+    """Processes of this user that have each segment mapped, without its owner."""
     users: dict[str, list[int]] = {name: [] for name in names}
     for pid in sorted(int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()):
         for name in _mapped_segments(pid) & users.keys():
@@ -223,7 +213,7 @@ def _mapped_segments(pid: int) -> set[str]:
     """Names of the segments that a process has mapped."""
     try:
         lines = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:  # it has ended, or is another user's
+    except OSError:  # the process has ended, or belongs to another user
         return set()
     prefix = f"{SHARED}/escape-"
     return {line[line.index(prefix) + len(str(SHARED)) + 1 :] for line in lines if prefix in line}

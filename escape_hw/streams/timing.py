@@ -1,4 +1,4 @@
-"""Histograms of durations in fixed memory, and latency and jitter of a loop."""
+"""Histograms of durations, and latency and jitter of a loop."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-#: Bins to each doubling: a bin is 1/16 to 1/32 of its value wide, so its middle is right within 3 %.
+#: Bins per octave: the width of a bin is 1/32 to 1/16 of its value, so its centre is accurate to 3 %.
 PER_OCTAVE = 16
 _MIN_BITS = 5
-#: Up to 2**40 ns, about 18 minutes; what is longer counts in the last bin.
+#: Up to 2**40 ns, about 18 minutes; longer durations count in the last bin.
 BINS = (40 - _MIN_BITS + 2) * PER_OCTAVE
 
 
 def bin_of(nanoseconds: int) -> int:
-    """Number of the bin of a duration; those below 16 ns have a bin each."""
+    """Index of the bin of a duration; below 16 ns each value has its own bin."""
     if nanoseconds < PER_OCTAVE:
         return max(nanoseconds, 0)
     bits = nanoseconds.bit_length()
@@ -33,19 +33,19 @@ def _middles() -> NDArray[np.float64]:
     return np.asarray(low + (np.exp2(shift) - 1) / 2)
 
 
-#: Middle of each bin in nanoseconds ``(BINS,)``.
+#: Centre of each bin in nanoseconds ``(BINS,)``.
 MIDDLES = _middles()
 
 
 def percentiles_of(counts: ArrayLike, shares: ArrayLike) -> NDArray[np.float64]:
-    """Percentiles in nanoseconds of what was counted, by the nearest rank; NaN when nothing was.
+    """Percentiles of a histogram in nanoseconds, by the nearest rank; NaN when it is empty.
 
     Parameters
     ----------
     counts
         Count by bin ``(BINS,)``.
     shares
-        Percentiles asked for, 0 to 100.
+        Percentiles, 0 to 100.
     """
     above = np.cumsum(np.asarray(counts, dtype=np.float64))
     wanted = np.asarray(shares, dtype=np.float64) / 100
@@ -55,12 +55,12 @@ def percentiles_of(counts: ArrayLike, shares: ArrayLike) -> NDArray[np.float64]:
 
 
 class Histogram:
-    """Durations counted in bins.
+    """Histogram of durations with logarithmic bins.
 
     Parameters
     ----------
     counts
-        Where to count, :data:`BINS` integers of 64 bits; memory of its own by default.
+        Storage, :data:`BINS` 64-bit integers; allocated by default.
     """
 
     def __init__(self, counts: MutableSequence[int] | None = None) -> None:
@@ -76,11 +76,11 @@ class Histogram:
             self.largest = nanoseconds
 
     def percentiles(self, *shares: float) -> tuple[float, ...]:
-        """Percentiles in microseconds; NaN while nothing was counted."""
+        """Percentiles in microseconds; NaN when empty."""
         return tuple((percentiles_of(np.array(self.counts), shares) / 1e3).tolist())
 
     def deviation_percentile(self, share: float) -> float:
-        """Percentile of how far durations depart from their median, in microseconds; NaN: nothing counted."""
+        """Percentile of the absolute deviation from the median, in microseconds; NaN when empty."""
         counts = np.array(self.counts, np.float64)
         if not counts.any():
             return math.nan
@@ -90,7 +90,7 @@ class Histogram:
         return float(off[order][np.searchsorted(above, share / 100 * above[-1])]) / 1e3
 
 
-#: Frames whose times are kept exactly; a second of them up to this rate.
+#: Frames whose times are stored exactly: one second of them up to this rate.
 _RECENT = 4096
 
 
@@ -101,9 +101,9 @@ class TimingSummary:
     Parameters
     ----------
     p50, p99, largest
-        From a frame in hand to its command sent.
+        Time from frame received to command sent.
     jitter_p99
-        99th percentile of how far the spacing of frames departs from its median.
+        99th percentile of the deviation of the frame interval from its median.
     """
 
     p50: float = math.nan
@@ -113,7 +113,7 @@ class TimingSummary:
 
 
 class LoopTiming:
-    """Latencies of a loop and the spacing of its frames."""
+    """Latencies and frame intervals of a loop."""
 
     def __init__(self) -> None:
         self.latency, self.spacing = Histogram(), Histogram()
@@ -121,7 +121,7 @@ class LoopTiming:
         self._count = self._last = 0
 
     def add(self, began_ns: int, ended_ns: int) -> None:
-        """Book a frame that was in hand at one time and answered at the other, on one monotonic clock."""
+        """Add a frame: time received and time answered, monotonic nanoseconds."""
         took, at = ended_ns - began_ns, self._count % _RECENT
         self._began[at], self._took[at] = began_ns, took
         self.latency.add(took)
@@ -131,7 +131,7 @@ class LoopTiming:
         self._count += 1
 
     def recent(self, seconds: float = 1.0) -> TimingSummary:
-        """Of the frames of the last second, exactly."""
+        """Summary of the last second, exact."""
         kept = min(self._count, _RECENT)
         order = np.arange(self._count - kept, self._count) % _RECENT
         began, took = np.array(self._began)[order], np.array(self._took)[order]
@@ -144,10 +144,10 @@ class LoopTiming:
         return TimingSummary(p50, p99, largest, float(np.percentile(off, 99)) / 1e3)
 
     def since_start(self) -> TimingSummary:
-        """Of all frames, the percentiles to about 3 %; what departs less than that counts as no jitter."""
+        """Summary of all frames; percentiles to about 3 %, smaller jitter counts as none."""
         p50, p99 = self.latency.percentiles(50, 99)
         return TimingSummary(p50, p99, self.latency.largest / 1e3, self.spacing.deviation_percentile(99))
 
     def histograms(self) -> NDArray[np.float32]:
-        """Counts since the start: latency, and spacing of frames ``(2, BINS)``."""
+        """Counts since the start ``(2, BINS)``: latency and frame interval."""
         return np.array([self.latency.counts, self.spacing.counts], np.float32)

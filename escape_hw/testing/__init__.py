@@ -1,4 +1,7 @@
-"""Contract suite for devices: checks that every driver and twin must pass, usable with or without pytest. Tests of this package are in tests/."""
+"""Contract suite: checks that every driver and twin must pass, usable with or without pytest.
+
+Checks of one kind of device are in one module each. Tests of ESCAPE itself are in ``tests/``.
+"""
 
 from escape_hw.testing.adaptive_secondary import secondary_checks
 from escape_hw.testing.camera import camera_checks

@@ -19,19 +19,20 @@ from escape_hw.testing.checks import (
     Factory,
     assert_refused,
     check,
+    checks_in,
     checks_up_to,
     open_device,
 )
 from escape_hw.testing.device import COMMON_CHECKS
 
-#: A call with a time-out far below this must be back within it, in wall-clock seconds.
+#: Longest duration of a call with a much shorter time-out, wall-clock seconds.
 _MAX_CALL_S = 10.0
-#: Calls that drain whatever a driver has buffered.
+#: Number of calls that exhaust the buffer of any driver.
 _CALLS = 200
 
 
 def generous_timeout_s(camera: Camera) -> float:
-    """Give a time-out that a healthy camera never needs."""
+    """A time-out that a working camera never reaches."""
     now = camera.settings
     return 2.0 + 20 * (now.exposure_s + 1 / now.frame_rate_hz)
 
@@ -42,7 +43,7 @@ def _frames(camera: Camera, n: int) -> list[Frame]:
 
 @check(READS)
 def check_camera_frames_are_well_formed(factory: Factory) -> None:
-    """Frames are read-only uint16 of the region's shape, within the bit depth, and timed."""
+    """Frames are read-only uint16 of the shape of the region, within the bit depth."""
     with open_device(factory) as camera:
         region, top = camera.settings.region, camera.info.full_scale
         for frame in _frames(camera, 3):
@@ -50,13 +51,13 @@ def check_camera_frames_are_well_formed(factory: Factory) -> None:
             assert isinstance(data, np.ndarray), f"data is {type(data).__name__}, not an array"
             assert data.dtype == np.uint16, f"data has type {data.dtype}, not uint16"
             assert data.shape == (region.height, region.width), (
-                f"data has shape {data.shape}; the region is {region.height} rows of {region.width}"
+                f"data has shape {data.shape}; the region has {region.height} rows of {region.width}"
             )
-            assert not data.flags.writeable, "data can be written to; several readers share it"
-            assert int(data.max()) <= top, f"a pixel has {data.max()} counts; the scale ends at {top}"
+            assert not data.flags.writeable, "data is writable; several readers share it"
+            assert int(data.max()) <= top, f"a pixel has {data.max()} counts; full scale is {top}"
             saturated = int(np.count_nonzero(data == top))
             assert frame.n_saturated == saturated, (
-                f"n_saturated is {frame.n_saturated}, but {saturated} pixels are at the top of the scale"
+                f"n_saturated is {frame.n_saturated}, but {saturated} pixels are at full scale"
             )
 
 
@@ -68,34 +69,34 @@ def check_camera_frames_are_not_overwritten(factory: Factory) -> None:
         before = first.data.copy()
         for later in _frames(camera, 8):
             assert not np.shares_memory(first.data, later.data), "two frames share one buffer"
-        assert np.array_equal(first.data, before), "a frame changed after later ones had come"
+        assert np.array_equal(first.data, before), "later frames changed an earlier one"
 
 
 @check(READS)
 def check_camera_index_and_time_rise(factory: Factory) -> None:
-    """Index and times rise from frame to frame; a frame arrives after it was exposed."""
+    """Index and times increase from frame to frame; a frame arrives after its exposure."""
     with open_device(factory) as camera:
         frames = _frames(camera, 10)
         now = camera.now_ns()
         for one, next_one in pairwise(frames):
             assert next_one.index > one.index, f"the index went from {one.index} to {next_one.index}"
-            assert next_one.exposed_ns > one.exposed_ns, "exposed_ns did not rise"
-            assert next_one.arrived_ns >= one.arrived_ns, "arrived_ns fell"
+            assert next_one.exposed_ns > one.exposed_ns, "exposed_ns did not increase"
+            assert next_one.arrived_ns >= one.arrived_ns, "arrived_ns decreased"
         for frame in frames:
             assert isinstance(frame.index, int), f"index is {type(frame.index).__name__}, not int"
             assert frame.exposed_ns <= frame.arrived_ns, "a frame arrived before its exposure had ended"
-            assert frame.arrived_ns <= now, "a frame is said to arrive in the future of the camera's clock"
+            assert frame.arrived_ns <= now, "arrived_ns is in the future of the camera clock"
 
 
 @check(READS)
 def check_camera_rate_is_as_stated(factory: Factory) -> None:
-    """Frames come at ``settings.frame_rate_hz``, by their own times (10 % tolerance)."""
+    """The rate from ``exposed_ns`` is ``settings.frame_rate_hz`` within 10 %."""
     with open_device(factory) as camera:
         frames = _frames(camera, 20)
         periods = [(b.exposed_ns - a.exposed_ns) / (b.index - a.index) for a, b in pairwise(frames)]
         rate, stated = 1e9 / statistics.median(periods), camera.settings.frame_rate_hz
         assert abs(rate / stated - 1) < 0.1, (
-            f"settings says {stated:.6g} Hz, the frames come at {rate:.6g} Hz"
+            f"settings has {stated:.6g} Hz, the frames arrive at {rate:.6g} Hz"
         )
 
 
@@ -114,7 +115,7 @@ def check_camera_counts_add_up(factory: Factory) -> None:
 
 @check(READS)
 def check_camera_refuses_timeouts(factory: Factory) -> None:
-    """A time-out that is zero, negative, not a number or endless is refused."""
+    """A time-out that is not positive and finite is rejected."""
     with open_device(factory) as camera:
         for timeout_s in (0.0, -1.0, math.nan, math.inf):
             what = f"next_frame(timeout_s={timeout_s})"
@@ -123,7 +124,7 @@ def check_camera_refuses_timeouts(factory: Factory) -> None:
 
 @check(NORMAL)
 def check_camera_raises_timeout(factory: Factory) -> None:
-    """With no frame in time ``next_frame`` raises ``FrameTimeout``, counts it, and goes on after it."""
+    """``next_frame`` raises and counts ``FrameTimeout``, and works afterwards."""
     with open_device(factory) as camera:
         original = camera.settings
         try:
@@ -135,7 +136,7 @@ def check_camera_raises_timeout(factory: Factory) -> None:
 
 @check(READS)
 def check_camera_polls_without_waiting(factory: Factory) -> None:
-    """``poll`` gives what is there or ``None``, takes no time, and counts no time-out."""
+    """``poll`` returns a frame or ``None`` without waiting, and counts no time-out."""
     with open_device(factory) as camera:
         camera.next_frame(generous_timeout_s(camera))
         delivered, taken_ns = 1, []
@@ -143,10 +144,10 @@ def check_camera_polls_without_waiting(factory: Factory) -> None:
             began = camera.now_ns()
             frame = camera.poll()
             taken_ns.append(camera.now_ns() - began)
-            assert frame is None or isinstance(frame, Frame), f"poll() gave {type(frame).__name__}"
+            assert frame is None or isinstance(frame, Frame), f"poll() returned {type(frame).__name__}"
             delivered += frame is not None
         status = camera.status()
-        assert status.timeouts == 0, f"{status}: an empty poll() is no time-out"
+        assert status.timeouts == 0, f"{status}: poll() must not count a time-out"
         assert status.delivered == delivered, f"{status}, but {delivered} frames were delivered"
         usual_s, period_s = statistics.median(taken_ns) * 1e-9, 1 / camera.settings.frame_rate_hz
         assert usual_s < 0.5 * period_s, f"poll() took {usual_s:.3g} s; it must not wait for a frame"
@@ -156,7 +157,7 @@ def _slow_down(camera: Camera) -> None:
     try:
         camera.configure(replace(camera.settings, frame_rate_hz=min(20.0, camera.settings.frame_rate_hz)))
     except SettingRejected:
-        # It cannot go so slowly; then its own rate has to do.
+        # Keep the rate of a camera that cannot run so slowly.
         return
 
 
@@ -173,7 +174,7 @@ def _assert_times_out(camera: Camera) -> None:
             timeouts += 1
             assert camera.name in str(timeout), f"the time-out does not name the camera: {timeout}"
         except Exception as other:
-            raise AssertionError(f"FrameTimeout was due, {type(other).__name__} came: {other}") from other
+            raise AssertionError(f"expected FrameTimeout, got {type(other).__name__}: {other}") from other
         took = time.monotonic() - began
         assert took < _MAX_CALL_S, f"next_frame({short_timeout_s:.3g} s) took {took:.1f} s"
         if timeouts >= 3:
@@ -187,26 +188,14 @@ def _assert_times_out(camera: Camera) -> None:
     assert after > last, f"after a time-out the index went from {last} to {after}"
 
 
-FRAME_CHECKS: tuple[Check, ...] = (
-    check_camera_frames_are_well_formed,
-    check_camera_frames_are_not_overwritten,
-    check_camera_index_and_time_rise,
-    check_camera_rate_is_as_stated,
-    check_camera_counts_add_up,
-    check_camera_refuses_timeouts,
-    check_camera_raises_timeout,
-    check_camera_polls_without_waiting,
-)
-
-
 @check(READS)
 def check_camera_info_is_complete(factory: Factory) -> None:
-    """Identity and fixed properties are there and make sense."""
+    """Identity and fixed properties are complete and valid."""
     with open_device(factory) as camera:
         info = camera.info
         assert isinstance(info, CameraInfo), f"info is {type(info).__name__}, not CameraInfo"
         assert info.model, "info.model is empty"
-        assert info.serial, "info.serial is empty; products could not say which camera they are from"
+        assert info.serial, "info.serial is empty; products need it"
         assert isinstance(info.simulated, bool), f"info.simulated is {info.simulated!r}, not a bool"
         assert 1 <= info.bit_depth <= 16, f"info.bit_depth is {info.bit_depth}; frames are uint16"
         assert len(info.sensor_shape) == 2, f"info.sensor_shape is {info.sensor_shape}, not (rows, columns)"
@@ -215,17 +204,17 @@ def check_camera_info_is_complete(factory: Factory) -> None:
 
 @check(READS)
 def check_camera_settings_are_achievable(factory: Factory) -> None:
-    """The settings in force are settings that ``check`` answers with itself."""
+    """``check`` returns the present settings unchanged."""
     with open_device(factory) as camera:
         settings = camera.settings
         assert isinstance(settings, CameraSettings), f"settings is {type(settings).__name__}"
         answer = camera.check(settings)
-        assert answer == settings, f"settings in force are {settings}, but check() makes {answer} of them"
+        assert answer == settings, f"the settings are {settings}, but check() returns {answer}"
 
 
 @check(READS)
 def check_camera_check_is_a_fixed_point(factory: Factory) -> None:
-    """What ``check`` answers with is achievable: checked again, it stays."""
+    """The result of ``check`` is achievable: a second ``check`` returns it unchanged."""
     with open_device(factory) as camera:
         for want in _trial_settings(camera):
             answer = camera.check(want)
@@ -235,7 +224,7 @@ def check_camera_check_is_a_fixed_point(factory: Factory) -> None:
 
 @check(READS)
 def check_camera_check_changes_nothing(factory: Factory) -> None:
-    """``check`` changes no setting and does not disturb acquisition."""
+    """``check`` changes neither settings nor acquisition."""
     with open_device(factory) as camera:
         for running in (False, True):
             if running:
@@ -249,7 +238,7 @@ def check_camera_check_changes_nothing(factory: Factory) -> None:
 
 @check(READS)
 def check_camera_refuses_regions_off_the_sensor(factory: Factory) -> None:
-    """A region that does not lie on the sensor is refused, by ``check`` and by ``configure``."""
+    """``check`` and ``configure`` reject a region outside the sensor."""
     with open_device(factory) as camera:
         before = camera.settings
         rows, columns = camera.info.sensor_shape
@@ -269,7 +258,7 @@ def check_camera_refuses_regions_off_the_sensor(factory: Factory) -> None:
 
 @check(READS)
 def check_camera_refuses_meaningless_settings(factory: Factory) -> None:
-    """Exposure, rate and gain that mean nothing are refused."""
+    """Exposure, rate and gain that are not valid numbers are rejected."""
     with open_device(factory) as camera:
         before = camera.settings
         for name in ("exposure_s", "frame_rate_hz"):
@@ -286,33 +275,33 @@ def _assert_settings_unchanged(
 ) -> None:
     for verb in (camera.check, camera.configure):
         assert_refused(camera, SettingRejected, f"{verb.__name__}() with {what}", verb, want)
-        assert camera.settings == before, f"{what}: refused, but the settings changed"
+        assert camera.settings == before, f"{what}: rejected, but the settings changed"
 
 
 @check(NORMAL)
 def check_camera_configure_reports_actual_settings(factory: Factory) -> None:
-    """``configure`` answers with what is in force: ``settings`` and the frames bear it out."""
+    """The result of ``configure`` agrees with ``settings`` and with the frames."""
     with open_device(factory) as camera:
         original = camera.settings
         try:
             for want in _trial_settings(camera):
                 answer = camera.configure(want)
                 now = camera.settings
-                assert answer == now, f"configure() answered {answer}, but settings says {now}"
-                foreseen = camera.check(want)
-                assert answer.region == foreseen.region, (
-                    f"check() foresaw {foreseen.region}, configure() made {answer.region}"
+                assert answer == now, f"configure() returned {answer}, but settings is {now}"
+                checked = camera.check(want)
+                assert answer.region == checked.region, (
+                    f"check() returned {checked.region}, configure() {answer.region}"
                 )
                 shape = camera.next_frame(generous_timeout_s(camera)).data.shape
                 stated = (now.region.height, now.region.width)
-                assert shape == stated, f"settings says {stated}, but frames come as {shape}"
+                assert shape == stated, f"settings has {stated}, but frames have shape {shape}"
         finally:
             camera.configure(original)
 
 
 @check(NORMAL)
 def check_camera_configures_while_running(factory: Factory) -> None:
-    """Acquisition goes on after ``configure`` if it ran before, and stays off if it did not."""
+    """``configure`` preserves whether the camera acquires."""
     with open_device(factory) as camera:
         original = camera.settings
         try:
@@ -321,7 +310,7 @@ def check_camera_configures_while_running(factory: Factory) -> None:
             camera.start()
             camera.next_frame(generous_timeout_s(camera))
             camera.configure(original)
-            assert camera.is_running, "acquisition did not go on after configure()"
+            assert camera.is_running, "acquisition stopped after configure()"
             camera.next_frame(generous_timeout_s(camera))
         finally:
             camera.configure(original)
@@ -329,7 +318,7 @@ def check_camera_configures_while_running(factory: Factory) -> None:
 
 @check(READS)
 def check_camera_start_and_stop_repeat(factory: Factory) -> None:
-    """``start`` and ``stop`` may be called any number of times; the first frame starts too."""
+    """``start`` and ``stop`` may be repeated; ``next_frame`` starts acquisition."""
     with open_device(factory) as camera:
         camera.stop()
         assert not camera.is_running, "running before start()"
@@ -347,7 +336,7 @@ def check_camera_start_and_stop_repeat(factory: Factory) -> None:
 
 @check(READS)
 def check_camera_restart_resets_counters(factory: Factory) -> None:
-    """The counters count from ``start``; ``start`` of a running camera resets nothing."""
+    """``start`` resets the counters unless the camera is running."""
     with open_device(factory) as camera:
         for _ in range(3):
             camera.next_frame(generous_timeout_s(camera))
@@ -361,7 +350,7 @@ def check_camera_restart_resets_counters(factory: Factory) -> None:
 
 @check(READS)
 def check_camera_closes_while_running(factory: Factory) -> None:
-    """``close`` stops acquisition first, and the camera can be opened and used again."""
+    """``close`` stops acquisition, and the camera can be used again."""
     with open_device(factory) as camera:
         camera.next_frame(generous_timeout_s(camera))
         camera.close()
@@ -380,35 +369,15 @@ def _half_region(camera: Camera) -> CameraSettings:
 
 
 def _trial_settings(camera: Camera) -> list[CameraSettings]:
-    """Settings that any camera can come near to, none of them likely to be exactly achievable."""
+    """Valid settings, most of which are not exactly achievable."""
     now = camera.settings
     longer = replace(now, exposure_s=now.exposure_s * 1.0137, frame_rate_hz=now.frame_rate_hz * 0.7731)
     return [now, _half_region(camera), longer]
 
 
-CAMERA_CHECKS: tuple[Check, ...] = (
-    *COMMON_CHECKS,
-    check_camera_info_is_complete,
-    check_camera_settings_are_achievable,
-    check_camera_check_is_a_fixed_point,
-    check_camera_check_changes_nothing,
-    check_camera_refuses_regions_off_the_sensor,
-    check_camera_refuses_meaningless_settings,
-    check_camera_configure_reports_actual_settings,
-    check_camera_configures_while_running,
-    check_camera_start_and_stop_repeat,
-    check_camera_restart_resets_counters,
-    check_camera_closes_while_running,
-    *FRAME_CHECKS,
-)
+CAMERA_CHECKS = (*COMMON_CHECKS, *checks_in(globals()))
 
 
 def camera_checks(max_level: int = 3) -> list[Check]:
-    """Checks for a :class:`~escape_hw.api.camera.Camera`.
-
-    Parameters
-    ----------
-    max_level
-        Leave out what changes more: 0 takes frames as it is set, 2 changes settings and back.
-    """
+    """Checks for a camera up to a level: 0 takes frames, 2 changes settings and restores them."""
     return checks_up_to(CAMERA_CHECKS, max_level)

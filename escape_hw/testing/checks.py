@@ -1,33 +1,33 @@
-"""What a contract check is, and the few tools that checks are written with."""
+"""Type of a contract check, and helper functions for checks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar, cast
 
 from escape_hw.api.device import Device
 from escape_hw.errors import DeviceError
 
-#: Makes a fresh device that is not open.
+#: Creates a new device that is not open.
 Factory = Callable[[], Any]
 E = TypeVar("E", bound=DeviceError)
 
-#: Opens, reads and closes; what every device does on opening and closing still happens.
+#: Opens, reads and closes; moves only what opening and closing move.
 READS = 0
-#: Moves by a percent of the range at most.
+#: Moves by at most a percent of the range.
 TINY = 1
-#: Moves within what normal operation uses.
+#: Moves within the range of normal operation.
 NORMAL = 2
-#: Uses the full range that the limits allow.
+#: Uses the full range within the limits.
 FULL = 3
 
 
 class Check(Protocol):
-    """A contract check: takes a factory, raises ``AssertionError`` when the contract is broken.
+    """A contract check: called with a factory, it raises ``AssertionError`` on a violation.
 
-    ``level`` says how much it moves or changes: 0 nothing, 1 tiny, 2 normal, 3 full range. It
-    raises ``unittest.SkipTest`` when the device has nothing to check.
+    ``level`` is the largest change it makes: 0 nothing, 1 tiny, 2 normal, 3 full range. It raises
+    ``unittest.SkipTest`` if it does not apply to the device.
     """
 
     __name__: str
@@ -35,11 +35,11 @@ class Check(Protocol):
     level: int
 
     def __call__(self, factory: Factory) -> None:
-        """Run the check on devices made by ``factory``."""
+        """Run the check on devices from ``factory``."""
 
 
 def check(level: int) -> Callable[[Callable[[Factory], None]], Check]:
-    """Make a function a check of the given level."""
+    """Decorate a function as a check of the given level."""
 
     def decorate(function: Callable[[Factory], None]) -> Check:
         decorated = cast(Check, function)
@@ -49,18 +49,24 @@ def check(level: int) -> Callable[[Callable[[Factory], None]], Check]:
     return decorate
 
 
+def checks_in(namespace: Mapping[str, object]) -> tuple[Check, ...]:
+    """The checks defined in a module so far, in order; ``namespace`` is its ``globals()``."""
+    return tuple(
+        cast(Check, one)
+        for name, one in namespace.items()
+        if name.startswith("check_") and getattr(one, "__module__", "") == namespace["__name__"]
+    )
+
+
 def checks_up_to(checks: tuple[Check, ...], max_level: int) -> list[Check]:
-    """Those of ``checks`` that change no more than ``max_level`` allows."""
+    """The checks up to a level."""
     return [one for one in checks if one.level <= max_level]
 
 
 def assert_refused(device: Device, error: type[E], why: str, call: Callable[..., object], *args: object) -> E:
-    """Require that ``call(*args)`` raises ``error`` and that the message names the device.
+    """Require that ``call(*args)`` raises ``error`` with the name of the device; returns the error.
 
-    Parameters
-    ----------
-    why
-        What was tried, for the message of a failure: "a command that holds NaN".
+    ``why`` describes the call for the message of a failure, for example "a command with NaN".
     """
     try:
         answer = call(*args)
@@ -70,14 +76,14 @@ def assert_refused(device: Device, error: type[E], why: str, call: Callable[...,
         return refusal
     except Exception as other:
         raise AssertionError(
-            f"{why}: {error.__name__} was due, {type(other).__name__} came: {other}"
+            f"{why}: expected {error.__name__}, got {type(other).__name__}: {other}"
         ) from other
-    raise AssertionError(f"{why}: {error.__name__} was due, but it was let through and gave {answer!r}")
+    raise AssertionError(f"{why}: expected {error.__name__}, but it was accepted and returned {answer!r}")
 
 
 @contextmanager
 def replace_hook(device: Device, hook: str, replacement: Callable[..., Any]) -> Iterator[None]:
-    """Put ``replacement`` in place of one of the driver's hooks, on this one device only."""
+    """Replace one hook of the driver, on this device only."""
     setattr(device, hook, replacement)
     try:
         yield
@@ -87,16 +93,15 @@ def replace_hook(device: Device, hook: str, replacement: Callable[..., Any]) -> 
 
 @contextmanager
 def open_device(factory: Factory) -> Iterator[Any]:
-    """Give a fresh device, open; close it afterwards without hiding a failure of the check."""
+    """Open a new device and close it afterwards; a failure of the check takes precedence."""
     device = factory()
     device.open()
     try:
         yield device
     except BaseException as failure:
-        # The check's own failure is the news; that the device did not close either stands beside it.
         try:
             device.close()
         except DeviceError as second:
-            failure.add_note(f"and then it did not close: {type(second).__name__}: {second}")
+            failure.add_note(f"then the device did not close: {type(second).__name__}: {second}")
         raise
     device.close()

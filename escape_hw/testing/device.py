@@ -1,4 +1,4 @@
-"""What every device promises, whatever its kind."""
+"""Contract checks of every device."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from escape_hw.api.mirror import DeformableMirror
 from escape_hw.api.modulator import Modulation, TipTiltModulator
 from escape_hw.api.phase_screen import PhaseScreen
 from escape_hw.errors import NotOpen
-from escape_hw.testing.checks import READS, Check, Factory, assert_refused, check, open_device
+from escape_hw.testing.checks import READS, Factory, assert_refused, check, checks_in, open_device
 
 
 @check(READS)
 def check_construction_does_not_connect(factory: Factory) -> None:
-    """Making a device connects to nothing, and forgetting it does nothing."""
+    """Construction does not connect, and garbage collection does nothing."""
     device = factory()
-    assert isinstance(device, Device), f"the factory made {type(device).__name__}, not a Device"
+    assert isinstance(device, Device), f"the factory returned {type(device).__name__}, not a Device"
     assert not device.is_open, f"{device.name}: open before open() was called"
     assert isinstance(device.name, str), f"the name is {device.name!r}; it must be text"
-    assert device.name.strip(), "the name is empty; messages could not say which device they mean"
-    assert factory() is not device, "the factory gave the same device twice; each check needs a fresh one"
-    guilty = [kind.__name__ for kind in type(device).__mro__ if "__del__" in vars(kind)]
-    assert not guilty, f"{device.name}: {guilty} define __del__; nothing may happen on garbage collection"
+    assert device.name.strip(), "the name is empty; messages need it"
+    assert factory() is not device, "the factory returned the same device twice; each check needs a new one"
+    classes = [kind.__name__ for kind in type(device).__mro__ if "__del__" in vars(kind)]
+    assert not classes, f"{device.name}: {classes} define __del__; nothing may happen on garbage collection"
 
 
 @check(READS)
 def check_final_methods_are_not_overridden(factory: Factory) -> None:
-    """No driver goes round the checks in the public methods."""
+    """The driver does not override the final public methods."""
     device = factory()
     own = type(device)
     for base in own.__mro__:
@@ -38,13 +38,13 @@ def check_final_methods_are_not_overridden(factory: Factory) -> None:
             if getattr(method, "__final__", False):
                 assert getattr(own, name) is method, (
                     f"{own.__name__} overrides {base.__name__}.{name}, which is final; "
-                    f"fill in the hook _{name} instead"
+                    f"implement the hook _{name} instead"
                 )
 
 
 @check(READS)
 def check_open_and_close_repeat(factory: Factory) -> None:
-    """``open`` and ``close`` may be called any number of times, in turns too."""
+    """``open`` and ``close`` may be repeated and alternated."""
     device = factory()
     device.close()
     assert not device.is_open, "open after close() of a device that was never opened"
@@ -62,10 +62,10 @@ def check_open_and_close_repeat(factory: Factory) -> None:
 
 @check(READS)
 def check_context_manager(factory: Factory) -> None:
-    """``with`` opens, closes, and lets errors of its body pass."""
+    """``with`` opens and closes, and does not suppress exceptions."""
     device = factory()
     with device as entered:
-        assert entered is device, "'with' must give the device itself"
+        assert entered is device, "'with' must return the device itself"
         assert device.is_open, "not open inside 'with'"
     assert not device.is_open, "still open after 'with'"
     mistake = ZeroDivisionError("inside 'with'")
@@ -73,15 +73,15 @@ def check_context_manager(factory: Factory) -> None:
         with device:
             raise mistake
     except ZeroDivisionError as caught:
-        assert caught is mistake, "another error came out of 'with' than was raised in it"
+        assert caught is mistake, "'with' replaced the exception of its body"
     else:
-        raise AssertionError("'with' swallowed an error of its body")
-    assert not device.is_open, "still open after an error inside 'with'"
+        raise AssertionError("'with' suppressed an exception of its body")
+    assert not device.is_open, "still open after an exception inside 'with'"
 
 
 @check(READS)
 def check_refuses_use_unless_open(factory: Factory) -> None:
-    """Everything that needs the device says so, before ``open`` and after ``close``."""
+    """Calls that need an open device raise ``NotOpen`` before ``open`` and after ``close``."""
     device = factory()
     for when in ("before open()", "after close()"):
         for what, call in _calls_needing_open(device).items():
@@ -92,15 +92,14 @@ def check_refuses_use_unless_open(factory: Factory) -> None:
 
 @check(READS)
 def check_clock_is_monotonic(factory: Factory) -> None:
-    """``now_ns`` counts whole nanoseconds and never falls."""
+    """``now_ns`` is an integer and does not decrease."""
     with open_device(factory) as device:
         times = [device.now_ns() for _ in range(100)]
-        assert all(type(t) is int for t in times), f"now_ns gave {type(times[0]).__name__}, not int"
-        assert times == sorted(times), "the clock ran backwards"
+        assert all(type(t) is int for t in times), f"now_ns returned {type(times[0]).__name__}, not int"
+        assert times == sorted(times), "now_ns decreased between two calls"
 
 
 def _calls_needing_open(device: Any) -> dict[str, Callable[[], object]]:
-    """Calls that need an open device of this kind."""
     if isinstance(device, DeformableMirror):
         uses: dict[str, Callable[[], object]] = {
             "send": lambda: device.send([0.0]),
@@ -130,16 +129,9 @@ def _secondary_calls_needing_open(device: Any) -> dict[str, Callable[[], object]
         "state": lambda: device.state,
         "health": lambda: device.health,
         "measured_positions": device.measured_positions,
-        "go": lambda: device.go_to(ShellState.RESTED),
+        "go_to": lambda: device.go_to(ShellState.RESTED),
         "recover": device.recover,
     }
 
 
-COMMON_CHECKS: tuple[Check, ...] = (
-    check_construction_does_not_connect,
-    check_final_methods_are_not_overridden,
-    check_open_and_close_repeat,
-    check_context_manager,
-    check_refuses_use_unless_open,
-    check_clock_is_monotonic,
-)
+COMMON_CHECKS = checks_in(globals())

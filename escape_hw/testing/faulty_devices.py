@@ -1,4 +1,4 @@
-"""Devices that fail on demand, around any mirror or camera."""
+"""Wrappers of mirrors and cameras that inject faults."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout
 
 
 class FaultyMirror(DeformableMirror):
-    """A mirror around another one that records what reaches it and fails on demand.
+    """A wrapper of a mirror that records transfers and injects faults.
 
-    Without faults it keeps the mirror's contract.
+    Without faults it satisfies the contract of a mirror.
 
     Parameters
     ----------
     inner
-        The mirror to pass commands on to; its name and limits are taken over.
+        The wrapped mirror; name and limits are taken from it.
     fail_sends
-        Transfers that fail once with :class:`~escape_hw.errors.DeviceError`, counted from 0 over
-        the life of this object, the ramps of ``flatten`` included.
+        Numbers of the transfers that fail with :class:`~escape_hw.errors.DeviceError`, counted from 0 over
+        the life of this object and including the ramps of ``flatten``.
     lost_from
-        The transfer from which on all fail with :class:`~escape_hw.errors.DeviceLost`. The inner
-        mirror is then disconnected by ``close`` too, but what it does is not seen.
+        Number of the transfer from which all fail with :class:`~escape_hw.errors.DeviceLost`.
 
     Attributes
     ----------
@@ -76,34 +75,34 @@ class FaultyMirror(DeformableMirror):
         number = self.transfers
         self.transfers += 1
         if self.lost_from is not None and number >= self.lost_from:
-            raise DeviceLost(self.name, f"lost at transfer {number}, as arranged")
+            raise DeviceLost(self.name, f"lost at transfer {number} (injected)")
         if number in self.fail_sends:
-            raise DeviceError(self.name, f"transfer {number} failed, as arranged")
+            raise DeviceError(self.name, f"transfer {number} failed (injected)")
         report = self.inner.send(command)
         self.reached.append(report.sent.copy())
         return report.sent if report.skipped else None
 
 
 class FaultyCamera(Camera):
-    """A camera around another one that loses, repeats and withholds frames on demand.
+    """A wrapper of a camera that drops, repeats and withholds frames.
 
-    Without faults it keeps the camera's contract. Faults go by the inner camera's frame index.
+    Without faults it satisfies the contract of a camera. Faults refer to frame indices of the inner camera.
 
     Parameters
     ----------
     inner
-        The camera to take frames from; its name is taken over.
+        The wrapped camera; the name is taken from it.
     drop
-        Indices of frames that get lost.
+        Indices of lost frames.
     drop_every
-        Lose every frame whose index divides by this.
+        Frames with an index divisible by this number are lost.
     repeat
-        Indices of frames that are delivered a second time, as some drivers do after an overrun;
-        ``next_frame`` then refuses the copy.
+        Indices of frames that are delivered twice, as by some drivers after an overrun; ``next_frame``
+        rejects the copy.
     stall_from
-        Index from which on no frame comes any more: every call times out.
+        Index from which every call times out.
     lost_from
-        Index from which on every call raises :class:`~escape_hw.errors.DeviceLost`.
+        Index from which every call raises :class:`~escape_hw.errors.DeviceLost`.
     """
 
     def __init__(
@@ -118,7 +117,7 @@ class FaultyCamera(Camera):
     ) -> None:
         super().__init__(inner.name)
         if drop_every is not None and drop_every < 2:
-            raise ValueError(f"drop_every is {drop_every}; from 2 on some frames are left")
+            raise ValueError(f"drop_every is {drop_every}; it must be at least 2")
         self.inner = inner
         self.drop = frozenset(drop)
         self.drop_every = drop_every
@@ -177,7 +176,7 @@ class FaultyCamera(Camera):
             except FrameTimeout:
                 raise FrameTimeout(self.name, f"no frame within {timeout_s:g} s") from None
             if self.lost_from is not None and frame.index >= self.lost_from:
-                raise DeviceLost(self.name, f"lost at frame {frame.index}, as arranged")
+                raise DeviceLost(self.name, f"lost at frame {frame.index} (injected)")
             if not self._is_withheld(frame.index):
                 break
         if frame.index in self.repeat:

@@ -1,4 +1,4 @@
-"""What a tip-tilt modulator promises."""
+"""Contract checks of tip-tilt modulators."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from escape_hw.testing.checks import (
     Factory,
     assert_refused,
     check,
+    checks_in,
     checks_up_to,
     open_device,
     replace_hook,
 )
 from escape_hw.testing.device import COMMON_CHECKS
 
-#: A tilt that any stage for a pyramid sensor can do, in radians.
+#: Tilt within the range of any stage for a pyramid sensor, radians.
 _SMALL_RAD = 1e-6
 
 
 def _trial_modulation(modulator: TipTiltModulator) -> Modulation:
-    """A small circle at a rate the stage can do, unlikely to be exactly achievable."""
+    """A small circle at a possible frequency that is probably not exactly achievable."""
     for rate in (97.3, 9.73, 0.973, 973.0):
         want = Modulation(_SMALL_RAD, rate)
         try:
@@ -33,16 +34,16 @@ def _trial_modulation(modulator: TipTiltModulator) -> Modulation:
         except SettingRejected:
             continue
         return want
-    raise AssertionError(f"{modulator.name}: refuses {_SMALL_RAD} rad at every rate from 1 Hz to 1 kHz")
+    raise AssertionError(f"{modulator.name}: rejects {_SMALL_RAD} rad at every frequency from 1 Hz to 1 kHz")
 
 
 @check(READS)
 def check_modulator_info(factory: Factory) -> None:
-    """``info`` says what the stage is and how far it tilts, and that is what ``check`` holds it to."""
+    """``info`` is complete, and ``check`` rejects tilts beyond ``info.max_tilt_rad``."""
     with open_device(factory) as modulator:
         info = modulator.info
         assert isinstance(info, ModulatorInfo), f"info is {type(info).__name__}, not ModulatorInfo"
-        assert info.model.strip(), "info.model is empty; products could not say which stage it was"
+        assert info.model.strip(), "info.model is empty; products need it"
         assert type(info.simulated) is bool, f"info.simulated is {info.simulated!r}, neither true nor false"
         limit = info.max_tilt_rad
         assert 0 < limit < math.inf, f"info.max_tilt_rad is {limit}; it must be positive and finite"
@@ -52,11 +53,11 @@ def check_modulator_info(factory: Factory) -> None:
 
 @check(READS)
 def check_modulator_check_changes_nothing(factory: Factory) -> None:
-    """``check`` moves nothing, and its own answer is achievable."""
+    """``check`` moves nothing, and a second ``check`` returns its result unchanged."""
     with open_device(factory) as modulator:
         before, want = modulator.modulation, _trial_modulation(modulator)
         answer = modulator.check(want)
-        assert isinstance(answer, Modulation), f"check() gave {type(answer).__name__}"
+        assert isinstance(answer, Modulation), f"check() returned {type(answer).__name__}"
         again = modulator.check(answer)
         assert again == answer, f"check() made {answer} of {want}, and then {again} of its own answer"
         after = modulator.modulation
@@ -65,7 +66,7 @@ def check_modulator_check_changes_nothing(factory: Factory) -> None:
 
 @check(READS)
 def check_modulator_refuses_meaningless(factory: Factory) -> None:
-    """Radius, frequency and centre that mean nothing are refused and move nothing."""
+    """Invalid radius, frequency and centre are rejected and move nothing."""
     with open_device(factory) as modulator:
         before, good = modulator.modulation, _trial_modulation(modulator)
         wrong = [replace(good, radius_rad=r) for r in (-1e-6, math.nan, math.inf)]
@@ -74,28 +75,26 @@ def check_modulator_refuses_meaningless(factory: Factory) -> None:
         for want in wrong:
             for verb in (modulator.check, modulator.modulate):
                 assert_refused(modulator, SettingRejected, f"{verb.__name__}({want})", verb, want)
-            assert modulator.modulation == before, f"{want} was refused, but the modulation changed"
+            assert modulator.modulation == before, f"{want} was rejected, but the modulation changed"
 
 
 @check(TINY)
 def check_modulator_reports_actual_modulation(factory: Factory) -> None:
-    """``modulate`` answers with what the stage says it does, which ``check`` had foreseen."""
+    """The result of ``modulate`` agrees with ``modulation`` and with ``check``."""
     with open_device(factory) as modulator:
         want = _trial_modulation(modulator)
-        foreseen = modulator.check(want)
+        checked = modulator.check(want)
         answer, now = modulator.modulate(want), modulator.modulation
-        assert answer == now, f"modulate() answered {answer}, but modulation says {now}"
-        off = abs(answer.frequency_hz / foreseen.frequency_hz - 1)
-        assert off < 0.01, (
-            f"check() foresaw {foreseen.frequency_hz} Hz, the stage does {answer.frequency_hz} Hz"
-        )
+        assert answer == now, f"modulate() returned {answer}, but modulation is {now}"
+        off = abs(answer.frequency_hz / checked.frequency_hz - 1)
+        assert off < 0.01, f"check() returned {checked.frequency_hz} Hz, modulate() {answer.frequency_hz} Hz"
         still = modulator.modulate(replace(want, radius_rad=0.0))
-        assert still.radius_rad == 0.0, f"asked for no radius, got {still.radius_rad} rad"
+        assert still.radius_rad == 0.0, f"radius 0 requested, got {still.radius_rad} rad"
 
 
 @check(TINY)
 def check_modulator_parks(factory: Factory) -> None:
-    """``park`` stops the modulation, may be repeated, and is where the stage is on opening."""
+    """``park`` stops the modulation and may be repeated; the stage is parked on opening."""
     with open_device(factory) as modulator:
         assert modulator.modulation is None, f"modulating on opening: {modulator.modulation}"
         modulator.park()
@@ -107,7 +106,7 @@ def check_modulator_parks(factory: Factory) -> None:
 
 @check(TINY)
 def check_modulator_is_parked_when_closed(factory: Factory) -> None:
-    """``close`` parks before it disconnects."""
+    """``close`` parks before disconnection."""
     with open_device(factory) as modulator:
         modulator.modulate(_trial_modulation(modulator))
         disconnect, state_at_close = modulator._close, []
@@ -118,46 +117,31 @@ def check_modulator_is_parked_when_closed(factory: Factory) -> None:
 
         with replace_hook(modulator, "_close", record_and_close):
             modulator.close()
-        assert state_at_close == [None], f"the stage was left at {state_at_close} when it was disconnected"
+        assert state_at_close == [None], f"the modulation at disconnection was {state_at_close}"
 
 
 @check(TINY)
 def check_modulator_status_moves_nothing(factory: Factory) -> None:
-    """``status`` says what the stage does, turning, parked and closed, and leaves it so."""
+    """``status`` is correct while modulating, parked and closed, and changes nothing."""
     with open_device(factory) as modulator:
         for turning in (False, True):
             if turning:
                 modulator.modulate(_trial_modulation(modulator))
             now = modulator.modulation
             status = modulator.status()
-            assert isinstance(status, ModulatorStatus), f"status() gave {type(status).__name__}"
-            assert status.info == modulator.info, f"status() speaks of {status.info}, not {modulator.info}"
-            assert status.modulation == now, f"status() tells {status.modulation}, modulation says {now}"
+            assert isinstance(status, ModulatorStatus), f"status() returned {type(status).__name__}"
+            assert status.info == modulator.info, f"status() has {status.info}, not {modulator.info}"
+            assert status.modulation == now, f"status() has {status.modulation}, modulation is {now}"
             assert modulator.modulation == now, f"status() changed {now} to {modulator.modulation}"
         modulator.close()
         rest = modulator.status().modulation
-        assert rest is None, f"status() of the closed stage tells {rest}; closing parks"
-        assert not modulator.is_open, "status() left a stage open that was closed"
+        assert rest is None, f"status() of the closed stage has {rest}, but closing parks"
+        assert not modulator.is_open, "status() opened a closed stage"
 
 
-MODULATOR_CHECKS: tuple[Check, ...] = (
-    *COMMON_CHECKS,
-    check_modulator_info,
-    check_modulator_check_changes_nothing,
-    check_modulator_refuses_meaningless,
-    check_modulator_reports_actual_modulation,
-    check_modulator_parks,
-    check_modulator_is_parked_when_closed,
-    check_modulator_status_moves_nothing,
-)
+MODULATOR_CHECKS = (*COMMON_CHECKS, *checks_in(globals()))
 
 
 def modulator_checks(max_level: int = 3) -> list[Check]:
-    """Checks for a :class:`~escape_hw.api.modulator.TipTiltModulator`.
-
-    Parameters
-    ----------
-    max_level
-        Leave out what moves the stage more: 0 rests, 1 modulates by a microradian.
-    """
+    """Checks for a tip-tilt modulator up to a level: 0 at rest, 1 modulates by a microradian."""
     return checks_up_to(MODULATOR_CHECKS, max_level)

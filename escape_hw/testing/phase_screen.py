@@ -1,4 +1,4 @@
-"""What a phase-screen changer promises."""
+"""Contract checks of phase screens."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from escape_hw.testing.checks import (
     Factory,
     assert_refused,
     check,
+    checks_in,
     checks_up_to,
     open_device,
 )
@@ -25,17 +26,17 @@ from escape_hw.testing.device import COMMON_CHECKS
 
 @check(READS)
 def check_screen_info(factory: Factory) -> None:
-    """``info`` says what the changer is, and whether it is a twin."""
+    """``info`` is complete."""
     with open_device(factory) as screen:
         info = screen.info
         assert isinstance(info, ScreenInfo), f"info is {type(info).__name__}, not ScreenInfo"
-        assert info.model.strip(), "info.model is empty; products could not say which changer it was"
+        assert info.model.strip(), "info.model is empty; products need it"
         assert type(info.simulated) is bool, f"info.simulated is {info.simulated!r}, neither true nor false"
 
 
 @check(READS)
 def check_screen_state_is_valid(factory: Factory) -> None:
-    """The state names a screen that exists, in or out, at a speed."""
+    """The state is within its ranges."""
     with open_device(factory) as screen:
         state = screen.state
         assert isinstance(state, ScreenState), f"state is {type(state).__name__}, not ScreenState"
@@ -48,7 +49,7 @@ def check_screen_state_is_valid(factory: Factory) -> None:
 
 @check(READS)
 def check_screen_refuses_meaningless(factory: Factory) -> None:
-    """Screens that do not exist and speeds that mean nothing are refused and change nothing."""
+    """Invalid values are rejected and change nothing."""
     with open_device(factory) as screen:
         before = screen.state
         wrong: list[dict[str, Any]] = [{"screen": k} for k in (-1, screen.n_screens, 0.5, True)]
@@ -60,28 +61,28 @@ def check_screen_refuses_meaningless(factory: Factory) -> None:
         ]
         for change in wrong:
             assert_refused(screen, SettingRejected, f"set({change})", partial(screen.set, **change))
-            assert screen.state == before, f"set({change}) was refused, but the state changed"
+            assert screen.state == before, f"set({change}) was rejected, but the state changed"
 
 
 @check(NORMAL)
 def check_screen_set_changes_only_given_fields(factory: Factory) -> None:
-    """``set`` changes what is given, keeps the rest, and answers with the state reached."""
+    """``set`` changes the given values only, and returns the new state."""
     with open_device(factory) as screen:
         before = screen.state
         try:
             assert screen.set() == before, "set() without arguments changed the state"
             for inserted in (False, True):
                 answer = screen.set(inserted=inserted)
-                assert answer == screen.state, f"set() answered {answer}, but state says {screen.state}"
-                assert answer.inserted is inserted, f"set(inserted={inserted}) led to {answer}"
+                assert answer == screen.state, f"set() returned {answer}, but state is {screen.state}"
+                assert answer.inserted is inserted, f"set(inserted={inserted}) gave {answer}"
                 assert answer.screen == before.screen, "set(inserted=...) changed the screen"
                 assert answer.speed_m_s == before.speed_m_s, "set(inserted=...) changed the speed"
             for blocked in (True, False):
                 answer = screen.set(blocked=blocked)
-                assert answer.blocked is blocked, f"set(blocked={blocked}) led to {answer}"
+                assert answer.blocked is blocked, f"set(blocked={blocked}) gave {answer}"
                 assert answer.screen == before.screen, "set(blocked=...) changed the screen"
             still = screen.set(speed_m_s=0.0)
-            assert still.speed_m_s == 0.0, f"set(speed_m_s=0) led to {still}"
+            assert still.speed_m_s == 0.0, f"set(speed_m_s=0) gave {still}"
             assert still.screen == before.screen, "set(speed_m_s=...) changed the screen"
         finally:
             screen.set(**asdict(before))
@@ -89,34 +90,21 @@ def check_screen_set_changes_only_given_fields(factory: Factory) -> None:
 
 @check(FULL)
 def check_screen_reaches_every_screen(factory: Factory) -> None:
-    """Every screen of the changer can be chosen."""
+    """Every screen can be selected."""
     with open_device(factory) as screen:
         before = screen.state
         try:
             for k in range(screen.n_screens):
                 reached = screen.set(screen=k)
-                assert reached.screen == k, f"set(screen={k}) led to {reached}"
-                assert screen.state == reached, f"set() answered {reached}, but state says {screen.state}"
+                assert reached.screen == k, f"set(screen={k}) gave {reached}"
+                assert screen.state == reached, f"set() returned {reached}, but state is {screen.state}"
         finally:
             screen.set(screen=before.screen)
 
 
-SCREEN_CHECKS: tuple[Check, ...] = (
-    *COMMON_CHECKS,
-    check_screen_info,
-    check_screen_state_is_valid,
-    check_screen_refuses_meaningless,
-    check_screen_set_changes_only_given_fields,
-    check_screen_reaches_every_screen,
-)
+SCREEN_CHECKS = (*COMMON_CHECKS, *checks_in(globals()))
 
 
 def screen_checks(max_level: int = 3) -> list[Check]:
-    """Checks for a :class:`~escape_hw.api.phase_screen.PhaseScreen`.
-
-    Parameters
-    ----------
-    max_level
-        Leave out what moves the changer more: 0 rests, 2 moves the screen in and out, 3 uses all.
-    """
+    """Checks for phase screens up to a level: 0 at rest, 2 moves the screen in and out, 3 all screens."""
     return checks_up_to(SCREEN_CHECKS, max_level)

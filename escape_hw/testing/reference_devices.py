@@ -1,7 +1,4 @@
-"""The smallest complete devices: they keep every contract and pretend to nothing else.
-
-They serve as stand-ins in tests of procedures, and as an example of what a driver has to fill in.
-"""
+"""Minimal devices that satisfy every contract, for tests of procedures and as examples of drivers."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from escape_hw.safety.limits import MirrorLimits
 
 
 class RecordingMirror(DeformableMirror):
-    """A mirror of 21 actuators in a circle (5 x 5 without corners) that keeps what it is sent.
+    """A mirror of 21 actuators in a circle (5 x 5 without corners) that records its commands.
 
     Attributes
     ----------
@@ -38,21 +35,21 @@ class RecordingMirror(DeformableMirror):
         axis = np.arange(5) - 2
         layout = axis[:, None] ** 2 + axis**2 <= 5
         rows, columns = np.nonzero(layout)
-        places = np.stack([axis[columns], axis[rows]], axis=1) * np.float64(1.5e-3)
-        return DMInfo("recording", "REF-DM", int(layout.sum()), layout, places, 2e-6, simulated=True)
+        positions_m = np.stack([axis[columns], axis[rows]], axis=1) * np.float64(1.5e-3)
+        return DMInfo("recording", "REF-DM", int(layout.sum()), layout, positions_m, 2e-6, simulated=True)
 
     def _open(self) -> None:
-        """Nothing to connect to."""
+        pass
 
     def _close(self) -> None:
-        """Nothing to disconnect from."""
+        pass
 
     def _send(self, command: NDArray[np.float64]) -> None:
         self.history.append(command.copy())
 
 
 class IdealSecondary(AdaptiveSecondary):
-    """An adaptive secondary of 21 actuators that is at once wherever it is told to be."""
+    """An adaptive secondary of 21 actuators that reaches every state and shape at once."""
 
     def __init__(self, name: str = "secondary", limits: MirrorLimits | None = None) -> None:
         super().__init__(name, limits or MirrorLimits())
@@ -65,10 +62,10 @@ class IdealSecondary(AdaptiveSecondary):
         return RecordingMirror().info
 
     def _open(self) -> None:
-        """Nothing to connect to."""
+        pass
 
     def _close(self) -> None:
-        """Nothing to disconnect from."""
+        pass
 
     def _send_to_shell(self, command: NDArray[np.float64]) -> None:
         self._last = command
@@ -90,7 +87,7 @@ class IdealSecondary(AdaptiveSecondary):
 
 
 class SyntheticCamera(Camera):
-    """A camera of 64 x 48 pixels on a simulated clock that counts whole microseconds per frame."""
+    """A camera of 64 x 48 pixels on a simulated clock with a resolution of 1 us."""
 
     _TICK_NS = 1000
     _STEP_PX = 4
@@ -119,14 +116,16 @@ class SyntheticCamera(Camera):
         return round(1e9 / self._settings.frame_rate_hz / self._TICK_NS) * self._TICK_NS
 
     def _open(self) -> None:
-        """Nothing to connect to."""
+        pass
 
     def _close(self) -> None:
-        """Nothing to disconnect from."""
+        pass
 
     def _check(self, want: CameraSettings) -> CameraSettings:
         if not 1 <= want.frame_rate_hz <= 2000:
-            raise SettingRejected(self.name, f"frame_rate_hz is {want.frame_rate_hz}; it does 1 to 2000 Hz")
+            raise SettingRejected(
+                self.name, f"frame_rate_hz is {want.frame_rate_hz}; the range is 1 to 2000 Hz"
+            )
         period_us = round(1e6 / want.frame_rate_hz)
         exposure_us = min(max(1, round(want.exposure_s * 1e6)), period_us)
         region, step = want.region, self._STEP_PX
@@ -148,13 +147,13 @@ class SyntheticCamera(Camera):
         self._exposed_ns = self._clock_ns
 
     def _stop(self) -> None:
-        """Frames come only when they are asked for."""
+        """Frames are created on request."""
 
     def _next_frame(self, timeout_s: float) -> Frame:
         due_ns, deadline_ns = self._exposed_ns + self._period_ns, self._clock_ns + round(timeout_s * 1e9)
         if due_ns > deadline_ns:
             self._clock_ns = deadline_ns
-            raise FrameTimeout(self.name, f"no frame within {timeout_s:g} s; the next takes longer")
+            raise FrameTimeout(self.name, f"no frame within {timeout_s:g} s")
         self._exposed_ns = self._clock_ns = due_ns
         self._index += 1
         region = self._settings.region
@@ -185,15 +184,17 @@ class QuantisedModulator(TipTiltModulator):
         return self._modulation
 
     def _open(self) -> None:
-        """Nothing to connect to."""
+        pass
 
     def _close(self) -> None:
-        """Nothing to disconnect from."""
+        pass
 
     def _check(self, want: Modulation) -> Modulation:
         steps = round(1 / (want.frequency_hz * self.STEP_S))
         if not 4 <= steps <= 100_000:
-            raise SettingRejected(self.name, f"frequency_hz is {want.frequency_hz}; it does 0.2 to 5000 Hz")
+            raise SettingRejected(
+                self.name, f"frequency_hz is {want.frequency_hz}; the range is 0.2 to 5000 Hz"
+            )
         return replace(want, frequency_hz=1 / (steps * self.STEP_S))
 
     def _modulate(self, modulation: Modulation) -> None:
@@ -204,7 +205,7 @@ class QuantisedModulator(TipTiltModulator):
 
 
 class IdealPhaseScreen(PhaseScreen):
-    """A changer with four screens that gets wherever it is told at once."""
+    """A changer with four screens that reaches every state at once."""
 
     def __init__(self, name: str = "screen") -> None:
         super().__init__(name)
@@ -226,10 +227,10 @@ class IdealPhaseScreen(PhaseScreen):
         return 4
 
     def _open(self) -> None:
-        """Nothing to connect to."""
+        pass
 
     def _close(self) -> None:
-        """Nothing to disconnect from."""
+        pass
 
     def _set(self, want: ScreenState) -> None:
         self._state = want

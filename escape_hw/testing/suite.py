@@ -1,4 +1,4 @@
-"""Puts the checks to use: for one device, in a plain loop or under pytest."""
+"""Selection and execution of the checks for a device, with or without pytest."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """Outcome of one check: ``passed``, ``failed`` or ``skipped``, and why."""
+    """Outcome of one check: ``passed``, ``failed`` or ``skipped``, with a message."""
 
     check: str
     level: int
@@ -36,7 +36,7 @@ class CheckResult:
 
 
 def checks_for(device: Device, max_level: int = 3) -> list[Check]:
-    """Every check that fits the device's kind and changes no more than ``max_level`` allows."""
+    """Every check for the kind of a device, up to a level."""
     if isinstance(device, AdaptiveSecondary):
         return secondary_checks(max_level)
     if isinstance(device, DeformableMirror):
@@ -56,14 +56,14 @@ def run_checks(factory: Factory, max_level: int = 3) -> list[CheckResult]:
     Parameters
     ----------
     factory
-        Makes a fresh device that is not open.
+        Creates a new device that is not open.
     max_level
         0 nothing moves, 1 tiny, 2 normal, 3 full range.
 
     Returns
     -------
     list of CheckResult
-        In the order they ran; one that fails does not stop the next.
+        In the order of execution; all checks are run.
     """
     return [_outcome(check, factory) for check in checks_for(factory(), max_level)]
 
@@ -82,13 +82,12 @@ def _outcome(check: Check, factory: Factory) -> CheckResult:
 
 
 def parametrize_device_checks(factories: Mapping[str, Factory], max_level: int = 3) -> pytest.MarkDecorator:
-    """Decorate a pytest function so that it runs every check on every device.
+    """Parametrise a pytest function with every check of every device.
 
     Parameters
     ----------
     factories
-        A name for each device, and what makes it; each is called once while tests are collected,
-        to learn its kind.
+        Name -> factory; each is called once during collection to determine the kind of device.
     max_level
         0 nothing moves, 1 tiny, 2 normal, 3 full range.
 

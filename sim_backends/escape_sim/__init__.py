@@ -1,1 +1,4 @@
-"""Simulated devices (twins), their optics, the synthetic models that SPRINT inverts, emulators and stand-ins of vendor libraries. Imports escape_hw only; loaded through entry points."""
+"""Simulated devices, their optics, synthetic models, emulators and stand-ins of vendors' libraries.
+
+Imports ``escape_hw`` only and is loaded through entry points.
+"""

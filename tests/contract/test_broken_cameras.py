@@ -148,8 +148,8 @@ BROKEN: list[Broken] = [
     ("check sets", SyntheticCamera, "camera_check_changes_nothing", {"_check": checks_by_setting}),
     ("any region", SyntheticCamera, "camera_refuses_regions_off_the_sensor", {"check": takes_all}),
     ("any settings", SyntheticCamera, "camera_refuses_meaningless_settings", {"check": takes_all}),
-    ("configure lies", SyntheticCamera, "camera_configure_tells_the_truth", {"configure": lies}),
-    ("region ignored", SyntheticCamera, "camera_configure_tells_the_truth", {"_configure": forgets_region}),
+    ("configure lies", SyntheticCamera, "camera_configure_reports_actual_settings", {"configure": lies}),
+    ("region ignored", SyntheticCamera, "camera_configure_reports_actual_settings", {"_configure": forgets_region}),
     ("stays stopped", SyntheticCamera, "camera_configures_while_running", {"configure": stays_stopped}),
     ("starts once", SyntheticCamera, "camera_start_and_stop_repeat", {"start": fails_twice}),
     ("keeps counting", SyntheticCamera, "camera_restart_resets_counters", {"start": keeps_counting}),
@@ -184,7 +184,7 @@ BROKEN: list[Broken] = [
         "camera_frames_are_well_formed",
         {"_next_frame": frames_with(data=lambda f: frozen(np.full_like(f.data, 1023)))},
     ),
-    ("one buffer", SyntheticCamera, "camera_frames_are_kept", {"_next_frame": one_buffer}),
+    ("one buffer", SyntheticCamera, "camera_frames_are_not_overwritten", {"_next_frame": one_buffer}),
     ("index falls", SyntheticCamera, "camera_index_and_time_rise", {"_next_frame": index_falls}),
     (
         "arrives early",
@@ -195,10 +195,10 @@ BROKEN: list[Broken] = [
     ("half the rate", SyntheticCamera, "camera_rate_is_as_stated", {"_period_ns": property(half_as_fast)}),
     ("miscounts", SyntheticCamera, "camera_counts_add_up", {"status": miscounts}),
     ("any time-out", SyntheticCamera, "camera_refuses_timeouts", {"next_frame": waits_any_time}),
-    ("gives None", SyntheticCamera, "camera_keeps_deadlines", {"_next_frame": gives_none}),
+    ("gives None", SyntheticCamera, "camera_raises_timeout", {"_next_frame": gives_none}),
     ("poll waits", SyntheticCamera, "camera_polls_without_waiting", {"_poll": polls_patiently}),
     ("poll counts", SyntheticCamera, "camera_polls_without_waiting", {"poll": polls_through_next_frame}),
-    ("waits for ever", SyntheticCamera, "camera_keeps_deadlines", {"_next_frame": waits_for_ever}),
+    ("waits for ever", SyntheticCamera, "camera_raises_timeout", {"_next_frame": waits_for_ever}),
 ]
 
 

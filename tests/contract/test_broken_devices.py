@@ -47,24 +47,24 @@ def falling_clock(self: Any) -> int:
 
 
 BROKEN: list[Broken] = [
-    ("opens itself", IdealPhaseScreen, "construction_is_passive", {"__init__": opens_itself}),
-    ("finaliser", IdealPhaseScreen, "construction_is_passive", {"__del__": lambda self: None}),
+    ("opens itself", IdealPhaseScreen, "construction_does_not_connect", {"__init__": opens_itself}),
+    ("finaliser", IdealPhaseScreen, "construction_does_not_connect", {"__del__": lambda self: None}),
     (
         "no name",
         IdealPhaseScreen,
-        "construction_is_passive",
+        "construction_does_not_connect",
         {"__init__": lambda self: IdealPhaseScreen.__init__(self, "")},
     ),
-    ("overrides send", RecordingMirror, "final_methods_are_kept", {"send": lambda self, c: self._send(c)}),
+    ("overrides send", RecordingMirror, "final_methods_are_not_overridden", {"send": lambda self, c: self._send(c)}),
     ("opens once", IdealPhaseScreen, "open_and_close_repeat", {"_open": refuses_to_reopen}),
     ("swallows errors", IdealPhaseScreen, "context_manager", {"__exit__": swallows}),
     ("works while closed", IdealPhaseScreen, "refuses_use_unless_open", {"set": sets_anyway}),
     ("does not say who", IdealPhaseScreen, "refuses_use_unless_open", {"require_open": unnamed_not_open}),
-    ("clock runs backwards", IdealPhaseScreen, "clock_never_runs_backwards", {"now_ns": falling_clock}),
+    ("clock runs backwards", IdealPhaseScreen, "clock_is_monotonic", {"now_ns": falling_clock}),
     (
         "clock in seconds",
         IdealPhaseScreen,
-        "clock_never_runs_backwards",
+        "clock_is_monotonic",
         {"now_ns": lambda self: time.monotonic()},
     ),
 ]

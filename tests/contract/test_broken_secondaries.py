@@ -79,16 +79,16 @@ def stays_afloat(self: Any) -> None:
 
 
 BROKEN: list[tuple[str, str, dict[str, Any]]] = [
-    ("sticks", "secondary_walks_the_ladder", {"_step": sticks_on_the_way_down}),
-    ("health elsewhere", "secondary_walks_the_ladder", {"_health": health_of_another_state}),
+    ("sticks", "secondary_reaches_every_state", {"_step": sticks_on_the_way_down}),
+    ("health elsewhere", "secondary_reaches_every_state", {"_health": health_of_another_state}),
     ("follows asleep", "secondary_follows_commands_only_when_running", {"send": always_follows}),
-    ("remembers", "secondary_is_flat_when_it_floats_anew", {"go": keeps_its_shape}),
-    ("ignores a fault", "secondary_never_goes_to_a_fault", {"go": goes_anywhere}),
+    ("remembers", "secondary_is_flat_after_rest", {"go_to": keeps_its_shape}),
+    ("ignores a fault", "secondary_refuses_fault_as_target", {"go_to": goes_anywhere}),
     ("few positions", "secondary_measures_every_actuator", {"measured_positions": half_of_them}),
-    ("metres", "secondary_measures_every_actuator", {"_measure": in_metres_per_stroke}),
-    ("no gap", "secondary_tells_its_health", {"_health": no_gap}),
+    ("metres", "secondary_measures_every_actuator", {"_measure_positions": in_metres_per_stroke}),
+    ("no gap", "secondary_reports_health", {"_health": no_gap}),
     ("drives regardless", "secondary_latches_faults", {"_send": drives_regardless}),
-    ("no way out", "secondary_latches_faults", {"_latched": hides_the_way_out}),
+    ("no way out", "secondary_latches_faults", {"_fault_error": hides_the_way_out}),
     ("recovers always", "secondary_recovers_only_from_faults", {"recover": recovers_always}),
     ("closes afloat", "secondary_rests_when_closed", {"_before_close": stays_afloat}),
 ]

@@ -70,7 +70,7 @@ BROKEN: list[Broken] = [
     ("brags of its reach", QuantisedModulator, "modulator_info", {"info": property(brags)}),
     ("check moves", QuantisedModulator, "modulator_check_changes_nothing", {"_check": checks_by_moving}),
     ("any modulation", QuantisedModulator, "modulator_refuses_meaningless", {"check": takes_all}),
-    ("modulate lies", QuantisedModulator, "modulator_tells_the_truth", {"modulate": modulates_as_asked}),
+    ("modulate lies", QuantisedModulator, "modulator_reports_actual_modulation", {"modulate": modulates_as_asked}),
     ("does not park", QuantisedModulator, "modulator_parks", {"_park": lambda self: None}),
     (
         "closes moving",
@@ -83,12 +83,12 @@ BROKEN: list[Broken] = [
     (
         "counts from one",
         IdealPhaseScreen,
-        "screen_state_makes_sense",
+        "screen_state_is_valid",
         {"n_screens": property(lambda self: 1)},
     ),
     ("takes anything", IdealPhaseScreen, "screen_refuses_meaningless", {"set": repairs_screen}),
-    ("forgets the rest", IdealPhaseScreen, "screen_set_keeps_the_rest", {"set": forgets_the_rest}),
-    ("answers blindly", IdealPhaseScreen, "screen_set_keeps_the_rest", {"set": answers_blindly}),
+    ("forgets the rest", IdealPhaseScreen, "screen_set_changes_only_given_fields", {"set": forgets_the_rest}),
+    ("answers blindly", IdealPhaseScreen, "screen_set_changes_only_given_fields", {"set": answers_blindly}),
     ("sticks", IdealPhaseScreen, "screen_reaches_every_screen", {"_set": sticks}),
 ]
 

@@ -56,7 +56,7 @@ def over_serial() -> PiModulator:
 
 def over_usb() -> PiModulator:
     def connect() -> UsbTransport:
-        bus = UsbBackend(UsbPipe(E727Controller(MAKE), FaultInjector()), busy=True)
+        bus = UsbBackend(UsbPipe(E727Controller(MAKE), FaultInjector()), kernel_driver_active=True)
         return UsbTransport(VENDOR, None, "SIMMOD", 1.0, bus)
 
     return with_wire(connect)

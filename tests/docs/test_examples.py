@@ -39,9 +39,9 @@ def test_every_example_is_tested() -> None:
 
 def test_poke_an_actuator(tmp_path: Path) -> None:
     out = run("poke_an_actuator.py", tmp_path)
-    assert "untouched by the guard: True" in out
-    assert "asked for 5.0, the mirror got 0.8" in out
-    assert "refused: dm: actuator 48 is nan" in out
+    assert "unchanged by the guard: True" in out
+    assert "requested 5.0, sent 0.8" in out
+    assert "rejected: dm: actuator 48 is nan" in out
     assert 0.1 < number(r"largest slope: ([\d.]+) pixels", out) < 2.0
     picture = out.splitlines()[-24:]
     rows = [number for number, line in enumerate(picture) if "@" in line]
@@ -96,4 +96,4 @@ def test_own_device(tmp_path: Path) -> None:
     assert len(outcomes) > 15
     assert set(outcomes) <= {"passed", "skipped"}
     assert outcomes.count("passed") > 15
-    assert "Acme 97: asked for 0.9, sent 0.500" in out
+    assert "Acme 97: requested 0.9, sent 0.500" in out

@@ -9,7 +9,7 @@ from escape_drivers.pi.transports import TransportLost
 from escape_hw.config.loader import load_system
 from escape_sim.emulators.e727.controller import E727Controller
 from escape_sim.emulators.e727.state import ControllerSettings
-from escape_sim.emulators.e727.transports import FaultInjector, UsbPipe, WireFault
+from escape_sim.emulators.e727.transports import FaultInjector, UsbPipe
 
 #: How many times faster than real the emulated stage lives; the longest wait for a reply.
 HURRY, TIMEOUT_S = 40.0, 0.03
@@ -49,11 +49,16 @@ class Pipe:
 class Peers:
     """The emulated controller, and drivers for it."""
 
-    def __init__(self, *faults: WireFault, zeroed: bool = True, correct: str = "none") -> None:
+    def __init__(
+        self, faults: dict[int, str] | None = None, *, zeroed: bool = True, correct: str = "none"
+    ) -> None:
         make = ControllerSettings(serial="SIMMOD", zeroed=zeroed, auto_zero_s=2.0)
         self.controller = E727Controller(make, lambda: HURRY * time.monotonic())
         self.wire = FaultInjector(faults)
-        overrides = [f'devices.modulator.stage.correct="{correct}"', "devices.modulator.stage.settle_s=0.5"]
+        overrides = [
+            f'devices.modulator.stage.correction_source="{correct}"',
+            "devices.modulator.stage.settle_s=0.5",
+        ]
         overrides.append(f"devices.modulator.wire.timeout_s={TIMEOUT_S}")
         section = load_system("razor-pywfs", overrides=overrides).devices.modulator
         assert section is not None

@@ -10,7 +10,7 @@ from pipe import TIMEOUT_S, Peers
 
 from escape_hw.api.modulator import Modulation
 from escape_hw.errors import DeviceError
-from escape_sim.emulators.e727.transports import FAULT_KINDS, WireFault
+from escape_sim.emulators.e727.transports import FAULT_KINDS
 
 CIRCLE = Modulation(1.41e-4, 303.03)
 #: What a message tells the operator to do.
@@ -51,16 +51,18 @@ def session(peers: Peers) -> list[str]:
 def commands_of_a_session() -> int:
     peers = Peers()
     assert session(peers) == []
-    assert peers.controller.state.complaints == []
+    assert peers.controller.state.violations == []
     return len(peers.controller.received_commands)
 
 
 def check(kind: str, at: int) -> None:
-    peers = Peers(WireFault(kind, at))
+    peers = Peers({at: kind})
     failures = session(peers)
-    if kind in ("late", "double", "garbage") or (kind in ("drop", "truncate", "lose") and not failures):
+    if kind in ("delay", "double", "garbage") or (
+        kind in ("drop_reply", "truncate", "drop_command") and not failures
+    ):
         assert peers.condition == "at rest", (kind, at, failures)
-    if kind in ("close", "reset", "power", "stall"):
+    if kind in ("close", "reset", "power_cut", "stall"):
         assert failures, (kind, at, "a lost link must be told")
     # Whatever happened: the next opening finds everything in order, and leaves it at rest.
     peers.wire.is_stalled = False

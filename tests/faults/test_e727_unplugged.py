@@ -84,7 +84,7 @@ def test_usb_pulled_out_in_the_middle():
 
 
 def test_usb_is_taken_from_the_kernel_and_given_back():
-    here = bus(busy=True)
+    here = bus(kernel_driver_active=True)
     with stage(UsbTransport(VENDOR, None, "SIMMOD", 0.2, here)):
         assert (here.kernel_driver, here.claimed) == (False, True)
     assert (here.kernel_driver, here.claimed) == (True, False)

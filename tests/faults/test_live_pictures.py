@@ -83,7 +83,7 @@ def test_modes_not_measured_yet_are_nan(bench, often, procedure):
     np.testing.assert_allclose(shown["matrix_sigma"][-1], result.matrix.sigma, rtol=1e-4)
 
 
-@pytest.mark.parametrize("solver", ["effects", "light", "batches"])
+@pytest.mark.parametrize("solver", ["mixed-effects", "registration-only", "batches"])
 def test_sprint_shows_every_iteration(bench, good, solver):
     found, shown = watched(bench, estimate_registration(good.matrix, good.model, solver=solver))
     course = shown["registration"][-1]

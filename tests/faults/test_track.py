@@ -120,14 +120,14 @@ def test_what_was_fitted_beside_the_registration_stays(start):
 
 
 def test_a_matrix_without_a_registration_is_fitted_as_configured(start):
-    with small(QUIET, 'calibration.also=["anamorphosis"]') as bench:
+    with small(QUIET, 'calibration.extra_parameters=["anamorphosis"]') as bench:
         found = followed(bench, replace(start, registration=None), 2, exchange=False)
     assert set(found.latest.registration.extras) == {"anamorphosis"}
     assert abs(found.column("shift_x")[-1] - start.registration.registration.shift_x) < 3
 
 
 def test_too_large_a_change_is_not_exchanged_without_asking(start):
-    with small(QUIET, "twin.drift.rate.shift_x=3.0", "tracking.limit=0.02") as bench:
+    with small(QUIET, "twin.drift.rate.shift_x=3.0", "tracking.exchange_limit=0.02") as bench:
         found = followed(bench, start, 5)
     assert found.exchanges
     assert not any(one.accepted for one in found.exchanges)

@@ -1,4 +1,4 @@
-"""A window on a scripted source, and the proof that nothing of it is left behind."""
+"""Fixtures: a window on a scripted source; every test is checked for leaks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 
 import shiboken6
-from gui_windows import dispose, settle, shown
+from gui_windows import dispose, settle, show_window
 from PySide6.QtCore import QTimer
 from PySide6.QtWidgets import QApplication
 from scripted import ScriptedControl, ScriptedSource
@@ -31,36 +31,36 @@ from escape_gui.settings import Settings
 
 @pytest.fixture(scope="session")
 def qapp() -> QApplication:
-    """The application, set up as the command does."""
+    """The application, configured as by the command."""
     return qt_application()
 
 
 def segments() -> set[str]:
-    """Shared memory of this process."""
+    """Shared-memory segments of this process."""
     folder = Path("/dev/shm")
     return {path.name for path in folder.glob(f"escape-*-{os.getpid()}-*")} if folder.is_dir() else set()
 
 
 def timers() -> set[int]:
-    """Timers that still run."""
+    """Running timers."""
     found = (one for one in gc.get_objects() if isinstance(one, QTimer))
     return {id(one) for one in found if shiboken6.isValid(one) and one.isActive()}
 
 
 def widgets() -> dict[int, str]:
-    """All widgets by the place of their C++ half; wrappers come and go."""
+    """All widgets by the address of their C++ object, which identifies them."""
     return {shiboken6.getCppPointer(one)[0]: repr(one) for one in QApplication.allWidgets()}
 
 
 @pytest.fixture(autouse=True)
-def nothing_left(qapp: QApplication) -> Iterator[None]:
-    """Fail a test that leaves a widget, a running timer, a thread or shared memory."""
+def no_leaks(qapp: QApplication) -> Iterator[None]:
+    """Fail a test that leaves a widget, a running timer, a thread or shared memory behind."""
     settle()
     before = widgets().keys()
     threads, shared, running = set(threading.enumerate()), segments(), timers()
     yield
     for _ in range(4):
-        # Some cycles are collected only after the widgets in them are gone.
+        # Some reference cycles are collected only after the deletion of their widgets.
         settle()
         left = [name for place, name in widgets().items() if place not in before]
         if not left:
@@ -81,13 +81,13 @@ def source() -> ScriptedSource:
 
 @pytest.fixture
 def control() -> ScriptedControl:
-    """A server that notes what it is asked."""
+    """A server that records the requests."""
     return ScriptedControl()
 
 
 @pytest.fixture
 def session(source: ScriptedSource, control: ScriptedControl) -> Iterator[Session]:
-    """A session on both."""
+    """A session with both."""
     session = Session()
     session.set_source(source, control)
     yield session
@@ -97,11 +97,11 @@ def session(source: ScriptedSource, control: ScriptedControl) -> Iterator[Sessio
 
 @pytest.fixture
 def make_window(session: Session, tmp_path: Path) -> Iterator[Callable[..., MainWindow]]:
-    """Makes windows of some panels, and closes them."""
+    """Creates windows with some panels, and closes them."""
     made: list[MainWindow] = []
 
     def make(panels: Sequence[type[Panel]] = PANELS, settings: Settings | None = None) -> MainWindow:
-        made.append(shown(session, tmp_path / "gui.json", panels, settings))
+        made.append(show_window(session, tmp_path / "gui.json", panels, settings))
         for dock in made[-1].docks.values() if len(panels) == 1 else ():
             dock.show()
         made[-1].update_timer.tick(force=True)
@@ -116,14 +116,14 @@ def make_window(session: Session, tmp_path: Path) -> Iterator[Callable[..., Main
 @pytest.fixture
 def window(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
     """The whole window."""
-    window = shown(session, tmp_path / "gui.json")
+    window = show_window(session, tmp_path / "gui.json")
     yield window
     dispose(window)
 
 
 @pytest.fixture
 def small_window(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
-    """A window of three panels, for what does not concern the others."""
-    window = shown(session, tmp_path / "gui.json", (DevicesPanel, CameraPanel, LogPanel))
+    """A window with three panels, for tests that do not depend on the others."""
+    window = show_window(session, tmp_path / "gui.json", (DevicesPanel, CameraPanel, LogPanel))
     yield window
     dispose(window)

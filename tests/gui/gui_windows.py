@@ -1,4 +1,4 @@
-"""Windows for tests: made, looked at, closed, and nothing of them left behind."""
+"""Windows for tests: created, refreshed, closed and deleted."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from escape_gui.settings import Settings
 
 
 def settle() -> None:
-    """Let Qt delete what was to be deleted, and Python what nobody holds."""
+    """Process deferred deletions of Qt, and collect garbage."""
     QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete.value)
     QCoreApplication.processEvents()
     gc.collect()
     QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete.value)
 
 
-def shown(
+def show_window(
     session: Session,
     settings_path: Path,
     panels: Sequence[type[Panel]] = PANELS,
     settings: Settings | None = None,
 ) -> MainWindow:
-    """A window that has looked once at everything."""
+    """A window that was refreshed once."""
     window = MainWindow(session, settings or Settings(), settings_path, panels)
     window.show()
     QCoreApplication.processEvents()
@@ -39,6 +39,6 @@ def shown(
 
 
 def dispose(window: MainWindow) -> None:
-    """Close a window and all it holds."""
+    """Close and delete a window."""
     window.close()
     window.deleteLater()

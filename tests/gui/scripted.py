@@ -1,4 +1,4 @@
-"""A source whose every word the test decides, and a server that only notes what it was asked."""
+"""A data source scripted by the test, and a server that only records the requests."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def disc(n: int, fill: float = 1.0) -> NDArray[np.bool_]:
 
 
 def rows_of(mask: NDArray[np.bool_]) -> tuple[str, ...]:
-    """A mask as :class:`Geometry` writes it."""
+    """A mask in the format of :class:`Geometry`."""
     return tuple("".join("1" if one else "0" for one in row) for row in mask)
 
 
@@ -94,7 +94,7 @@ def secondary() -> Geometry:
         angles = 2 * np.pi * np.arange(count) / count
         places += [(0.03 * ring * float(np.cos(a)), 0.03 * ring * float(np.sin(a))) for a in angles]
     pupils = ((45.0, 48.0, 32.0), (128.0, 46.0, 32.0), (65.0, 152.0, 32.0), (130.0, 130.0, 32.0))
-    return Geometry(valid=rows_of(disc(64)), places_m=tuple(places[:336]), outlines_px=pupils, n_modes=100)
+    return Geometry(valid=rows_of(disc(64)), positions_m=tuple(places[:336]), outlines_px=pupils, n_modes=100)
 
 
 def spots(geometry: Geometry, size: int = 400, seed: int = 0) -> NDArray[np.uint16]:
@@ -132,7 +132,7 @@ def counted(*microseconds: float) -> NDArray[np.float64]:
 
 
 def running(**changes: Any) -> State:
-    """The state of a bench whose loop is closed and which we control."""
+    """The state of a bench with a closed loop and this client in control."""
     values: dict[str, Any] = {
         "serial": 1,
         "server_pid": 10,
@@ -142,17 +142,17 @@ def running(**changes: Any) -> State:
         "phase": Phase.LOOP,
         "lease": LEASE,
         "devices": DEVICES,
-        "rates": FrameCounters(frame_hz=500.0, frames=123456, lost=2),
-        "light": Illumination(saturated=0.0004, peak=0.97),
-        "mirror": MirrorState(rms=0.082, peak=0.412, clipped=0.0),
-        "latency": LatencyState(p50=312.0, p99=401.0, largest=880.0, jitter_p99=64.0),
+        "rates": FrameCounters(frame_hz=500.0, frames=123456, lost_frames=2),
+        "illumination": Illumination(saturated=0.0004, peak=0.97),
+        "mirror": MirrorState(rms=0.082, peak=0.412, saturated_share=0.0),
+        "latency": LatencyState(p50=312.0, p99=401.0, max=880.0, jitter_p99=64.0),
         "loop": LoopState(
             closed=True,
             matrix="escape",
             gain=0.425,
             leak=0.026,
             dropped_modes=14,
-            modes=80,
+            n_modes=80,
             residual_nm=44.0,
             strehl=0.365,
             strehl_sigma=0.004,
@@ -169,49 +169,49 @@ def running(**changes: Any) -> State:
 
 
 class ScriptedSource:
-    """Shows what the test puts into it."""
+    """A data source whose content is set by the test."""
 
     def __init__(self, state: State | None = None, geometry: Geometry | None = None) -> None:
         self.connected = True
         self.state = state or running()
-        self.places = geometry or shack_hartmann()
+        self.geometry_data = geometry or shack_hartmann()
         self.lines: list[LogLine] = []
-        self.offers: tuple[ProcedureEntry, ...] = ()
+        self.entries: tuple[ProcedureEntry, ...] = ()
         self.streams: dict[str, Sample] = {}
         self.reads = 0
 
     def change(self, **values: Any) -> None:
-        """Another state, with a number of its own."""
+        """Change fields of the state, with the next serial number."""
         self.state = self.state.model_copy(update={**values, "serial": self.state.serial + 1})
 
     def fail(self, reason: str = "no frames for 0.5 s") -> None:
-        """A fault that made the mirror safe."""
-        fault = FaultState(reason=reason, at_utc="2026-11-21T21:00:00", way_out="look at the camera's cable")
+        """Enter the fault state."""
+        fault = FaultState(reason=reason, at_utc="2026-11-21T21:00:00", remedy="look at the camera's cable")
         lost = DEVICES[1].model_copy(update={"health": DeviceHealth.LOST, "message": "unplugged"})
         loop = self.state.loop.model_copy(update={"closed": False})
         self.change(phase=Phase.FAULT, fault=fault, devices=(DEVICES[0], lost, DEVICES[2]), loop=loop)
 
     def push(self, stream: str, data: NDArray[Any], **meta: float | str) -> None:
-        """The next entry of a stream."""
+        """Add an entry to a stream."""
         last = self.streams.get(stream)
         now = time.monotonic_ns()
         self.streams[stream] = Sample(0 if last is None else last.index + 1, now - 500_000, now, data, meta)
 
     def push_all(self, seed: int = 0) -> None:
-        """An entry of every stream that the operator's panels read."""
+        """Add an entry to every stream that the panels read."""
         rng = np.random.default_rng(seed)
-        n_slopes = 2 * sum(row.count("1") for row in self.places.valid)
-        n_act = sum(row.count("1") for row in self.places.layout) or len(self.places.places_m)
-        self.push("frames", spots(self.places, seed=seed), top=1023.0)
+        n_slopes = 2 * sum(row.count("1") for row in self.geometry_data.valid)
+        n_act = sum(row.count("1") for row in self.geometry_data.layout) or len(self.geometry_data.positions_m)
+        self.push("frames", spots(self.geometry_data, seed=seed), top=1023.0)
         self.push("slopes", rng.normal(0, 0.4, n_slopes))
         self.push("commands", rng.normal(0, 0.1, n_act))
-        self.push("modes", rng.normal(0, 20, self.places.n_modes))
+        self.push("modes", rng.normal(0, 20, self.geometry_data.n_modes))
         self.push("psf", speckles(seed))
         self.push("model_psf", speckles(seed, strehl=1.0))
         latencies = rng.gamma(60, 5.2, 4000)
         spacing = rng.normal(2000, 18, 4000)
         self.push("latency_histogram", np.stack([counted(*latencies), counted(*spacing)]))
-        if self.places.places_m:
+        if self.geometry_data.positions_m:
             self.push("measured_positions", rng.normal(0, 4e-7, n_act))
         line = LogLine(
             number=len(self.lines),
@@ -223,25 +223,25 @@ class ScriptedSource:
         self.lines.append(line)
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
-        """As a server would."""
+        """The newest entry, unless it has the index ``after``."""
         self.reads += 1
         sample = self.streams.get(stream)
         return sample if sample is not None and sample.index != after else None
 
     def geometry(self) -> Geometry:
-        """Where things stand."""
-        return self.places
+        """The geometry set by the test."""
+        return self.geometry_data
 
     def log_after(self, number: int) -> Sequence[LogLine]:
-        """Lines after a number."""
+        """Log lines after a number."""
         return [line for line in self.lines if line.number > number]
 
     def procedures(self) -> Sequence[ProcedureEntry]:
-        """What can be started."""
-        return self.offers
+        """The procedures set by the test."""
+        return self.entries
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
-        """A plan as long as was asked."""
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+        """A plan with the requested number of frames."""
         frames = int(arguments.get("frames") or 1000)
         return ProcedurePlan(
             name=procedure, arguments=dict(arguments), frames=frames, seconds=frames / 500, stroke=0.02
@@ -249,7 +249,7 @@ class ScriptedSource:
 
 
 class ScriptedControl:
-    """Notes every request; ``refuse`` makes it raise."""
+    """Records every request; raises if ``refuse`` is set."""
 
     client = CLIENT
 
@@ -264,7 +264,7 @@ class ScriptedControl:
 
     @property
     def verbs(self) -> list[str]:
-        """What was asked, in order."""
+        """The requests, in order."""
         return [verb for verb, _ in self.asked]
 
     def __getattr__(self, verb: str) -> Any:
@@ -272,7 +272,7 @@ class ScriptedControl:
             raise AttributeError(verb)
         return lambda *args, **kwargs: self._note(verb, **({"args": args} if args else {}), **kwargs)
 
-    def check(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
+    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """A plan."""
-        self._note("check", procedure=procedure, arguments=arguments)
-        return ScriptedSource().check(procedure, arguments)
+        self._note("plan", procedure=procedure, arguments=arguments)
+        return ScriptedSource().plan(procedure, arguments)

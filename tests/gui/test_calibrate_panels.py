@@ -1,4 +1,4 @@
-"""The panels of the Calibrate workspace on a source that the test scripts."""
+"""The panels of the Calibrate workspace on a scripted source."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import fake_results as fake
 import numpy as np
 import pytest
-from gui_windows import dispose, shown
+from gui_windows import dispose, show_window
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
@@ -36,7 +36,7 @@ from escape_hw.remote.state import (
     ProductEntry,
 )
 
-OFFERS = (
+PROCEDURES = (
     ProcedureEntry(
         name="escape",
         title="ESCAPE",
@@ -46,7 +46,9 @@ OFFERS = (
                 name="frames", kind="int", default=1000, unit="frame", low=1, high=1e6, help="How many."
             ),
             ProcedureParameter(name="snr", kind="float", low=0.01, help="Goal."),
-            ProcedureParameter(name="pokes", kind="choice", default="white", choices=("white", "shaped")),
+            ProcedureParameter(
+                name="pokes", kind="choice", default="white", choices=("white", "anticorrelated")
+            ),
             ProcedureParameter(name="plain", kind="bool", default=False),
             ProcedureParameter(name="closed_loop", kind="matrix"),
         ),
@@ -60,14 +62,14 @@ OFFERS = (
 )
 MATRIX = fake.calibration("docrime-whitened", n=24, n_modes=30).matrix
 RUNNING = ActiveRun(
-    id=3, name="escape", arguments={}, stage="DO-CRIME", done=610, total=1000, remaining_s=252.0
+    id=3, name="escape", arguments={}, stage="DO-CRIME", completed=610, total=1000, remaining_s=252.0
 )
 
 
 @pytest.fixture
 def source() -> ScriptedSource:
     source = ScriptedSource()
-    source.offers = OFFERS
+    source.entries = PROCEDURES
     source.change(phase=Phase.IDLE, products=())
     return source
 
@@ -75,7 +77,7 @@ def source() -> ScriptedSource:
 @pytest.fixture
 def calibrate(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
     kinds = (ProcedurePanel, ModesPanel, SprintPanel, GainsPanel)
-    window = shown(session, tmp_path / "gui.json", kinds, Settings(workspace="calibrate"))
+    window = show_window(session, tmp_path / "gui.json", kinds, Settings(workspace="calibrate"))
     window.resize(1600, 1000)
     for dock in window.docks.values():
         dock.show()
@@ -104,7 +106,7 @@ def press(button: QPushButton) -> None:
 
 
 def measure(source: ScriptedSource, share: float) -> None:
-    """The matrix after a share of its frames."""
+    """Push the matrix with the standard errors after a fraction of its frames."""
     sigma = MATRIX.sigma / np.sqrt(share)
     source.push("valid", MATRIX.valid.astype(np.float32))
     source.push("matrix_sigma", sigma, stage="DO-CRIME")
@@ -116,22 +118,22 @@ def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
     panel = calibrate.panels["modes"]
     look(calibrate)
     assert panel.shows_placeholder
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     measure(source, 1e-4)
     look(calibrate)
     assert not panel.shows_placeholder
     assert panel.matrix_selector.currentData() == LIVE_LABEL
-    assert panel.matrix_selector.currentText() == "DO-CRIME, as measured now"
+    assert panel.matrix_selector.currentText() == "DO-CRIME, live"
     pale = contrast(panel)
     measure(source, 1.0)
     look(calibrate)
     assert contrast(panel) > 2 * pale
-    panel.fade.setChecked(False)
+    panel.weight_by_snr.setChecked(False)
     assert contrast(panel) > 2 * pale
 
 
 def contrast(panel: ModesPanel) -> float:
-    """How far the mosaic's colours lie from white."""
+    """Mean distance of the mosaic's colours from white."""
     picture = panel.mosaic._image.image.astype(float)
     return float(np.abs(picture[picture > 0] - 128).mean())
 
@@ -156,28 +158,29 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     until(lambda: mosaic.mode == 4, calibrate)
     assert panel.detail.isVisible()
     assert panel.detail.titles == (
-        "push-pull", "DO-CRIME", "ESCAPE", "ESCAPE − push-pull", "Error of DO-CRIME", "SNR of DO-CRIME",
+        "push-pull", "DO-CRIME", "ESCAPE", "ESCAPE − push-pull", "Standard error of DO-CRIME",
+        "SNR of DO-CRIME",
     )  # fmt: skip
-    assert panel._words.text().startswith("mode 5  rms slope")
+    assert panel._status_label.text().startswith("mode 5  rms slope")
     mosaic.setFocus()
     QTest.keyClick(mosaic, Qt.Key.Key_Right)
     assert mosaic.mode == 5
     QTest.keyClick(mosaic, Qt.Key.Key_Escape)
     assert not panel.detail.isVisible()
-    names = [array.name for array in panel.shown()]
+    names = [array.name for array in panel.export_arrays()]
     assert names == ["matrix", "sigma"]
 
 
 @pytest.mark.parametrize(
     ("width", "height", "columns"), [(900, 260, 6), (480, 300, 3), (500, 700, 2), (500, 1200, 1)]
 )
-def test_tiles_use_their_room(width, height, columns):
+def test_tiles_use_the_available_space(width, height, columns):
     assert best_columns(6, width, height, 56) == columns
 
 
-def test_pages_turn(calibrate, source):
+def test_pages_change(calibrate, source):
     panel = calibrate.panels["modes"]
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     measure(source, 1.0)
     look(calibrate)
     panel.mosaic.setMaximumSize(240, 160)
@@ -198,34 +201,35 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     estimate = fake.registration()
     path = np.array([step.registration.to_array() for step in estimate.iterations])
     norm = np.array([step.step_norm for step in estimate.iterations])
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     source.push("registration", path[:6] * TO_STREAM_UNITS)
     source.push("registration_sigma", np.full(5, np.nan))
     source.push("step_norm", norm[:6])
     look(calibrate)
-    assert panel._indicator.word == "running, 6 iterations"
+    assert panel._indicator.text == "running, 6 iterations"
     source.push("registration", path * TO_STREAM_UNITS)
     source.push("registration_sigma", estimate.sigma * TO_STREAM_UNITS)
     source.push("step_norm", norm)
     document = calibration_document(fake.calibration("escape"))
     ended = FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document)
-    source.change(phase=Phase.IDLE, procedure=None, last=ended)
+    source.change(phase=Phase.IDLE, active_run=None, last_run=ended)
     look(calibrate)
-    assert panel._indicator.word == "converged, 18 iterations"
+    assert panel._indicator.text == "converged, 18 iterations"
     assert "±" in panel._values[0].text()
     assert "tangential_scaling is consistent with zero" in panel._notes.text()
-    # Runs that fit no registration leave the verdict as it is, gains that did not converge among them.
+    # Runs without a registration do not change the state of the fit.
     for k, name, told in ((4, "push-pull", None), (5, "gains", False)):
-        source.change(last=FinishedRun(id=k, name=name, finish=Finish.ABORTED, document={"converged": told}))
+        ended = FinishedRun(id=k, name=name, finish=Finish.ABORTED, document={"converged": told})
+        source.change(last_run=ended)
         look(calibrate)
-        assert panel._indicator.word == "converged, 18 iterations"
+        assert panel._indicator.text == "converged, 18 iterations"
     press(panel.units)
     assert panel.plot.physical
-    table = panel.shown()[0].data
+    table = panel.export_arrays()[0].data
     np.testing.assert_allclose(table[:, 2:], path, rtol=1e-6)
 
 
-def test_a_drift_is_followed(calibrate, source):
+def test_a_drift_is_shown(calibrate, source):
     panel = calibrate.panels["sprint"]
     track = np.zeros((30, 11))
     track[:, 0] = np.arange(30)
@@ -233,13 +237,13 @@ def test_a_drift_is_followed(calibrate, source):
     source.push("registration_track", track)
     look(calibrate)
     assert panel.tabs.currentIndex() == 1
-    np.testing.assert_allclose(panel.shown()[-1].data[-1, 1], 2.9)
+    np.testing.assert_allclose(panel.export_arrays()[-1].data[-1, 1], 2.9)
 
 
 def test_gains_appear_round_by_round(calibrate, source):
     panel = calibrate.panels["gains"]
     gains = fake.optical_gains(0.7)
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     source.push("gains", gains.value, stage="round 2")
     source.push("gains_sigma", gains.sigma)
     source.push("gains_smooth", gains.trend)
@@ -248,7 +252,7 @@ def test_gains_appear_round_by_round(calibrate, source):
     assert "median 0.700" in panel._legend.text()
     assert "2 rounds" in panel._legend.text()
     press_box(panel)
-    assert panel.shown()[0].data.shape == (20, 5)
+    assert panel.export_arrays()[0].data.shape == (20, 5)
 
 
 def press_box(panel: GainsPanel) -> None:
@@ -257,24 +261,24 @@ def press_box(panel: GainsPanel) -> None:
 
 
 # ---------------------------------------------------------------- procedures
-def test_from_the_form_to_the_start(calibrate, source, control):
+def test_a_procedure_is_started_from_the_form(calibrate, source, control):
     panel = calibrate.panels["procedure"]
     look(calibrate)
     assert [panel.choice.itemText(k) for k in range(panel.choice.count())] == ["ESCAPE", "Optical gains"]
     assert not panel.start.isEnabled()
     panel.form.set_value("frames", "200")
-    panel.form.set_value("pokes", "shaped")
+    panel.form.set_value("pokes", "anticorrelated")
     until(panel.start.isEnabled, calibrate)
-    arguments = {"frames": 200, "pokes": "shaped"}
-    assert ("check", {"procedure": "escape", "arguments": arguments}) in control.asked
+    arguments = {"frames": 200, "pokes": "anticorrelated"}
+    assert ("plan", {"procedure": "escape", "arguments": arguments}) in control.asked
     assert "frames" in panel.plan.text()
-    assert "% of the stroke" in panel.plan.text()
+    assert "% of stroke" in panel.plan.text()
     press(panel.start)
     until(lambda: any(verb == "start" for verb, _ in control.asked), calibrate)
     assert ("start", {"args": ("escape",), **arguments}) in control.asked
 
 
-def test_a_form_that_is_wrong_starts_nothing(calibrate, control):
+def test_an_invalid_form_starts_nothing(calibrate, control):
     panel = calibrate.panels["procedure"]
     look(calibrate)
     until(panel.start.isEnabled, calibrate)
@@ -287,7 +291,7 @@ def test_a_form_that_is_wrong_starts_nothing(calibrate, control):
     assert "not checked" in panel.start.toolTip()
 
 
-def test_a_refusal_is_told_beside_the_form(calibrate, control):
+def test_a_refusal_is_shown_below_the_form(calibrate, control):
     panel = calibrate.panels["procedure"]
     control.refuse = "no light on the sensor"
     look(calibrate)
@@ -296,42 +300,42 @@ def test_a_refusal_is_told_beside_the_form(calibrate, control):
     control.refuse = ""
 
 
-def test_a_procedure_is_watched_halted_and_stopped(calibrate, source, control):
+def test_a_procedure_is_monitored_paused_and_aborted(calibrate, source, control):
     panel = calibrate.panels["procedure"]
     look(calibrate)
     assert not panel.abort.isEnabled()
-    assert "no procedure runs" in panel.abort.toolTip()
+    assert "no procedure is running" in panel.abort.toolTip()
     measure(source, 1.0)
-    source.change(phase=Phase.PROCEDURE, procedure=RUNNING)
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     look(calibrate)
     source.change()
     look(calibrate)
     assert panel.progress.text() == "DO-CRIME: 610 of 1000 frames, 4:12 min left"
     assert "worst mode 1: SNR" in panel._metrics.text()
     assert panel.bar.value() == 610
-    assert "a procedure runs" in panel.start.toolTip()
+    assert "a procedure is running" in panel.start.toolTip()
     press(panel.pause)
     until(lambda: ("pause", {}) in control.asked, calibrate)
-    source.change(procedure=RUNNING.model_copy(update={"paused": True}))
+    source.change(active_run=RUNNING.model_copy(update={"paused": True}))
     look(calibrate)
-    assert panel.pause.text() == "Go on"
+    assert panel.pause.text() == "Resume"
     press(panel.pause)
     until(lambda: ("resume", {}) in control.asked, calibrate)
     press(panel.abort)
     until(lambda: ("abort", {}) in control.asked, calibrate)
 
 
-def test_the_result_stands_beside_the_one_before(calibrate, source):
+def test_the_result_is_compared_with_the_previous_one(calibrate, source):
     panel = calibrate.panels["procedure"]
     document = calibration_document(fake.calibration("escape"))
     first = FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/1", document=document)
-    source.change(last=first)
+    source.change(last_run=first)
     look(calibrate)
     assert panel.outcome.text() == "Done: escape"
     assert "Δ" not in panel.numbers.text()
     assert not panel.report.isVisible()
     second = first.model_copy(update={"id": 2, "products": {"report": "/runs/2/report.html"}})
-    source.change(last=second)
+    source.change(last_run=second)
     look(calibrate)
     assert "(Δ 0.00 ± " in panel.numbers.text()
     assert panel.report.isVisible()

@@ -1,4 +1,4 @@
-"""Every action of the table, through its menu entry: what it does, and why it is impossible otherwise."""
+"""Every action of the table: its effect when triggered, and the reason when it is unavailable."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SOMEBODY = Lease(
 
 
 class Stage:
-    """What a check may look at."""
+    """Objects that the checks use."""
 
     def __init__(
         self, window: MainWindow, source: ScriptedSource, control: ScriptedControl, folder: Path, bot: QtBot
@@ -31,13 +31,13 @@ class Stage:
         self.window, self.source, self.control, self.folder, self.bot = window, source, control, folder, bot
 
     def asked(self, verb: str, **arguments: object) -> None:
-        """The server was asked exactly this."""
+        """The server received exactly this request."""
         self.bot.waitUntil(lambda: self.control.asked == [(verb, arguments)], timeout=5000)
 
     def refused(self, name: str) -> None:
-        """What was chosen is no recording, and a note says so."""
-        self.bot.waitUntil(lambda: bool(self.window.notifications.notes), timeout=5000)
-        assert name in self.window.notifications.notes[-1].text
+        """The chosen file is not a recorded run, and a notification says so."""
+        self.bot.waitUntil(lambda: bool(self.window.notifications.notifications), timeout=5000)
+        assert name in self.window.notifications.notifications[-1].text
 
     def saved(self, ending: str) -> Path:
         """One file was saved."""
@@ -81,7 +81,7 @@ def _reset(stage: Stage) -> None:
     assert stage.window.docks["log"].isVisible()
 
 
-#: What each action must have done. An action that is missing here fails.
+#: Check of the effect of each action. The test of an action without a check fails.
 CHECKS: dict[str, Callable[[Stage], None]] = {
     "open_product": lambda s: s.refused("chosen.fits"),
     "open_run": lambda s: s.refused("saved"),
@@ -113,10 +113,10 @@ CHECKS: dict[str, Callable[[Stage], None]] = {
     "keys": lambda s: _is("Ctrl+Shift+F" in s.window.overlay.page),
 }
 
-#: What must be so before, where the usual state does not do.
+#: Changes of the state that an action needs.
 SETTINGS: dict[str, Callable[[ScriptedSource], None]] = {
-    "abort": lambda s: s.change(procedure=RUN),
-    "pause": lambda s: s.change(procedure=RUN),
+    "abort": lambda s: s.change(active_run=RUN),
+    "pause": lambda s: s.change(active_run=RUN),
     "take_control": lambda s: s.change(lease=SOMEBODY),
     "clear_fault": lambda s: s.change(phase=Phase.FAULT, fault=FAULT),
 }
@@ -146,7 +146,7 @@ def test_every_action_does_what_it_says(
     SETTINGS.get(action.name, lambda _: None)(source)
     if action.name == "reset_layout":
         window.docks["log"].close()
-    window.panels["camera"].picture.setFocus()
+    window.panels["camera"].image_view.setFocus()
     window.refresh()
     entry = window.actions_by_name[action.name]
     assert entry.isEnabled(), entry.toolTip()
@@ -159,10 +159,10 @@ def test_every_action_does_what_it_says(
 @pytest.mark.parametrize(
     ("names", "state", "reason"),
     [
-        (("abort", "pause"), {}, "no procedure runs"),
+        (("abort", "pause"), {}, "no procedure is running"),
         (("take_control",), {}, "you have control"),
         (("give_back",), {"lease": None}, "you do not have control"),
-        (("clear_fault",), {}, "there is no fault"),
+        (("clear_fault",), {}, "no active fault"),
         (("record", "pause"), {"lease": None}, "take control first"),
         (("record",), {"lease": SOMEBODY}, "ben on control has control"),
     ],
@@ -188,10 +188,10 @@ def test_without_a_server_nothing_can_be_asked(small_window: MainWindow, source:
     asking = [one for one in ACTIONS if one.menu == "&Loop"]
     source.connected = False
     window.refresh()
-    assert all("does not answer" in window.actions_by_name[one.name].toolTip() for one in asking)
+    assert all("server not responding" in window.actions_by_name[one.name].toolTip() for one in asking)
     window.context.session.set_source(source, None)
     window.refresh()
-    assert all("replayed" in window.actions_by_name[one.name].toolTip() for one in asking)
+    assert all("replay of a recorded run" in window.actions_by_name[one.name].toolTip() for one in asking)
     assert not any(window.actions_by_name[one.name].isEnabled() for one in asking)
 
 

@@ -1,4 +1,4 @@
-"""The way to a server: what takes time is fetched by a thread, and a lost server is found again."""
+"""Connection to a server: slow requests are made in a thread, and a lost server is found again."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from escape_hw.remote.state import Geometry, ProcedureEntry
 
 
 class FakeConnection(ScriptedSource):
-    """A connection that notes from which thread it is asked what takes time."""
+    """A connection that records the threads of its slow requests."""
 
     def __init__(self) -> None:
         super().__init__()
         self.push_all()
-        self.offers = (ProcedureEntry(name="escape", title="ESCAPE", help=""),)
+        self.entries = (ProcedureEntry(name="escape", title="ESCAPE", help=""),)
         self.askers: set[threading.Thread] = set()
         self.closed = False
 
@@ -41,7 +41,7 @@ class FakeConnection(ScriptedSource):
 
 
 class Network:
-    """Answers ``connect``; ``reachable`` says whether anybody is there."""
+    """Replaces ``connect``; fails unless ``reachable``."""
 
     def __init__(self) -> None:
         self.reachable = True
@@ -58,9 +58,9 @@ class Network:
 def network(monkeypatch: pytest.MonkeyPatch) -> Network:
     network = Network()
     monkeypatch.setattr(live, "connect", network.connect)
-    monkeypatch.setattr(live, "_DEAD_S", 0.3)
+    monkeypatch.setattr(live, "_RECONNECT_AFTER_S", 0.3)
     monkeypatch.setattr(live, "_RETRY_S", 0.02)
-    monkeypatch.setattr(live, "_HERE_S", 0.02)
+    monkeypatch.setattr(live, "_LOCAL_PERIOD_S", 0.02)
     return network
 
 
@@ -79,31 +79,31 @@ def attach(address: str, found: list[LiveSource]) -> Iterator[ServerAttachment]:
 
 
 @pytest.fixture
-def here(network: Network, found: list[LiveSource]) -> Iterator[ServerAttachment]:
+def local(network: Network, found: list[LiveSource]) -> Iterator[ServerAttachment]:
     yield from attach("razor-shwfs", found)
 
 
 @pytest.fixture
-def afar(network: Network, found: list[LiveSource]) -> Iterator[ServerAttachment]:
+def remote(network: Network, found: list[LiveSource]) -> Iterator[ServerAttachment]:
     yield from attach("tcp://bench:5555", found)
 
 
-def test_what_takes_time_is_asked_by_the_thread(
-    here: ServerAttachment, found: list[LiveSource], network: Network, qtbot: QtBot
+def test_slow_requests_are_made_in_the_thread(
+    local: ServerAttachment, found: list[LiveSource], network: Network, qtbot: QtBot
 ) -> None:
     qtbot.waitUntil(lambda: bool(found) and bool(found[0].procedures()))
     source = found[0]
     places = source.geometry()
-    assert places == network.made[0].places
+    assert places == network.made[0].geometry_data
     assert threading.current_thread() not in network.made[0].askers
-    # On this machine streams are read where they lie.
+    # Streams of a local server are read from shared memory in the calling thread.
     assert source.latest("frames") is not None
     assert threading.current_thread() in network.made[0].askers
     assert source.geometry() is places
 
 
-def test_streams_from_afar_never_stop_the_window(
-    afar: ServerAttachment, found: list[LiveSource], network: Network, qtbot: QtBot
+def test_streams_of_a_remote_server_do_not_block_the_window(
+    remote: ServerAttachment, found: list[LiveSource], network: Network, qtbot: QtBot
 ) -> None:
     qtbot.waitUntil(lambda: bool(found))
     source = found[0]
@@ -117,12 +117,12 @@ def test_streams_from_afar_never_stop_the_window(
     assert threading.current_thread() not in network.made[0].askers
 
 
-def test_a_server_that_came_back_is_found(
-    here: ServerAttachment, found: list[LiveSource], network: Network, qtbot: QtBot
+def test_a_restarted_server_is_found(
+    local: ServerAttachment, found: list[LiveSource], network: Network, qtbot: QtBot
 ) -> None:
     qtbot.waitUntil(lambda: len(found) == 1)
     reasons: list[str] = []
-    here.connection_failed.connect(reasons.append)
+    local.connection_failed.connect(reasons.append)
     network.reachable = False
     network.made[0].connected = False
     qtbot.waitUntil(lambda: bool(reasons))
@@ -131,11 +131,11 @@ def test_a_server_that_came_back_is_found(
     network.reachable = True
     qtbot.waitUntil(lambda: len(found) == 2)
     assert found[1].connected
-    here.discard(found[0])
+    local.discard(found[0])
     qtbot.waitUntil(lambda: network.made[0].closed)
 
 
-def test_hanging_up_closes_the_connection(network: Network, found: list[LiveSource], qtbot: QtBot) -> None:
+def test_close_closes_the_connection(network: Network, found: list[LiveSource], qtbot: QtBot) -> None:
     for attachment in attach("razor-shwfs", found):
         qtbot.waitUntil(lambda: bool(found))
         network.made[0].state = running(serial=5)

@@ -1,4 +1,4 @@
-"""Every panel through what can happen to its source; and what single panels show of it."""
+"""All panels in all states of their source, and the content of single panels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from escape_gui.panels.loop import LoopPanel
 from escape_gui.panels.mirror import MirrorPanel
 from escape_gui.panels.performance import PerformancePanel
 from escape_gui.panels.psf import PsfPanel
-from escape_gui.widgets.controls.hold_button import HOLD_MS
+from escape_gui.widgets.controls.buttons import HOLD_MS
 from escape_hw.errors import StorageError
 from escape_hw.remote.state import (
     DeviceHealth,
@@ -43,7 +43,7 @@ MakeWindow = Callable[..., MainWindow]
 
 @pytest.fixture
 def window(make_window: MakeWindow) -> MainWindow:
-    """A window of the panels that are looked at here together."""
+    """A window with several panels."""
     return make_window((DevicesPanel, CameraPanel, MirrorPanel, LoopPanel, PerformancePanel, LogPanel))
 
 
@@ -54,7 +54,7 @@ def panel_of(window: MainWindow, kind: type[P]) -> P:
 
 
 @pytest.mark.parametrize("kind", PANELS, ids=lambda kind: kind.name)
-def test_each_panel_lives_through_everything(
+def test_each_panel_handles_all_states_of_the_source(
     kind: type[Panel], make_window: MakeWindow, source: ScriptedSource
 ) -> None:
     window = make_window((kind,))
@@ -66,18 +66,18 @@ def test_each_panel_lives_through_everything(
         return panel.health
 
     assert look() is DeviceHealth.OK
-    assert not dock._pill.isVisible()
+    assert not dock._indicator.isVisible()
     source.fail()
     assert look() is DeviceHealth.FAULT
-    assert dock._pill.word == "fault"
+    assert dock._indicator.text == "fault"
     source.connected = False
     assert look() is DeviceHealth.LOST
-    assert dock._pill.word == "lost"
+    assert dock._indicator.text == "lost"
     source.connected = True
     source.state = running(engine_pid=99, serial=1000)
     source.push_all(1)
     assert look() is DeviceHealth.OK
-    # Nothing at all, as before the first connection.
+    # An empty source, as before the first connection.
     source.state, source.streams, source.lines = State(), {}, []
     look()
     assert panel.shows_placeholder == bool(panel.placeholder) or kind.stale_after_s is None
@@ -91,13 +91,13 @@ def test_frames_that_stop_are_called_stale(
     camera._last_sample_s -= 2.0
     window.update_timer.tick(force=True)
     assert camera.health is DeviceHealth.STALE
-    assert window.docks["camera"]._pill.word == "stale"
+    assert window.docks["camera"]._indicator.text == "stale"
     source.push_all(5)
     window.update_timer.tick(force=True)
     assert camera.health is DeviceHealth.OK
 
 
-def test_every_panel_says_what_to_do_when_there_is_nothing() -> None:
+def test_every_panel_has_a_help_text() -> None:
     for kind in PANELS:
         assert kind.title
         assert len(kind.help) > 40
@@ -109,12 +109,12 @@ def test_camera_counts_and_hatches_saturation(window: MainWindow, source: Script
     frame = np.zeros((400, 400), np.uint16)
     frame[7, 9] = 1023
     source.push("frames", frame, top=1023.0)
-    source.change(light=Illumination(saturated=0.0321, peak=1.0))
+    source.change(illumination=Illumination(saturated=0.0321, peak=1.0))
     camera._histogram_due = 0.0
     window.update_timer.tick(force=True)
     assert "3.21 %" in camera.saturation.text()
-    assert camera.picture._marks.isVisible()
-    assert np.argwhere(camera.picture._marks.image[..., 3]).tolist() == [[7, 9]]
+    assert camera.image_view._marks.isVisible()
+    assert np.argwhere(camera.image_view._marks.image[..., 3]).tolist() == [[7, 9]]
 
 
 def test_camera_views(window: MainWindow, source: ScriptedSource) -> None:
@@ -122,24 +122,24 @@ def test_camera_views(window: MainWindow, source: ScriptedSource) -> None:
     kept = source.streams["frames"].data.astype(np.float32)
     camera.choice.choose("arrows")
     assert camera.quiver.isVisible()
-    n = len(source.places.outlines_px)
+    n = len(source.geometry_data.outlines_px)
     assert camera.quiver.getData()[0].size == 2 * n
     camera.choice.choose("x | y")
     maps = camera.signed.data
     assert maps is not None
     assert np.isfinite(maps).sum() == 2 * n
-    camera.choice.choose("change")
+    camera.choice.choose("difference")
     source.push_all(3)
     window.update_timer.tick(force=True)
     assert camera.signed.data is not None
     assert np.array_equal(camera.signed.data, source.streams["frames"].data - kept)
 
 
-def test_cursor_says_place_and_value(window: MainWindow, source: ScriptedSource, qtbot: QtBot) -> None:
-    picture = panel_of(window, CameraPanel).picture
+def test_cursor_shows_position_and_value(window: MainWindow, source: ScriptedSource, qtbot: QtBot) -> None:
+    image_view = panel_of(window, CameraPanel).image_view
     said: list[str] = []
-    picture.cursor_changed.connect(said.append)
-    qtbot.keyClick(picture, Qt.Key.Key_Right)
+    image_view.cursor_changed.connect(said.append)
+    qtbot.keyClick(image_view, Qt.Key.Key_Right)
     value = source.streams["frames"].data[200, 201]
     assert said[-1].split() == ["x", "201", "y", "200", str(value), "counts"]
 
@@ -150,16 +150,16 @@ def test_mirror_of_a_secondary_shows_both(session: Session, make_window: MakeWin
     session.set_source(source, None)
     window = make_window((MirrorPanel,))
     mirror = panel_of(window, MirrorPanel)
-    assert mirror.picture.data is not None
-    painted = mirror.picture.data[np.isfinite(mirror.picture.data)]
+    assert mirror.image_view.data is not None
+    painted = mirror.image_view.data[np.isfinite(mirror.image_view.data)]
     assert set(np.unique(painted)) == set(source.streams["commands"].data.astype(np.float32))
     assert mirror.choice.buttons["measured"].isEnabled()
     mirror.choice.choose("measured")
-    assert mirror.picture.unit == "µm"
+    assert mirror.image_view.unit == "µm"
 
 
-def test_mirror_tells_peak_and_clipping(window: MainWindow, source: ScriptedSource) -> None:
-    source.change(mirror=MirrorState(rms=0.0812, peak=0.8, clipped=0.031))
+def test_mirror_shows_peak_and_clipping(window: MainWindow, source: ScriptedSource) -> None:
+    source.change(mirror=MirrorState(rms=0.0812, peak=0.8, saturated_share=0.031))
     window.show_workspace("align")
     window.update_timer.tick(force=True)
     readouts = panel_of(window, MirrorPanel).readouts
@@ -209,8 +209,8 @@ def test_closing_the_loop_needs_a_held_button(
     window: MainWindow, source: ScriptedSource, control: ScriptedControl, qtbot: QtBot
 ) -> None:
     loop = panel_of(window, LoopPanel)
-    assert "it is closed" in loop.close_button.toolTip()
-    source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4, leak=0.02, dropped_modes=3, modes=80))
+    assert "the loop is closed" in loop.close_button.toolTip()
+    source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4, leak=0.02, dropped_modes=3, n_modes=80))
     window.update_timer.tick(force=True)
     qtbot.mouseClick(loop.close_button, Qt.MouseButton.LeftButton)
     qtbot.wait(50)
@@ -246,9 +246,9 @@ def test_log_search_level_and_copy(window: MainWindow, source: ScriptedSource) -
     assert "message 4" in QGuiApplication.clipboard().text()
 
 
-def test_performance_has_gaps_where_nobody_looked(window: MainWindow, source: ScriptedSource) -> None:
+def test_performance_has_gaps_while_hidden(window: MainWindow, source: ScriptedSource) -> None:
     panel = panel_of(window, PerformancePanel)
-    panel._last -= 60.0
+    panel._last_state_s -= 60.0
     source.change(loop=source.state.loop.model_copy(update={"residual_nm": 50.0}))
     window.update_timer.tick(force=True)
     (table,) = panel.export_arrays()
@@ -279,7 +279,7 @@ def test_profiles_begin_at_the_strehl_ratio(make_window: MakeWindow, source: Scr
     assert profiles["psf_profile"][0] / profiles["model_psf_profile"][0] == pytest.approx(0.25, rel=0.01)
 
 
-def test_latencies_are_counted_where_they_lie(make_window: MakeWindow, source: ScriptedSource) -> None:
+def test_latencies_are_exported_by_bin(make_window: MakeWindow, source: ScriptedSource) -> None:
     window = make_window((LatencyPanel,))
     (table,) = panel_of(window, LatencyPanel).export_arrays()
     assert table.data[:, 1].sum() == 4000
@@ -305,23 +305,21 @@ def test_devices_are_listed_with_units(window: MainWindow, source: ScriptedSourc
         ("unread", 4.0, "unread 4"),
     ],
 )
-def test_facts_in_words(key: str, value: float | str, text: str) -> None:
+def test_format_of_facts(key: str, value: float | str, text: str) -> None:
     assert format_fact(key, value) == text
 
 
-def test_a_full_disk_is_told_and_nothing_breaks(
-    window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_notified(window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, content: bytes) -> None:
         raise StorageError(f"{path}: cannot be written (No space left on device)")
 
     monkeypatch.setattr("escape_gui.window.export.write_atomic", full)
     window.exporter.save_panel_to(tmp_path / "a.png", "png", window.panels["camera"])
-    assert "No space left" in window.notifications.notes[-1].text
+    assert "No space left" in window.notifications.notifications[-1].text
     assert list(tmp_path.glob("a*")) == []
 
 
-def test_a_missing_model_image_is_told(make_window: MakeWindow, source: ScriptedSource) -> None:
+def test_a_missing_reference_psf_is_shown(make_window: MakeWindow, source: ScriptedSource) -> None:
     model = source.streams.pop("model_psf")
     source.change(loop=LoopState(closed=True, matrix="escape", residual_nm=50.0))
     window = make_window((PsfPanel, PerformancePanel))
@@ -330,9 +328,9 @@ def test_a_missing_model_image_is_told(make_window: MakeWindow, source: Scripted
     window.update_timer.tick(force=True)
     assert "run model-psf" in psf.captions["model_psf"].text()
     assert performance.readouts["strehl"].text == "–"
-    assert performance.model_missing_label.isVisible()
+    assert performance.reference_missing_label.isVisible()
     source.streams["model_psf"] = model
     source.change(streams=(StreamEntry(name="model_psf", segment="", unit=""),))
     window.update_timer.tick(force=True)
-    assert psf.captions["model_psf"].text() == "model, dashed"
-    assert not performance.model_missing_label.isVisible()
+    assert psf.captions["model_psf"].text() == "PSF: reference (dashed)"
+    assert not performance.reference_missing_label.isVisible()

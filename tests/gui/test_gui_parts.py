@@ -1,4 +1,4 @@
-"""Theme, settings, requests, maps, and the way to a server: what stands behind the widgets."""
+"""Theme, settings, requests, maps, and the command: everything except panels and window."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from scripted import ScriptedControl, disc, rows_of, secondary
 from escape_gui.app import require_display
 from escape_gui.client.session import RequestSender
 from escape_gui.settings import Settings, load_settings, save_settings
-from escape_gui.theme import PALETTES, SCALES, Palette, Theme, contrast
-from escape_gui.views.images import GAP, ActuatorImage, RadialProfile, mask_from_rows, slope_map_pair
+from escape_gui.theme import PALETTES, SCALES, Palette, Theme
+from escape_gui.views.images import MAP_GAP, ActuatorImage, RadialProfile, mask_from_rows, slope_map_pair
 from escape_gui.views.loop_form import LoopSettingsEdit
 from escape_gui.widgets.images.quiver import outline_points
-from escape_gui.widgets.plots.strip_chart import TimeSeriesBuffer
+from escape_gui.widgets.plots.plot import TimeSeriesBuffer
 from escape_hw.cli.app import run
 from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Geometry, LoopState
@@ -36,6 +36,19 @@ PAIRS = (
 )
 
 
+def contrast(one: str, other: str) -> float:
+    """Contrast ratio of two colours, from 1 to 21 (Web Content Accessibility Guidelines 2.2, 1.4.3)."""
+    bright, dim = sorted((_luminance(one), _luminance(other)), reverse=True)
+    return (bright + 0.05) / (dim + 0.05)
+
+
+def _luminance(colour: str) -> float:
+    """Relative luminance of an sRGB colour, 0 to 1 (same source)."""
+    channels = (int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
 @pytest.mark.parametrize("colours", PALETTES.values(), ids=PALETTES.keys())
 def test_every_text_can_be_read(colours: Palette) -> None:
     pairs = [(text, surface) for text in TEXTS for surface in SURFACES]
@@ -48,7 +61,7 @@ def test_every_text_can_be_read(colours: Palette) -> None:
 
 
 @pytest.mark.parametrize("colours", PALETTES.values(), ids=PALETTES.keys())
-def test_curves_stand_out_from_their_ground(colours: Palette) -> None:
+def test_curves_contrast_with_their_background(colours: Palette) -> None:
     assert min(contrast(colour, colours.field) for colour in colours.series) >= 3.0
 
 
@@ -57,7 +70,7 @@ def test_contrast_is_that_of_the_guidelines() -> None:
     assert contrast("#777777", "#ffffff") == pytest.approx(4.48, abs=0.01)
 
 
-def test_letters_grow_in_steps_and_stop(qtbot: QtBot) -> None:
+def test_font_scale_changes_in_steps_within_limits(qtbot: QtBot) -> None:
     theme = Theme()
     for _ in range(20):
         theme.step_scale(+1)
@@ -97,7 +110,7 @@ def test_sound_settings_survive_beside_damaged_ones(tmp_path: Path) -> None:
     assert load_settings(path) == (settings, ())
 
 
-def test_without_a_file_there_is_nothing_to_warn_of(tmp_path: Path) -> None:
+def test_a_missing_settings_file_gives_no_warning(tmp_path: Path) -> None:
     assert load_settings(tmp_path / "none.json") == (Settings(), ())
 
 
@@ -110,7 +123,7 @@ def requests(control: ScriptedControl):
     requests.deleteLater()
 
 
-def test_answers_come_back_into_the_windows_thread(requests: RequestSender, qtbot: QtBot) -> None:
+def test_answers_are_delivered_in_the_windows_thread(requests: RequestSender, qtbot: QtBot) -> None:
     threads: list[threading.Thread] = []
     asked = threading.current_thread()
 
@@ -139,7 +152,7 @@ def test_safety_does_not_wait_behind_a_slow_question(
     go_on.set()
 
 
-def test_a_failure_reaches_whoever_asked(
+def test_a_failure_is_reported_to_the_caller(
     requests: RequestSender, control: ScriptedControl, qtbot: QtBot
 ) -> None:
     control.refuse = "the loop is open"
@@ -150,7 +163,7 @@ def test_a_failure_reaches_whoever_asked(
     assert heard == ["the loop is open"]
 
 
-def test_answers_after_the_end_are_dropped(control: ScriptedControl, qtbot: QtBot) -> None:
+def test_answers_after_closing_are_discarded(control: ScriptedControl, qtbot: QtBot) -> None:
     requests = RequestSender(control)
     go_on, heard = threading.Event(), []
     requests.ask("slow", lambda server: go_on.wait(20), heard.append)
@@ -168,9 +181,9 @@ def test_slopes_become_two_maps() -> None:
     valid = disc(5)
     n = int(valid.sum())
     maps = slope_map_pair(np.arange(2.0 * n), valid)
-    assert maps.shape == (5, 10 + GAP)
+    assert maps.shape == (5, 10 + MAP_GAP)
     assert maps[:, :5][valid].tolist() == list(range(n))
-    assert maps[:, 5 + GAP :][valid].tolist() == list(range(n, 2 * n))
+    assert maps[:, 5 + MAP_GAP :][valid].tolist() == list(range(n, 2 * n))
     assert int(np.isfinite(maps).sum()) == 2 * n
 
 
@@ -183,18 +196,18 @@ def test_actuators_on_a_grid_have_a_square_each() -> None:
     chart = ActuatorImage(Geometry(layout=rows_of(mask)))
     values = np.arange(chart.n_act, dtype=float)
     assert chart.n_act == int(mask.sum())
-    picture = chart.picture(values)
-    assert picture[mask].tolist() == values.tolist()
-    assert np.isnan(picture[~mask]).all()
+    image = chart.to_image(values)
+    assert image[mask].tolist() == values.tolist()
+    assert np.isnan(image[~mask]).all()
 
 
-def test_actuators_without_a_grid_stand_at_their_places() -> None:
-    places = secondary().places_m
-    chart = ActuatorImage(Geometry(places_m=places))
-    picture = chart.picture(np.array([x for x, _ in places]))
-    # Values rise to the right as the places do, and every actuator is to be seen.
-    rows, columns = np.nonzero(np.isfinite(picture))
-    assert np.corrcoef(columns, picture[rows, columns])[0, 1] > 0.99
+def test_actuators_without_a_grid_are_at_their_positions() -> None:
+    places = secondary().positions_m
+    chart = ActuatorImage(Geometry(positions_m=places))
+    image = chart.to_image(np.array([x for x, _ in places]))
+    # Values increase to the right like the positions, and every actuator is visible.
+    rows, columns = np.nonzero(np.isfinite(image))
+    assert np.corrcoef(columns, image[rows, columns])[0, 1] > 0.99
     assert set(np.unique(chart.numbers)) == {-1, *range(len(places))}
 
 
@@ -214,7 +227,7 @@ def test_outlines_of_lenslets_are_squares_and_of_pupils_circles() -> None:
     assert np.hypot(*circle[:, :-1]) == pytest.approx(3.0)
 
 
-def test_history_forgets_the_oldest() -> None:
+def test_history_discards_the_oldest() -> None:
     history = TimeSeriesBuffer(4)
     for k in range(11):
         history.add(float(k), 10.0 * k)
@@ -226,7 +239,7 @@ def test_history_forgets_the_oldest() -> None:
 
 
 def test_what_an_edit_changes() -> None:
-    loop = LoopState(matrix="escape", gain=0.4, leak=0.02, dropped_modes=3, modes=80)
+    loop = LoopState(matrix="escape", gain=0.4, leak=0.02, dropped_modes=3, n_modes=80)
     assert LoopSettingsEdit("escape", 0.4, 0.02, 3).changed(loop) == {}
     edit = LoopSettingsEdit("docrime", 0.4, 0.02, 5)
     assert edit.changed(loop) == {"matrix": "docrime", "dropped_modes": 5}
@@ -244,7 +257,7 @@ def test_a_system_and_an_address_are_refused(capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.parametrize(("display", "said"), [("", "ssh -X"), (":0", "apt install libxcb-cursor0")])
-def test_without_a_display_the_way_out_is_told(
+def test_without_a_display_the_message_names_the_remedy(
     monkeypatch: pytest.MonkeyPatch, display: str, said: str
 ) -> None:
     for name in ("QT_QPA_PLATFORM", "WAYLAND_DISPLAY"):
@@ -258,7 +271,7 @@ def test_without_a_display_the_way_out_is_told(
 
 
 def test_qt_keeps_its_references() -> None:
-    """PySide6 6.12.0 on Python < 3.12 drops one with every signal, and aborts within some thousands."""
+    """PySide6 6.12.0 on Python < 3.12 loses a reference with every signal and aborts after some thousands."""
     code = (
         "from PySide6.QtCore import QObject, Signal\n"
         "class Bell(QObject):\n    rung = Signal(bool)\n"

@@ -1,4 +1,4 @@
-"""The window itself: safety buttons, band, layout, looks, and what it costs."""
+"""The main window: safety buttons, header, layout, theme, cost of hidden panels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from gui_windows import dispose, settle, shown
+from gui_windows import dispose, settle, show_window
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtWidgets import (
     QAbstractButton,
@@ -41,14 +41,14 @@ from escape_hw.remote.state import (
 MakeWindow = Callable[..., MainWindow]
 
 
-def places(header: HeaderBar) -> list[QPoint]:
+def button_positions(header: HeaderBar) -> list[QPoint]:
     return [
         button.mapTo(header.window(), QPoint(0, 0)) for button in (header.open_button, header.flatten_button)
     ]
 
 
 def test_safety_buttons_never_move(window: MainWindow, source: ScriptedSource, qapp: QApplication) -> None:
-    where = places(window.header)
+    positions = button_positions(window.header)
     for one in WORKSPACES:
         window.show_workspace(one.name)
         source.change(rates=source.state.rates.model_copy(update={"lost": 999999, "frame_hz": 9999.9}))
@@ -57,11 +57,11 @@ def test_safety_buttons_never_move(window: MainWindow, source: ScriptedSource, q
         )
         window.refresh()
         qapp.processEvents()
-        assert places(window.header) == where
+        assert button_positions(window.header) == positions
     source.fail()
     window.refresh()
     qapp.processEvents()
-    assert places(window.header) == where
+    assert button_positions(window.header) == positions
 
 
 def test_safety_keys_work_from_everywhere(
@@ -83,7 +83,7 @@ def test_safety_keys_work_from_everywhere(
     assert not window.overlay.isVisible()
 
 
-def test_the_band_says_what_it_is(small_window: MainWindow, source: ScriptedSource) -> None:
+def test_the_banner_states_the_kind_of_source(small_window: MainWindow, source: ScriptedSource) -> None:
     window = small_window
     connection_banner = window.header.connection_banner
     assert connection_banner.text().startswith("SIMULATED")
@@ -94,18 +94,18 @@ def test_the_band_says_what_it_is(small_window: MainWindow, source: ScriptedSour
     source.connected = False
     window.refresh()
     assert connection_banner.text().startswith("NOT CONNECTED")
-    assert window.notifications.notes[-1].title == "Server lost"
+    assert window.notifications.notifications[-1].title == "Server lost"
     window.context.session.set_source(source, None)
     window.refresh()
     assert connection_banner.text().startswith("REPLAY")
 
 
-def test_light_is_unknown_until_frames_come(small_window: MainWindow, source: ScriptedSource) -> None:
-    light = small_window.header.light
-    assert (light.level, light.word) == (Level.GOOD, "saturated 0.04 %")
+def test_saturation_is_unknown_until_frames_arrive(small_window: MainWindow, source: ScriptedSource) -> None:
+    indicator = small_window.header.saturation
+    assert (indicator.level, indicator.text) == (Level.GOOD, "saturated 0.04 %")
     source.change(rates=FrameCounters())
     small_window.refresh()
-    assert (light.level, light.word) == (Level.NEUTRAL, "saturated –")
+    assert (indicator.level, indicator.text) == (Level.NEUTRAL, "saturated –")
 
 
 def test_a_fault_stays_until_it_is_cleared(
@@ -118,21 +118,21 @@ def test_a_fault_stays_until_it_is_cleared(
     assert window.fault_banner.isVisible()
     assert "no frames for 0.5 s" in window.fault_banner._text.text()
     assert "cable" in window.fault_banner._text.text()
-    assert window.notifications.notes[-1].title == "Fault, mirror made safe"
+    assert window.notifications.notifications[-1].title == "Fault, mirror made safe"
     source.change(fault=None)
     window.refresh()
     assert not window.fault_banner.isVisible()
 
 
-def test_the_end_of_a_run_is_told(small_window: MainWindow, source: ScriptedSource) -> None:
+def test_the_end_of_a_run_is_notified(small_window: MainWindow, source: ScriptedSource) -> None:
     source.change(
-        last=FinishedRun(id=1, name="escape", finish=Finish.FAILED, message="too dark", folder="/runs/2")
+        last_run=FinishedRun(id=1, name="escape", finish=Finish.FAILED, message="too dark", folder="/runs/2")
     )
     small_window.refresh()
-    note = small_window.notifications.notes[-1]
+    note = small_window.notifications.notifications[-1]
     assert (note.title, note.text) == ("escape failed", "too dark\n/runs/2")
     note.close_button.click()
-    assert small_window.notifications.notes == []
+    assert small_window.notifications.notifications == []
 
 
 def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: ScriptedSource) -> None:
@@ -143,7 +143,7 @@ def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: Scri
         *(ProcedureParameter(name=f"number {k}", kind="int", default=k, unit="frame") for k in range(7)),
     )
     about = "Calibrates without a calibration source: DO-CRIME on the turbulence, then SPRINT. " * 2
-    source.offers = (ProcedureEntry(name="escape", title="ESCAPE", help=about, parameters=parameters),)
+    source.entries = (ProcedureEntry(name="escape", title="ESCAPE", help=about, parameters=parameters),)
     document = {
         "gain": 0.97,
         "residual_rms_nm": 44.0,
@@ -151,7 +151,7 @@ def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: Scri
         "strehl": {"peak": {"value": 0.4}},
     }
     source.change(
-        last=FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/2", document=document)
+        last_run=FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/2", document=document)
     )
     window = make_window(settings=Settings(workspace="calibrate"))
     panel = window.panels["procedure"]
@@ -174,7 +174,7 @@ def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: Scri
         assert field.width() >= 60
 
 
-def test_a_note_covers_nothing(
+def test_a_notification_covers_no_panel(
     small_window: MainWindow, qtbot: QtBot, qapp: QApplication, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     window, notifications = small_window, small_window.notifications
@@ -183,26 +183,28 @@ def test_a_note_covers_nothing(
     notifications.show_message(Level.ERROR, "Not saved", "the disk is full, " * 40 + "\n/runs/2")
     notifications.show_message(Level.GOOD, "Saved", "/runs/3")
     qapp.processEvents()
-    bad, good = notifications.notes
+    bad, good = notifications.notifications
     assert good.isVisible()
     assert not bad.isVisible()
     assert {name: dock.geometry() for name, dock in window.docks.items()} == where
     assert window.statusBar().isAncestorOf(good)
     assert window.width() == 1280
     assert "/runs/2" in bad.toolTip()
-    # What informs goes by itself; what is bad comes back and stays.
-    qtbot.waitUntil(lambda: notifications.notes == [bad], timeout=60_000)
+    # Information disappears after a time; the error is shown again and stays.
+    qtbot.waitUntil(lambda: notifications.notifications == [bad], timeout=60_000)
     qapp.processEvents()
     assert bad.isVisible()
     assert bad.close_button.mapTo(window, QPoint(0, 0)).x() < window.width()
 
 
-def test_a_refused_request_is_told(small_window: MainWindow, control: ScriptedControl, qtbot: QtBot) -> None:
+def test_a_refused_request_is_notified(
+    small_window: MainWindow, control: ScriptedControl, qtbot: QtBot
+) -> None:
     control.refuse = "ben has control since 20:00"
     small_window.actions_by_name["give_back"].trigger()
-    qtbot.waitUntil(lambda: bool(small_window.notifications.notes))
-    note = small_window.notifications.notes[-1]
-    assert (note.title, note.text) == ("Could not give control back", "ben has control since 20:00")
+    qtbot.waitUntil(lambda: bool(small_window.notifications.notifications))
+    note = small_window.notifications.notifications[-1]
+    assert (note.title, note.text) == ("Could not release control", "ben has control since 20:00")
 
 
 def test_hidden_panels_cost_nothing(window: MainWindow, source: ScriptedSource) -> None:
@@ -219,7 +221,7 @@ def test_hidden_panels_cost_nothing(window: MainWindow, source: ScriptedSource) 
 
 
 def test_a_tab_behind_another_costs_nothing(window: MainWindow, source: ScriptedSource) -> None:
-    """Log in front of Latency, Image in front of Mirror."""
+    """Log in front of Latency, PSF in front of Mirror."""
     window.docks["log"].raise_()
     window.docks["psf"].raise_()
     QApplication.processEvents()
@@ -240,30 +242,30 @@ def test_a_broken_panel_does_not_stop_the_others(
     source.push_all(1)
     window.update_timer.tick(force=True)
     assert window.panels["camera"].health is DeviceHealth.OK
-    # Another source gives it another chance.
+    # A new source clears the failures.
     window.context.session.set_source(source, None)
     window.update_timer.tick(force=True)
     assert window.update_timer.failed_panels == {}
 
 
-def test_frozen_panels_hold_but_the_band_goes_on(small_window: MainWindow, source: ScriptedSource) -> None:
+def test_frozen_panels_stop_but_the_header_updates(small_window: MainWindow, source: ScriptedSource) -> None:
     window = small_window
     window.toggle_freeze()
-    before = window.panels["camera"].picture.data
+    before = window.panels["camera"].image_view.data
     source.push_all(2)
     source.change(rates=source.state.rates.model_copy(update={"frame_hz": 123.4}))
     window.update_timer.tick(force=True)
-    assert window.panels["camera"].picture.data is before
+    assert window.panels["camera"].image_view.data is before
     assert window.header.readouts["rate"].text == "123.4"
 
 
-def test_layout_and_look_are_remembered(make_window: MakeWindow, tmp_path: Path) -> None:
+def test_layout_and_theme_are_saved(make_window: MakeWindow, tmp_path: Path) -> None:
     settings_path = tmp_path / "gui.json"
     window = make_window()
     window.docks["log"].close()
     window.show_workspace("align")
     window.toggle_theme()
-    window.step_font_scale(+1)
+    window.context.theme.step_scale(+1)
     window.close()
     settings, warnings = load_settings(settings_path)
     assert warnings == ()
@@ -276,7 +278,7 @@ def test_layout_and_look_are_remembered(make_window: MakeWindow, tmp_path: Path)
     assert not window.docks["log"].isVisible()
 
 
-def test_a_layout_of_another_time_is_dropped(make_window: MakeWindow) -> None:
+def test_an_invalid_layout_is_ignored(make_window: MakeWindow) -> None:
     settings = Settings(layouts={"operate": "AAAA"}, geometry="%%%", workspace="gone")
     window = make_window(settings=settings)
     assert window.workspace.name == "operate"
@@ -285,7 +287,7 @@ def test_a_layout_of_another_time_is_dropped(make_window: MakeWindow) -> None:
 
 def test_everything_can_be_reached_and_named(window: MainWindow) -> None:
     kinds = (QAbstractButton, QAbstractSpinBox, QComboBox, QLineEdit, QTabBar, ImageViewer)
-    nameless, deaf = [], []
+    nameless, unreachable = [], []
     for kind in kinds:
         for widget in window.findChildren(kind):
             # Qt's own: the tabs of docks behind each other, arrows of menus.
@@ -297,18 +299,18 @@ def test_everything_can_be_reached_and_named(window: MainWindow) -> None:
             if not (widget.accessibleName() or text or widget.toolTip()):
                 nameless.append(widget)
             if widget.focusPolicy() == Qt.FocusPolicy.NoFocus and not isinstance(widget, QTabBar):
-                deaf.append((widget, widget.accessibleName()))
+                unreachable.append((widget, widget.accessibleName()))
     assert nameless == []
-    assert deaf == []
+    assert unreachable == []
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.0, 1.4])
-def test_nothing_of_the_band_is_cut_off(make_window: MakeWindow, scale: float) -> None:
+def test_nothing_of_the_header_is_cut_off(make_window: MakeWindow, scale: float) -> None:
     window = make_window((), Settings(font_scale=scale))
     window.resize(round(1280 * max(scale, 1)), 800)
     QApplication.processEvents()
     header = window.header
-    for widget in (*header.readouts.values(), header.phase, header.loop, header.light, header.control):
+    for widget in (*header.readouts.values(), header.phase, header.loop, header.saturation, header.control):
         assert widget.width() >= widget.sizeHint().width()
         assert widget.geometry().right() < header.open_button.geometry().left()
 
@@ -317,15 +319,15 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
     session = Session()
     quiet: DataSource = EmptySource()
     assert not quiet.connected
-    window = shown(session, tmp_path / "gui.json")
+    window = show_window(session, tmp_path / "gui.json")
     assert window.panels["camera"].shows_placeholder
     header = window.header
     assert "escape serve SYSTEM" in header.connection_banner.text()
-    assert "old" not in header.connection_banner.text()
+    assert "stale" not in header.connection_banner.text()
     assert {one.text for one in header.readouts.values()} == {"–"}
-    for loop_indicator in (header.phase, header.loop, header.light, header.control):
+    for loop_indicator in (header.phase, header.loop, header.saturation, header.control):
         assert loop_indicator.level is Level.NEUTRAL
-        assert loop_indicator.word.endswith("–")
+        assert loop_indicator.text.endswith("–")
     assert "escape serve SYSTEM" in window.panels["loop"]._placeholder_label.text()
     dispose(window)
     session.close()
@@ -335,8 +337,8 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
 def test_the_window_fits_a_small_screen(
     make_window: MakeWindow, source: ScriptedSource, scale: float
 ) -> None:
-    """1366 x 768 with a task bar, even while a fault takes a row more."""
-    source.offers = (
+    """1366 x 768 with a task bar, also with the fault banner."""
+    source.entries = (
         ProcedureEntry(
             name="escape",
             title="ESCAPE",
@@ -344,7 +346,8 @@ def test_the_window_fits_a_small_screen(
             parameters=tuple(ProcedureParameter(name=f"number {k}", kind="int", default=k) for k in range(9)),
         ),
     )
-    source.change(last=FinishedRun(id=1, name="escape", finish=Finish.DONE, message="all went well " * 20))
+    ended = FinishedRun(id=1, name="escape", finish=Finish.DONE, message="all went well " * 20)
+    source.change(last_run=ended)
     source.fail()
     window = make_window(settings=Settings(font_scale=scale))
     window.update_timer.tick(force=True)
@@ -358,7 +361,7 @@ def test_the_window_fits_a_small_screen(
         assert window.height() == 700
 
 
-def test_no_tab_bar_of_another_workspace_stays(make_window: MakeWindow) -> None:
+def test_no_tab_bar_of_another_workspace_remains(make_window: MakeWindow) -> None:
     window = make_window()
     for one in (*WORKSPACES, *WORKSPACES):
         window.show_workspace(one.name)

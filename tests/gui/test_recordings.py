@@ -1,4 +1,4 @@
-"""Runs and products in the window: opened, dropped, moved through."""
+"""Recorded runs and products in the window: opening, drag and drop, playback."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def empty(tmp_path: Path) -> Iterator[MainWindow]:
-    """A window that nothing was opened in yet."""
+    """A window without a source."""
     session = Session()
     window = MainWindow(session, Settings(workspace="operate"), None)
     window.resize(1600, 1000)
@@ -69,12 +69,12 @@ def test_a_run_is_shown_by_every_panel(empty, folder):
         empty.docks[panel.name].show()
     empty.update_timer.tick(force=True)
     sprint, gains = empty.panels["sprint"], empty.panels["gains"]
-    assert sprint._indicator.word == "converged, 18 iterations"
+    assert sprint._indicator.text == "converged, 18 iterations"
     assert list(gains._curves) == ["ESCAPE", "DO-CRIME"]
     assert not empty.panels["psf"].shows_placeholder
 
 
-def test_what_a_recording_does_not_know_is_no_zero(empty, folder):
+def test_unknown_values_of_a_recorded_run_are_not_zero(empty, folder):
     empty.replay.open(folder)
     until(lambda: is_open(empty), empty)
     for name in ("camera", "mirror"):
@@ -84,27 +84,27 @@ def test_what_a_recording_does_not_know_is_no_zero(empty, folder):
         until(lambda: True, empty)
     header, panels = empty.header, empty.panels
     assert {one.text for one in header.readouts.values()} == {"–"}
-    assert (header.light.level, header.light.word) == (Level.NEUTRAL, "saturated –")
+    assert (header.saturation.level, header.saturation.text) == (Level.NEUTRAL, "saturated –")
     assert panels["camera"].saturation.text() == "peak –   saturated –"
     assert {one.text for one in panels["mirror"].readouts.values()} == {"–"}
 
 
-def test_nothing_can_be_commanded_and_the_reason_is_told(empty, folder):
+def test_no_procedure_can_be_started_and_the_reason_is_shown(empty, folder):
     empty.replay.open(folder)
     until(lambda: is_open(empty), empty)
     until(lambda: bool(empty.panels["procedure"].start.toolTip()), empty)
     procedure = empty.panels["procedure"]
     for button in (procedure.check, procedure.start, procedure.pause, procedure.abort):
         assert not button.isEnabled()
-        assert "replayed" in button.toolTip()
-    assert "recording" in procedure._description.text()
+        assert "replay of a recorded run" in button.toolTip()
+    assert "recorded run" in procedure._description.text()
     assert procedure.outcome.text() == "Done: A run"
 
 
-def test_the_slider_goes_through_the_run(empty, folder):
+def test_the_slider_moves_through_the_run(empty, folder):
     empty.replay.open(folder)
     until(lambda: is_open(empty), empty)
-    sprint, playback_bar = empty.panels["sprint"], empty.replay.playback_bar
+    sprint, playback_bar = empty.panels["sprint"], empty.playback_bar
     until(lambda: sprint._history is not None and len(sprint._history.values) == 18, empty)
     assert playback_bar.isVisible()
     playback_bar.slider.setValue(playback_bar.slider.maximum() // 2)
@@ -116,18 +116,18 @@ def test_the_slider_goes_through_the_run(empty, folder):
 
 
 @pytest.mark.parametrize("name", ["", "escape.fits"])
-def test_what_is_dropped_is_opened(empty, folder, name):
+def test_dropped_files_are_opened(empty, folder, name):
     data = QMimeData()
     data.setUrls([QUrl.fromLocalFile(str(folder / name))])
-    hands = (Qt.DropAction.CopyAction, data, Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier)
+    arguments = (Qt.DropAction.CopyAction, data, Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier)
     for kind, place in ((QDragEnterEvent, QPoint(50, 50)), (QDropEvent, QPointF(50, 50))):
-        event = kind(place, *hands)
+        event = kind(place, *arguments)
         QApplication.sendEvent(empty, event)
         assert event.isAccepted()
     until(lambda: is_open(empty), empty)
 
 
-def test_what_cannot_be_read_is_told(empty, tmp_path, monkeypatch):
+def test_an_unreadable_file_is_notified(empty, tmp_path, monkeypatch):
     path = tmp_path / "im.fits"
     path.write_bytes(b"no FITS")
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_: (str(path), ""))
@@ -139,13 +139,13 @@ def test_what_cannot_be_read_is_told(empty, tmp_path, monkeypatch):
     assert not is_open(empty)
 
 
-def test_a_bench_keeps_its_window(small_window, folder, monkeypatch):
-    """The safety buttons of a window on a bench must go on working."""
+def test_a_window_on_a_bench_opens_recorded_runs_in_another_window(small_window, folder, monkeypatch):
+    """The safety buttons of a window on a bench must remain those of the bench."""
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(folder))
     small_window.actions_by_name["open_run"].trigger()
-    until(lambda: bool(small_window.replay.replay_windows), small_window)
+    until(lambda: bool(small_window.replay_windows), small_window)
     assert not is_open(small_window)
-    (other,) = small_window.replay.replay_windows
+    (other,) = small_window.replay_windows
     assert is_open(other)
     assert other.isVisible()
     assert np.array_equal(

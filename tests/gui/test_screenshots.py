@@ -1,4 +1,4 @@
-"""Makes the pictures of the operator's tutorial: ``pytest -m screenshots``, on a machine with time."""
+"""Creates the images of the operator's tutorial: ``pytest -m screenshots``; takes some minutes."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ FIGURES = Path(__file__).parents[2] / "docs" / "figures" / "gui"
 pytestmark = [pytest.mark.screenshots, pytest.mark.timeout(1800)]
 
 
-def picture(operator: Operator, name: str) -> None:
-    """Save the window with few colours: a page of pictures loads quickly."""
-    for note in tuple(operator.window.notifications.notes):
+def save_image(operator: Operator, name: str) -> None:
+    """Save an image of the window with 256 colours, for small files."""
+    for note in tuple(operator.window.notifications.notifications):
         note.close_button.click()
     operator.settle(1.0)
     FIGURES.mkdir(exist_ok=True)
@@ -31,7 +31,7 @@ def picture(operator: Operator, name: str) -> None:
     few.save(path, optimize=True)
 
 
-def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serving, "SYSTEM", "razor-shwfs")
     with operating("razor-shwfs", tmp_path) as operator:
         window = operator.window
@@ -40,22 +40,20 @@ def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         operator.run("sensor")
         window.show_workspace("align")
         operator.settle(3.0)
-        picture(operator, "align")
+        save_image(operator, "align")
 
         window.show_workspace("calibrate")
         operator.choose("escape", frames="2000")
-        picture(operator, "plan")
-        before = source.source.state.last.id
+        save_image(operator, "plan")
+        before = source.source.state.last_run.id
         operator.press(operator.procedure.start)
-        operator.until(
-            lambda: panels["modes"].matrix_selector.currentData() == "as measured now", "maps fill in"
-        )
-        picture(operator, "measuring")
+        operator.until(lambda: panels["modes"].matrix_selector.currentData() == "live", "maps fill in")
+        save_image(operator, "measuring")
         operator.until(lambda: operator.ended(before), "it ends")
         operator.run("push-pull", frames="1")
         operator.until(lambda: "push-pull" in panels["modes"].matrices, "the baseline is shown")
         panels["modes"].mosaic.choose(9)
-        picture(operator, "detail")
+        save_image(operator, "detail")
 
         operator.run("model-psf")
         window.show_workspace("operate")
@@ -72,6 +70,6 @@ def test_pictures_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         # The log names folders of this machine.
         panels["log"].search.setText("loop")
         operator.settle(30.0)
-        picture(operator, "operate")
+        save_image(operator, "operate")
         window.actions_by_name["open_loop"].trigger()
         operator.until(lambda: not source.source.state.loop.closed, "the loop is open")

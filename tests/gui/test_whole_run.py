@@ -14,29 +14,29 @@ from escape_hw.io.fits.matrix import load_matrix
 from escape_hw.remote.state import Finish, FinishedRun
 
 
-def planted(ended: FinishedRun) -> Registration:
+def injected(ended: FinishedRun) -> Registration:
     return Registration(**ended.document["planted"])
 
 
 def recovered(ended: FinishedRun) -> None:
-    """The registration is the planted one, within five of its standard errors."""
-    truth = planted(ended).to_dict()
+    """The registration is the injected one, within five of its standard errors."""
+    truth = injected(ended).to_dict()
     for name in PARAMETERS:
         found = ended.document["registration"][name]
         assert abs(found["value"] - truth[name]) < 5 * found["sigma"], name
 
 
 def calibrated(operator: Operator, ended: FinishedRun) -> None:
-    """What the panels show after ESCAPE."""
+    """Check the content of the panels after ESCAPE."""
     window = operator.window
     modes, sprint = window.panels["modes"], window.panels["sprint"]
     assert ended.finish is Finish.DONE, ended.message
     recovered(ended)
-    # The maps filled in while frames came, and SPRINT's iterations came one by one.
+    # The maps were updated during the acquisition.
     assert operator.seen["live_modes"]
     assert any(operator.seen["abort"])
     operator.until(lambda: {"DO-CRIME", "ESCAPE"} <= set(modes.matrices), "products are shown")
-    assert sprint._indicator.word.startswith("converged")
+    assert sprint._indicator.text.startswith("converged")
     product = load_matrix(ended.products["im"])
     operator.until(lambda: modes.matrix_selector.currentText() == "ESCAPE", "the newest is in front")
     np.testing.assert_array_equal(modes.matrices["ESCAPE"].data, product.matrix.data)
@@ -56,15 +56,15 @@ def test_escape_through_the_buttons(small: Path, tmp_path: Path) -> None:
     with operating(small, tmp_path) as operator:
         operator.take_control()
         calibrated(operator, operator.run("escape", frames="3000"))
-        # Again, and stopped on the way: what was measured is kept.
+        # Again, and aborted: the acquired data are saved.
         operator.choose("docrime", frames="1000000")
         operator.press(operator.procedure.start)
         source = operator.window.context.session.source
         operator.until(operator.procedure.abort.isEnabled, "it can be stopped")
         operator.until(lambda: bool(operator.procedure._metrics.text()), "it is under way")
         operator.press(operator.procedure.abort)
-        operator.until(lambda: source.state.last.finish is Finish.ABORTED, "it is stopped")
-        operator.until(lambda: "Aborted" in operator.procedure.outcome.text(), "that is told")
+        operator.until(lambda: source.state.last_run.finish is Finish.ABORTED, "it is stopped")
+        operator.until(lambda: "Aborted" in operator.procedure.outcome.text(), "the outcome is shown")
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A window that is killed or hangs: the closed loop does not notice, and the next window finds the server."""
+"""A window that is killed or hangs does not disturb the closed loop; the next window finds the server."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from small_system import configuration
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Phase
 
-#: Longest wait for a window that loads its libraries on a busy machine, seconds.
+#: Time limit for a window to start on a busy computer, seconds.
 ATTACH_S = 60.0
 
 
@@ -38,7 +38,7 @@ def closed_loop(bench: Connection) -> None:
 
 
 def advances(bench: Connection, frames: int) -> None:
-    """The loop takes so many further frames without a fault."""
+    """The loop processes this number of further frames without a fault."""
     before = bench.state.rates.frames
     wait_for(lambda: bench.state.rates.frames > before + frames, "frames go on")
     assert bench.state.fault is None
@@ -47,10 +47,10 @@ def advances(bench: Connection, frames: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
-def test_the_loop_does_not_notice_a_window_that_dies(number: int, tmp_path: Path) -> None:
+def test_a_window_that_dies_does_not_disturb_the_loop(number: int, tmp_path: Path) -> None:
     small = tmp_path / "small.toml"
     small.write_text(configuration().to_toml())
-    with serving(small, "--set", "server.silent_s=60", folder=tmp_path) as served:
+    with serving(small, "--set", "server.engine_silence_s=60", folder=tmp_path) as served:
         bench = served.connect(control=True)
         windows: list[subprocess.Popen[bytes]] = []
         try:
@@ -71,13 +71,13 @@ def test_the_loop_does_not_notice_a_window_that_dies(number: int, tmp_path: Path
             assert seconds < 20, "two seconds on an idle machine"
             advances(bench, 200)
             if number == signal.SIGSTOP:
-                # Who wakes up again is back at once.
+                # A resumed window reconnects at once.
                 wait_for(lambda: bench.state.clients == alone + 1, "nobody counts it any more")
                 os.kill(windows[0].pid, signal.SIGCONT)
                 seconds = wait_for(lambda: bench.state.clients == alone + 2, "it is heard again", ATTACH_S)
                 print(f"the halted window was heard {seconds:.1f} s after it went on")
                 assert seconds < 20, "two seconds on an idle machine"
-                # Under its old number, with all that it knows.
+                # It keeps its client number.
                 known = f"process {windows[0].pid})"
                 assert sum(known in line.text for line in bench.log_after(-1)) == 1
             bench.open_loop()

@@ -1,4 +1,4 @@
-"""A window on a real server, and the clicks of somebody who calibrates with it."""
+"""A window on a real server, and an operator who calibrates with it."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ PATIENCE_S = 900.0
 
 
 class Operator:
-    """Clicks, and looks at what comes of it.
+    """Operates the window and waits for results.
 
     Parameters
     ----------
     window
-        On a server.
+        Connected to a server.
     """
 
     def __init__(self, window: MainWindow) -> None:
@@ -39,11 +39,11 @@ class Operator:
         panel = window.panels["procedure"]
         assert isinstance(panel, ProcedurePanel)
         self.procedure = panel
-        #: What each visible panel said while procedures ran.
+        #: Observations during procedures, by kind.
         self.seen: dict[str, list[float]] = {"live_modes": [], "iterations": [], "gains": [], "abort": []}
 
     def until(self, what: Callable[[], bool], why: str) -> None:
-        """Let the window live until something is so."""
+        """Process events until a condition is true."""
         deadline = time.monotonic() + PATIENCE_S
         while not what():
             assert time.monotonic() < deadline, f"never happened: {why}"
@@ -52,12 +52,12 @@ class Operator:
             time.sleep(0.01)
 
     def press(self, button: QPushButton) -> None:
-        """Click, as a hand does."""
+        """Click an enabled button."""
         assert button.isEnabled(), button.toolTip()
         QTest.mouseClick(button, Qt.MouseButton.LeftButton)
 
     def take_control(self) -> None:
-        """Wait until the bench is ready, and ask for it."""
+        """Wait until the bench is ready, and take control."""
         session = self.window.context.session
         self.until(lambda: session.source.state.phase is Phase.IDLE, "the engine is idle")
         self.until(lambda: self.procedure._state.phase is Phase.IDLE, "the panel knows")
@@ -74,14 +74,14 @@ class Operator:
         self.until(form.start.isEnabled, f"{name} is planned: {form.plan.text()}")
 
     def run(self, name: str, **arguments: str) -> FinishedRun:
-        """Start a procedure by its button, watch it to its end."""
+        """Start a procedure with its button, and wait for its end."""
         self.choose(name, **arguments)
         source = self.window.context.session.source
-        before = source.state.last.id if source.state.last is not None else 0
+        before = source.state.last_run.id if source.state.last_run is not None else 0
         self.press(self.procedure.start)
-        self.until(lambda: source.state.procedure is not None, "it runs")
+        self.until(lambda: source.state.active_run is not None, "it runs")
         self.until(lambda: self._watch() and self.ended(before), "it ends")
-        last = source.state.last
+        last = source.state.last_run
         assert last is not None
         self.until(lambda: self.procedure._ended is not None and self.procedure._ended.id == last.id, "told")
         return last
@@ -89,16 +89,16 @@ class Operator:
     def ended(self, before: int) -> bool:
         """Whether a procedure has ended since the one with that number."""
         state = self.window.context.session.source.state
-        return state.procedure is None and state.last is not None and state.last.id != before
+        return state.active_run is None and state.last_run is not None and state.last_run.id != before
 
     def settle(self, seconds: float) -> None:
-        """Let the window live for a while."""
+        """Process events for some time."""
         until = time.monotonic() + seconds
         self.until(lambda: time.monotonic() > until, "time goes by")
 
     def _watch(self) -> bool:
         panels, seen = self.window.panels, self.seen
-        if panels["modes"].matrix_selector.currentData() == "as measured now":
+        if panels["modes"].matrix_selector.currentData() == "live":
             seen["live_modes"].append(panels["modes"].mosaic.n_modes)
         if (course := panels["sprint"]._history) is not None:
             seen["iterations"].append(len(course.values))
@@ -109,14 +109,14 @@ class Operator:
 
 @contextmanager
 def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Operator]:
-    """A server of a system, and the window as the command makes it."""
-    # On a busy machine frames come late, and that is not what is tried here.
-    patient = ("--set", "server.silent_s=120", "--set", "server.no_frames_s=60")
+    """A server of a system, and a window as created by the command."""
+    # Long time limits: on a busy computer frames are late.
+    patient = ("--set", "server.engine_silence_s=120", "--set", "server.no_frames_s=60")
     with serving.serving(system, "--quiet", *patient, folder=folder) as served:
         os.environ["XDG_RUNTIME_DIR"] = served.environment["XDG_RUNTIME_DIR"]
         session = Session()
         window = MainWindow(session, Settings(**{"workspace": "calibrate", **settings}), None)
-        desk = WindowController(window, session, serving.SYSTEM, None)
+        controller = WindowController(window, session, serving.SYSTEM, None)
         window.resize(1280, 800)
         window.update_timer.start()
         window.show()
@@ -126,5 +126,5 @@ def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Ope
             dispose(window)
             session.close()
             session.deleteLater()
-            desk.close()
-            desk.deleteLater()
+            controller.close()
+            controller.deleteLater()

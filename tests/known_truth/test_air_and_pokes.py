@@ -1,4 +1,4 @@
-"""A pyramid under turbulence and random pokes: what the model takes for the mean, and its doubt."""
+"""A pyramid under turbulence and random pokes: the mean response and its uncertainty."""
 
 from __future__ import annotations
 
@@ -106,21 +106,23 @@ def test_pokes_that_move_the_rim_more_make_no_difference_between_modes(pupils: P
 
 
 @pytest.mark.parametrize("ratio", [1.5, 4.0, 8.0, 14.0])
-def test_the_strength_is_told_beside_pokes(pupils: PyramidPupils, ratio: float) -> None:
+def test_the_strength_is_estimated_with_pokes(pupils: PyramidPupils, ratio: float) -> None:
     model = poked(pupils, 0.05)
     optics, pokes = model.optics(), random_pokes(model)
     # Other phases than those that the estimate compares with.
     rng = np.random.default_rng(5)
-    air = np.array([screen.T[::-1] for screen in unit_screens(optics.amplitude.shape[0], 4.0)])
-    air = np.tile(air * ratio ** (5 / 6), (4, 1, 1))
+    turbulence = np.array([screen.T[::-1] for screen in unit_screens(optics.amplitude.shape[0], 4.0)])
+    turbulence = np.tile(turbulence * ratio ** (5 / 6), (4, 1, 1))
 
     def slopes() -> NDArray[np.float64]:
-        beside = np.tensordot(rng.standard_normal((len(air), len(pokes.modes_rad))), pokes.modes_rad, 1)
-        paths = ((air + beside) * (optics.wavelength_m / (2 * np.pi))).astype(np.float32)
+        beside = np.tensordot(
+            rng.standard_normal((len(turbulence), len(pokes.modes_rad))), pokes.modes_rad, 1
+        )
+        paths = ((turbulence + beside) * (optics.wavelength_m / (2 * np.pi))).astype(np.float32)
         return np.array([slopes_of_image(optics.frame(path), pupils) for path in paths])
 
     first, second = slopes(), slopes()
-    freedom = np.sqrt(len(air) / (len(air) - 1))
+    freedom = np.sqrt(len(turbulence) / (len(turbulence) - 1))
     first, second = (freedom * (s - s.mean(axis=0)) for s in (first, second))
     rms = float(np.sqrt(np.mean(np.square([first, second]))))
     seen = replace(pupils, motion=rms, persistent_fraction=float(np.mean(first * second) / rms**2))
@@ -132,7 +134,7 @@ def test_pokes_alone_are_no_turbulence(pupils: PyramidPupils) -> None:
     assert model.turbulence == 0
 
 
-def test_the_doubt_falls_with_the_states_that_were_seen(pupils: PyramidPupils) -> None:
+def test_the_uncertainty_falls_with_the_states_that_were_averaged(pupils: PyramidPupils) -> None:
     config, few = configuration(), replace(pupils, n_effective=4.0, centre_sigma_px=0.01)
     model = PyramidModel(config, few, turbulence=8.0)
     once = model.registration_systematic_error

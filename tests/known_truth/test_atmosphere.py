@@ -214,7 +214,7 @@ def test_boiling_time_is_the_time_to_one_over_e():
     assert make_layer(0, wind=(40.0, 0.0)).boiling_s < SIZE * PIXEL / 40.0
 
 
-def test_still_air_stays():
+def test_turbulence_without_wind_and_boiling_is_constant():
     layer = make_layer(1)
     assert np.array_equal(phase(layer, 0.0), phase(layer, 1000.0))
 
@@ -262,7 +262,7 @@ def test_it_may_be_asked_for_times_before_zero():
     assert min(values) > 0
 
 
-def air(**changes):
+def settings(**changes):
     values = {
         "r0_m": R0, "outer_scale_m": OUTER_SCALE, "fraction": (0.7, 0.3), "speed_m_s": (8.0, 20.0),
         "direction_deg": (0.0, 90.0), "boiling_s": 1.0,
@@ -271,7 +271,7 @@ def air(**changes):
 
 
 def test_layers_add_in_variance_and_r0_is_at_500_nm():
-    sky = Atmosphere(air(), PIXEL, LIT, np.random.SeedSequence(3), background=False)
+    sky = Atmosphere(settings(), PIXEL, LIT, np.random.SeedSequence(3), background=False)
     opd = np.zeros((N, N), np.float32)
     sky.add(0.4, opd)
     parts = [phase(layer, 0.4) for layer in sky.layers]
@@ -286,7 +286,7 @@ def test_layers_add_in_variance_and_r0_is_at_500_nm():
 
 def test_layers_differ_and_blow_where_they_should():
     lit = np.ones((N, N), bool)
-    sky = Atmosphere(air(boiling_s=math.inf), PIXEL, lit, np.random.SeedSequence(1))
+    sky = Atmosphere(settings(boiling_s=math.inf), PIXEL, lit, np.random.SeedSequence(1))
     right, up = sky.layers
     a, b = phase(right, 0.0), phase(right, 0.05)
     scale = np.std(a)

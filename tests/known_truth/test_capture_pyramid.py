@@ -33,7 +33,7 @@ def test_comes_home_or_says_that_it_does_not(number: int) -> None:
     matrix = InteractionMatrix(
         data.astype(np.float32), sigma.astype(np.float32), m2c, pupils.valid, "small", "push-pull", True
     )
-    found = sprint(matrix, model, solver="light", max_iterations=40)
+    found = sprint(matrix, model, solver="registration-only", max_iterations=40)
     error = np.abs(found.registration.to_array() - planted.to_array())
     assert found.converged, found.warnings
     assert (error < [0.05 * PITCH, 0.05 * PITCH, 0.5, 2.0, 2.0]).all(), error

@@ -49,7 +49,7 @@ def test_the_beam_goes_where_the_stage_points():
 
 
 def test_an_uncorrected_stage_draws_the_ellipse_that_its_loops_make():
-    keys = (*SMALL, 'devices.modulator.stage.correct="none"')
+    keys = (*SMALL, 'devices.modulator.stage.correction_source="none"')
     with escape_hw.open_system("razor-pywfs", set=keys) as bench:
         bench.find_sensor(frames=5)
         x, y = points(bench).T

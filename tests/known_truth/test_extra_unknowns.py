@@ -18,7 +18,7 @@ from escape_hw.calibration.sprint.synthetic_matrix import (
 )
 from escape_hw.errors import ConfigError
 from escape_hw.runtime.session.system import System
-from escape_sim.models.shack_hartmann import make_model
+from escape_sim.models.factory import make_fast_model
 
 SEEDS = range(6)
 SHEAR = 1.5
@@ -27,7 +27,7 @@ SYSTEMS = {"lenslets": small_lenslets, "pyramid": small_pyramid}
 
 @pytest.fixture(scope="module", params=SYSTEMS)
 def model(request):
-    return make_model(SYSTEMS[request.param](), None)
+    return make_fast_model(SYSTEMS[request.param](), None)
 
 
 def plant(seed: int) -> Registration:
@@ -123,7 +123,7 @@ def test_a_shear_stays_with_a_mirror_that_moves_on(model):
 
 def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
     config = small_pyramid()
-    model = make_model(config, None)
+    model = make_fast_model(config, None)
     pulls = []
     for seed in SEEDS:
         truth, moved = plant(seed), np.random.default_rng(seed).uniform(-15, 15, 2)
@@ -143,7 +143,7 @@ def test_on_the_twin_a_planted_shear_is_found_and_told():
     for seed in (1, 2, 3):
         leaning = Registration(-16.0, -71.0, -0.77, 2.9, 0.0).with_shear(SHEAR)
         planted = [f"twin.registration.{name}={value!r}" for name, value in leaning.to_dict().items()]
-        config = small_lenslets(*planted, 'calibration.also=["anamorphosis"]', seed=seed)
+        config = small_lenslets(*planted, 'calibration.extra_parameters=["anamorphosis"]', seed=seed)
         with System.from_config(config) as bench:
             found = bench.calibrate(frames=400).registration
         shear = found.extras["anamorphosis"]
@@ -154,10 +154,10 @@ def test_on_the_twin_a_planted_shear_is_found_and_told():
 
 
 def test_what_a_model_or_solver_does_not_know_is_refused():
-    model = make_model(small_lenslets(), None)
+    model = make_fast_model(small_lenslets(), None)
     matrix = noisy(model.zonal_matrix(Registration()), model, 0)
     with pytest.raises(ConfigError, match="knows no shift of the pupil"):
         sprint(matrix, model, also=("pupil_shift",))
-    with pytest.raises(ConfigError, match="takes solver = 'effects'"):
-        sprint(matrix, model, also=("anamorphosis",), solver="light")
+    with pytest.raises(ConfigError, match="takes solver = 'mixed-effects'"):
+        sprint(matrix, model, also=("anamorphosis",), solver="registration-only")
     assert not sprint(matrix, model).extras

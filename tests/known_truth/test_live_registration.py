@@ -121,7 +121,7 @@ def test_a_sheared_mirror_does_not_lean_the_registration():
     missed, blind = [], []
     for number in (1, 3):
         truth = random_registration(number)
-        with planted(truth, 'calibration.also=["anamorphosis"]', seed=number) as bench:
+        with planted(truth, 'calibration.extra_parameters=["anamorphosis"]', seed=number) as bench:
             found, start = looked(bench, 4, 500)
         errors, pulls = errors_and_pulls(found, truth)
         missed.append(errors[:2])
@@ -139,7 +139,9 @@ def test_a_sheared_mirror_does_not_lean_the_registration():
 
 
 def test_the_pyramid_keeps_shear_and_shifted_images_beside_its_curve():
-    with small_pyramid("twin.loss_probability=0", 'calibration.also=["anamorphosis","pupil_shift"]') as bench:
+    with small_pyramid(
+        "twin.loss_probability=0", 'calibration.extra_parameters=["anamorphosis","pupil_shift"]'
+    ) as bench:
         truth = bench.dm.twin.flexure.at(0.0)
         found, start = looked(bench, 2, 303, n_curve_coefficients=3, start_frames=900)
     _, pulls = errors_and_pulls(found, truth)

@@ -12,7 +12,7 @@ from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellState
 from escape_hw.api.registration import Registration
 from escape_sim.devices.bench import SimBench
 from escape_sim.devices.twins import SimAdaptiveSecondary
-from escape_sim.models.shack_hartmann import make_model
+from escape_sim.models.factory import make_fast_model
 
 #: Few modes on calm air keep this short; the faintest mode of so short a run is still well seen.
 FEW = [
@@ -64,7 +64,7 @@ def test_pupils_are_found_where_they_are(system, found):
 
 
 def test_the_matrix_knows_the_hidden_registration(system, found):
-    model = make_model(system.config, found.grid)
+    model = make_fast_model(system.config, found.grid)
     matrix = found.matrix
 
     def likeness(registration):

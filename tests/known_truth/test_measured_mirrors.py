@@ -20,7 +20,8 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.calibration.sprint.fit import fit_registration
 from escape_hw.config.loader import load_system
-from escape_sim.models.shack_hartmann import ShackHartmannModel, make_model
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import ShackHartmannModel
 
 SHARED = Path(os.environ.get("ESCAPE_SHARED_DATA", Path(__file__).parents[3] / "shared" / "data"))
 FOLDER = SHARED / "dm97"
@@ -101,7 +102,9 @@ def test_the_fit_of_a_measured_mirror_converges(date: str) -> None:
     references, light = np.zeros((n_valid, 2), np.float32), matrix.valid.astype(np.float32)
     grid = SubApertureGrid(PITCH, (first, first), matrix.valid, references, light, 0.0)
     fit = run(
-        fit_registration(matrix, Levelled(make_model(load_system("razor-shwfs", overrides=DESIGN), grid)))
+        fit_registration(
+            matrix, Levelled(make_fast_model(load_system("razor-shwfs", overrides=DESIGN), grid))
+        )
     )
     assert fit.estimate.converged, fit.estimate.warnings
     left = np.linalg.norm(matrix.data - fit.zonal()) / np.linalg.norm(matrix.data)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
-from escape_sim.oopao.library import make_lenslets, make_source, oopao, quiet
+from escape_sim.oopao.library import make_lenslets, make_source, oopao_classes, suppress_output
 from escape_sim.oopao.optics import OOPAOShackHartmann, trigonometric_interpolation
 from escape_sim.optics.shack_hartmann import ShackHartmannOptics
 
@@ -62,8 +62,8 @@ def own_geometry():
 
 
 def oopao_frame(light, sensor, opd):
-    with quiet():
-        light.source**light.telescope * oopao().OPD_map(opd.astype(float)) * sensor
+    with suppress_output():
+        light.source**light.telescope * oopao_classes().OPD_map(opd.astype(float)) * sensor
     size = 2 * N_PIX
     tiles = np.asarray(sensor.cam.frame).reshape(N_SUB, size, N_SUB, size) / light.photons_per_unit
     # OOPAO lays each lenslet's image down with x along its rows.

@@ -62,7 +62,7 @@ def test_devices_open_with_the_modulator_parked_and_close_parked() -> None:
     assert one.modulator.modulation is None
 
 
-def test_camera_exposes_whole_turns_and_counts_on() -> None:
+def test_camera_exposes_whole_cycles_and_continues_its_count() -> None:
     with small("twin.loss_probability=0") as one:
         assert one.modulator is not None
         assert one.wfs.settings.frame_rate_hz == 300.0

@@ -1,4 +1,4 @@
-"""The seed of a run changes air and noise, and leaves the bench what it is."""
+"""The seed of a run changes turbulence and noise, and leaves the bench unchanged."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def opened(*more: str):
     return escape_hw.open_system("razor-shwfs", set=(*small_system.SMALL, *more))
 
 
-def test_runs_differ_in_air_and_noise_on_the_same_bench():
+def test_runs_differ_in_turbulence_and_noise_on_the_same_bench():
     seen, truths = [], []
     for more in ((), ("twin.run_seed=5",), ("twin.run_seed=5",), ("twin.run_seed=6",)):
         with opened(*more) as bench:
@@ -42,11 +42,11 @@ def test_the_cameras_pixels_belong_to_the_bench():
     assert np.corrcoef(dark[0].ravel(), dark[1].ravel())[0, 1] > 0.9
 
 
-@pytest.mark.parametrize("alone", [True, False])
-def test_a_pyramid_without_helper_threads_makes_the_same_image(monkeypatch, alone):
+@pytest.mark.parametrize("threaded", [True, False])
+def test_a_pyramid_without_helper_threads_makes_the_same_image(monkeypatch, threaded):
     images = []
-    for helpers in (True, alone):
-        monkeypatch.setattr(threads, "_alone", helpers)
+    for helpers in (True, threaded):
+        monkeypatch.setattr(threads, "_helper_threads_allowed", helpers)
         with small_pyramid.small() as bench:
             images.append(bench.wfs.next_frame(1.0).data)
             optics = bench.dm.twin.sensor()

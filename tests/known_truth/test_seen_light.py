@@ -36,12 +36,12 @@ def seen(amplitude: NDArray[np.float32], offsets: NDArray[np.float64]) -> Pyrami
     return replace(pupils, flux=(light / np.percentile(light, 95)).astype(np.float32))
 
 
-def test_a_soiled_arc_is_dark_in_the_model() -> None:
+def test_a_contaminated_arc_is_dark_in_the_model() -> None:
     config = load_system("maps-nir", overrides=SOILED)
-    soiled, design = contaminated_pupil(config, np.random.default_rng(3)), pupil_geometry(config)
+    contaminated, design = contaminated_pupil(config, np.random.default_rng(3)), pupil_geometry(config)
     offsets = np.array([[0.3, -0.35], [-0.4, 0.2], [0.25, 0.4], [-0.2, -0.2]])
-    found = apply_measured_illumination(design, seen(soiled.amplitude, offsets))
-    light, want = (np.square(pupil.amplitude, dtype=float) for pupil in (found, soiled))
+    found = apply_measured_illumination(design, seen(contaminated.amplitude, offsets))
+    light, want = (np.square(pupil.amplitude, dtype=float) for pupil in (found, contaminated))
     # What the images cannot show: the last pixel of the rim, and samples half a pixel wide.
     radius = np.hypot(*np.meshgrid(design.coordinates_m, design.coordinates_m)) / 3.25
     inside = (radius < 0.95) & (radius > 0.2)

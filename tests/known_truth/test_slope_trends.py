@@ -14,8 +14,9 @@ from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.fit import SprintFit, fit_registration
 from escape_hw.calibration.sprint.mixed_effects import slope_trends
+from escape_sim.models.factory import make_fast_model
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
-from escape_sim.models.shack_hartmann import make_model, nominal_grid
+from escape_sim.models.shack_hartmann import nominal_grid
 
 SEEDS = range(6)
 #: Noise of an element, relative to the rms of the matrix.
@@ -121,7 +122,7 @@ def test_no_trend_is_found_where_there_is_none(model: PyramidModel) -> None:
 
 def test_only_a_pyramid_under_turbulence_or_pokes_has_trends(model: PyramidModel) -> None:
     config = small_lenslets()
-    lenslets, grid = make_model(config, None), nominal_grid(config)
+    lenslets, grid = make_fast_model(config, None), nominal_grid(config)
     assert slope_trends(lenslets, grid.valid).shape == (grid.n_slopes, 0)
     at_rest = PyramidModel(small_pyramid(), nominal_pupils(small_pyramid()))
     assert at_rest.gain_trend == 0.0
@@ -130,7 +131,7 @@ def test_only_a_pyramid_under_turbulence_or_pokes_has_trends(model: PyramidModel
 
 def test_the_noise_that_lenslets_share_is_left_as_it_was() -> None:
     config = small_lenslets()
-    lenslets, grid = make_model(config, None), nominal_grid(config)
+    lenslets, grid = make_fast_model(config, None), nominal_grid(config)
     zonal_matrix = lenslets.zonal_matrix(Registration(5.0, -3.0))
     rng = np.random.default_rng(0)
     # Noise that all slopes share, which a pyramid's fit would count.

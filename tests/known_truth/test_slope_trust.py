@@ -13,8 +13,8 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.fit import sprint
-from escape_hw.config.loader import load_system
 from escape_hw.config.choices import Solver
+from escape_hw.config.loader import load_system
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
 
 #: Noise of an element, relative to the rms of the matrix.
@@ -37,7 +37,7 @@ def soiled(pupils: PyramidPupils) -> NDArray[np.bool_]:
     return (np.hypot(x, y) > 0.4 * len(pupils.valid)) & (x > np.abs(y))
 
 
-def errors(selective: bool, solver: Solver = "effects") -> NDArray[np.float64]:
+def errors(selective: bool, solver: Solver = "mixed-effects") -> NDArray[np.float64]:
     """Errors ``(6, 5)`` on plants whose soiled pixels answer by half to what their neighbours see."""
     config = small_pyramid()
     pupils = nominal_pupils(config)
@@ -63,7 +63,7 @@ def errors(selective: bool, solver: Solver = "effects") -> NDArray[np.float64]:
     return np.array(out)
 
 
-@pytest.mark.parametrize("solver", ["effects", "light", "frozen"])
+@pytest.mark.parametrize("solver", ["mixed-effects", "registration-only", "frozen-derivatives"])
 def test_slopes_that_are_not_trusted_do_not_move_the_registration(solver: Solver) -> None:
     with_all, without = (np.sqrt(np.mean(np.square(errors(one, solver)), axis=0)) for one in (False, True))
     # Scaling along x, the way the soiled pixels look; a clean fit errs by some hundredths of a per cent.

@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from escape_hw.api.registration import Registration
 from escape_hw.config.loader import load_system
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, actuator_positions, pitch_on_pupil
 from escape_sim.models.shack_hartmann import (
     NEIGHBOURS,
     ShackHartmannModel,
@@ -20,7 +20,7 @@ from escape_sim.models.shack_hartmann import (
     nominal_grid,
     slope_weights,
 )
-from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import pupil_geometry
 from escape_sim.optics.shack_hartmann import ShackHartmannOptics
 
 MOVED = Registration(35.0, -22.0, 1.3, 1.5, -2.0)

@@ -13,7 +13,8 @@ from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.config.loader import load_system
-from escape_sim.models.shack_hartmann import ShackHartmannModel, make_model, nominal_grid
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import ShackHartmannModel, nominal_grid
 
 #: Noise of the matrix elements, relative to their rms.
 NOISE = 0.03
@@ -25,7 +26,7 @@ PAPER = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
 
 @pytest.fixture(scope="module")
 def model() -> ShackHartmannModel:
-    return make_model(load_system("razor-shwfs"), None)
+    return make_fast_model(load_system("razor-shwfs"), None)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +81,7 @@ def random_far(number):
     )
 
 
-@pytest.mark.parametrize("solver", ["light", "effects"])
+@pytest.mark.parametrize("solver", ["registration-only", "mixed-effects"])
 def test_two_pitches_away_turned_and_scaled(model, matrix_at, solver):
     for number in range(4):
         planted = random_far(number)
@@ -100,7 +101,7 @@ def test_plants_at_random_are_found_or_refused(model, matrix_at, n_modes):
         planted = Registration.from_array(
             [*rng.uniform(-coarse_search, coarse_search, 2), *(rng.uniform(-1, 1, 3) * [12, 8, 8])]
         )
-        estimate = sprint(matrix_at(planted), model, modes=np.arange(n_modes), solver="light")
+        estimate = sprint(matrix_at(planted), model, modes=np.arange(n_modes), solver="registration-only")
         error = np.abs(estimate.registration.to_array() - planted.to_array())
         assert not estimate.converged or (error < 5 * estimate.sigma).all(), planted
         found += estimate.converged
@@ -110,15 +111,17 @@ def test_plants_at_random_are_found_or_refused(model, matrix_at, n_modes):
 def test_high_modes_alone_are_found_by_many_starts(model, matrix_at):
     planted = Registration(shift_x=400.0, shift_y=-250.0, rotation=4.0)
     columns = np.arange(20, 25)
-    estimate = sprint(matrix_at(planted), model, modes=columns, solver="light")
+    estimate = sprint(matrix_at(planted), model, modes=columns, solver="registration-only")
     assert estimate.converged
     assert (np.abs(estimate.registration.to_array() - planted.to_array()) < 5 * estimate.sigma).all()
-    assert not sprint(matrix_at(planted), model, modes=columns, solver="light", coarse_search=False).converged
+    assert not sprint(
+        matrix_at(planted), model, modes=columns, solver="registration-only", coarse_search=False
+    ).converged
 
 
 def test_light_and_full_agree_on_a_mirror_like_the_model(model, matrix_at):
     matrix = matrix_at(PAPER)
-    light, full = (sprint(matrix, model, solver=s) for s in ("light", "effects"))
+    light, full = (sprint(matrix, model, solver=s) for s in ("registration-only", "mixed-effects"))
     assert light.converged
     assert full.converged
     assert light.width.value == 1.0
@@ -128,14 +131,14 @@ def test_light_and_full_agree_on_a_mirror_like_the_model(model, matrix_at):
 
 
 def test_a_slow_learner_arrives_too(model, matrix_at):
-    estimate = sprint(matrix_at(PAPER), model, solver="light", learning_rate=0.5)
+    estimate = sprint(matrix_at(PAPER), model, solver="registration-only", learning_rate=0.5)
     assert estimate.converged
     assert (np.abs(estimate.registration.to_array() - PAPER.to_array()) < 4 * estimate.sigma).all()
 
 
 def test_a_mirror_of_the_other_polarity_is_pointed_out(model, matrix_at):
     matrix = matrix_at(PAPER)
-    for solver in ("light", "effects"):
+    for solver in ("registration-only", "mixed-effects"):
         estimate = sprint(replace(matrix, data=-matrix.data), model, modes=10, solver=solver)
         assert not estimate.converged
         assert any("polarity" in warning for warning in estimate.warnings)
@@ -148,13 +151,13 @@ def test_a_flip_is_named(model, matrix_at):
     for k in range(matrix.n_modes):
         x, y = matrix.maps(k)
         flipped[:n, k], flipped[n:, k] = -np.fliplr(x)[matrix.valid], np.fliplr(y)[matrix.valid]
-    estimate = sprint(replace(matrix, data=flipped), model, modes=10, solver="light")
+    estimate = sprint(replace(matrix, data=flipped), model, modes=10, solver="registration-only")
     assert not estimate.converged
     assert any("mirrored left to right" in warning for warning in estimate.warnings), estimate.warnings
     turned = np.zeros_like(matrix.data)
     for k in range(matrix.n_modes):
         x, y = matrix.maps(k)
         turned[:n, k], turned[n:, k] = y.T[matrix.valid], x.T[matrix.valid]
-    estimate = sprint(replace(matrix, data=turned), model, modes=10, solver="light")
+    estimate = sprint(replace(matrix, data=turned), model, modes=10, solver="registration-only")
     assert not estimate.converged
     assert any("transposed;" in warning for warning in estimate.warnings), estimate.warnings

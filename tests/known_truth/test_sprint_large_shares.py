@@ -15,7 +15,8 @@ from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.calibration.sprint.fit import fit_registration
 from escape_hw.config.loader import load_system
-from escape_sim.models.shack_hartmann import make_model, nominal_grid
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import nominal_grid
 
 SMALL = (
     "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
@@ -54,7 +55,7 @@ class Doubtful:
 @pytest.mark.parametrize("seed", range(6))
 def test_large_shares_are_found_with_the_registration(seed: int) -> None:
     config = load_system("razor-shwfs", overrides=SMALL)
-    sharp = make_model(config, None)
+    sharp = make_fast_model(config, None)
     m2c = karhunen_loeve(*sharp.influence_functions(), 25, 4 * config.system.pupil_m)
     rng = np.random.default_rng(seed)
     planted = Registration(*(rng.uniform(-1, 1, 5) * (40.0, 40.0, 1.5, 3.0, 3.0)))

@@ -13,7 +13,8 @@ from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.calibration.sprint.fit import fit_registration, sprint
 from escape_hw.calibration.sprint.mode_choice import choose_modes
 from escape_hw.config.loader import load_system
-from escape_sim.models.shack_hartmann import make_model, nominal_grid
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import nominal_grid
 
 SMALL = (
     "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
@@ -25,7 +26,7 @@ PLANTED = Registration(-16.0, 31.0, -0.77, 2.9, 0.5)
 @pytest.fixture(scope="module")
 def bench():
     config = load_system("razor-shwfs", overrides=SMALL)
-    model = make_model(config, None)
+    model = make_fast_model(config, None)
     m2c = karhunen_loeve(*model.influence_functions(), 25, 4 * config.system.pupil_m)
     return model, nominal_grid(config).valid, m2c
 
@@ -68,7 +69,7 @@ def test_the_matrix_that_was_found_is_that_of_the_mirror_at_hand(bench):
     assert np.linalg.norm(nominal - exact) > 0.05 * np.linalg.norm(exact)
 
 
-@pytest.mark.parametrize("solver", ["effects", "light"])
+@pytest.mark.parametrize("solver", ["mixed-effects", "registration-only"])
 def test_hubers_loss_finds_home_among_bad_sub_apertures(bench, solver):
     model = bench[0]
     matrix = measured(bench, noise=0.02)
@@ -96,7 +97,7 @@ def test_informative_modes_beat_the_first_ones(bench):
     for choice in ("first", "snr", "d-optimal", "a-optimal"):
         modes = choose_modes(matrix, 6, choice, model)
         assert modes.size == 6
-        sigma[choice] = sprint(matrix, model, modes=modes, solver="light").sigma
+        sigma[choice] = sprint(matrix, model, modes=modes, solver="registration-only").sigma
     for choice in ("d-optimal", "a-optimal"):
         assert np.log(sigma[choice] / sigma["first"]).sum() < 0
     with pytest.raises(ValueError, match="hand over the model"):

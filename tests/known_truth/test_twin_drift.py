@@ -91,12 +91,12 @@ def test_seeing_scales_the_turbulence_as_kolmogorov_does():
     assert seeing.r0(10.0) == pytest.approx(1.1)
     assert seeing.strength(10.0) == pytest.approx(1.1 ** (-5 / 6))
     assert seeing.r0(1e4) == 0.2
-    calm, changing = bench(*STILL), bench(*STILL, "twin.seeing.rate=-0.01")
-    before, after = (one.optical_path(30.0, 30.002) for one in (calm, changing))
+    constant, changing = bench(*STILL), bench(*STILL, "twin.seeing.rate=-0.01")
+    before, after = (one.optical_path(30.0, 30.002) for one in (constant, changing))
     np.testing.assert_allclose(after, before * 0.7 ** (-5 / 6), rtol=1e-4, atol=1e-12)
 
 
-def test_air_over_a_telescope_changes_too():
+def test_turbulence_over_a_telescope_changes_too():
     after, before = (
         SimBench(load_system("maps-nir", overrides=(*STILL[:2], *more))).optical_path(20.0, 20.001)
         for more in (("twin.seeing.rate=-0.01",), ())

@@ -1,4 +1,4 @@
-"""Telemetry on disk: every entry, in order, or counted as dropped; a disk in trouble holds nobody up."""
+"""Telemetry on disk: every entry in order, or counted as dropped; a slow or full disk delays nothing."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_memory_is_bounded_when_the_disk_stands_still(tmp_path, writer, monkeypa
 
     monkeypatch.setattr(module, "write_block", stuck)
     monkeypatch.setattr(module, "_BLOCK_BYTES", 4000)
-    monkeypatch.setattr(module, "MOST_WAITING", 20_000)
+    monkeypatch.setattr(module, "MAX_QUEUED_BYTES", 20_000)
 
     def produce():
         entries(writer, 0, 800, wait_s=0.0002)
@@ -140,8 +140,8 @@ def test_a_full_disk_ends_the_recording_and_leaves_whole_blocks(tmp_path, writer
 
 
 def test_room_is_left_to_others(tmp_path, writer):
-    state = recorded(tmp_path, writer, lambda: time.sleep(0.2), least_free=1 << 60)
-    assert "are left to others" in state.fault
+    state = recorded(tmp_path, writer, lambda: time.sleep(0.2), min_free_bytes=1 << 60)
+    assert "below the limit of" in state.fault
 
 
 class SmallDisk(io.FileIO):
@@ -172,14 +172,14 @@ def test_damage_is_told(tmp_path, writer):
     recorded(tmp_path, writer, lambda: entries(writer, 0, 50))
     content = (tmp_path / "slopes.blocks").read_bytes()
     (tmp_path / "cut.blocks").write_bytes(content[: len(content) - 5])
-    with pytest.raises(ProductError, match="no whole block"):
+    with pytest.raises(ProductError, match="no complete block"):
         read_recording(tmp_path / "cut.blocks")
     (tmp_path / "two.blocks").write_bytes(content + content[:-5])
     (part,) = read_recording(tmp_path / "two.blocks")
     assert (len(part.data), part.complete) == (50, False)
     np.save(tmp_path / "other.npy", np.zeros((4, 4)))
     (tmp_path / "foreign.blocks").write_bytes((tmp_path / "other.npy").read_bytes() * 2)
-    with pytest.raises(ProductError, match="no recording"):
+    with pytest.raises(ProductError, match="not a recording"):
         read_recording(tmp_path / "foreign.blocks")
     with pytest.raises(ProductError, match="cannot be read"):
         read_recording(tmp_path / "none.blocks")

@@ -1,4 +1,4 @@
-"""Rings between processes: nothing torn, nothing leaked, whoever dies."""
+"""Rings between processes: no torn reads and no leaks, whichever process dies."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import pytest
 from escape_hw.streams import segments
 from escape_hw.streams.ring import RingReader, RingWriter
 from escape_hw.streams.segments import segment_name
+from escape_hw.supervision import process_start
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="shared memory as on Linux")
 
@@ -99,7 +100,7 @@ def test_a_recorder_in_another_process_gets_frames_whole_and_counts_the_rest() -
 
 
 @pytest.mark.parametrize("end", ["exit", "kill"])
-def test_the_end_of_a_reader_disturbs_nobody(end: str) -> None:
+def test_the_end_of_a_reader_affects_no_other_process(end: str) -> None:
     with RingWriter(segment_name(SYSTEM, "slopes"), 64) as writer, RingReader(writer.name) as other:
         writer.write(np.ones(4), 1)
         with process(READER, writer.name, "go" if end == "exit" else "stay") as reader:
@@ -135,7 +136,7 @@ def test_the_segments_of_a_killed_owner_are_reaped_and_no_others() -> None:
 
 def test_a_process_number_that_came_round_again_is_not_taken_for_the_owner() -> None:
     name = segment_name(SYSTEM, "psf")
-    began = segments.process_start(os.getpid())
+    began = process_start(os.getpid())
     assert began is not None
     with RingWriter(name, 64):
         content = bytearray((segments.SHARED / name).read_bytes())
@@ -154,12 +155,12 @@ def test_a_forked_child_does_not_remove_its_parents_segment() -> None:
     script = f"""
 import os, sys
 from escape_hw.streams.ring import RingWriter
-from escape_hw.streams.segments import examine, segment_name
+from escape_hw.streams.segments import read_identity, segment_name
 with RingWriter(segment_name({SYSTEM!r}, "frames"), 64) as writer:
     child = os.fork()
     if child:
         os.waitpid(child, 0)
-        print(examine(writer.name) is not None, flush=True)
+        print(read_identity(writer.name) is not None, flush=True)
 """
     with process(script) as parent:
         assert says(parent) == "True"

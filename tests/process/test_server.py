@@ -36,7 +36,7 @@ def holder(served: Served) -> Iterator[Connection]:
 
 @pytest.fixture
 def bench(holder: Connection) -> Iterator[Connection]:
-    """The server, idle and with the right to write, whatever the test before did."""
+    """The server, idle and with control, whatever the previous test did."""
     holder.acquire(take_over=True)
     yield holder
     holder.flatten()
@@ -93,14 +93,15 @@ def test_state_devices_geometry_and_frames(bench: Connection, matrix: str) -> No
 
 def test_while_it_measures_matrix_and_progress_are_shown(bench: Connection) -> None:
     run = bench.start("docrime", frames=10_000_000)
+    wait_for(lambda: run.running is not None and run.running.total == 10_000_000, "progress")
     wait_for(lambda: bench.latest("matrix") is not None, "a matrix")
-    running = bench.state.procedure
+    running = bench.state.active_run
     assert running is not None
-    assert (running.id, running.name, running.total) == (run.id, "docrime", 10_000_000)
+    assert (running.id, running.name) == (run.id, "docrime")
     assert bench.latest("matrix").data.shape[1] == 30
     wait_for(lambda: bench.state.mirror.peak > 0, "pokes")
     bench.abort()
-    with pytest.raises(Aborted, match="what was measured is kept") as stop:
+    with pytest.raises(Aborted, match="the data measured so far are saved") as stop:
         run.wait(120)
     assert stop.value.partial.partial
     wait_for(lambda: bench.state.mirror.peak == 0.0, "a flat mirror")
@@ -118,7 +119,7 @@ def test_the_loop_closes_takes_other_settings_and_opens(bench: Connection, matri
     wait_for(lambda: bench.state.latency.p50 > 0, "latency")
     with pytest.raises(RequestRefused, match="the loop is closed; open it first"):
         bench.start("docrime")
-    with pytest.raises(ConfigError, match="no matrix is called 'nothing'"):
+    with pytest.raises(ConfigError, match="there is no matrix 'nothing'"):
         bench.set_loop(matrix="nothing")
     assert bench.state.phase is Phase.LOOP
     bench.open_loop()
@@ -137,8 +138,8 @@ def test_who_looks_after_asking_sees_what_was_done(bench: Connection, matrix: st
         assert (bench.state.loop.closed, bench.state.mirror.peak) == (False, 0.0)
         until_idle(bench)
     run = bench.start("docrime", frames=10_000_000)
-    assert bench.state.procedure is not None
-    assert (bench.state.procedure.id, bench.state.phase) == (run.id, Phase.PROCEDURE)
+    assert bench.state.active_run is not None
+    assert (bench.state.active_run.id, bench.state.phase) == (run.id, Phase.PROCEDURE)
     bench.abort()
 
 
@@ -147,8 +148,8 @@ def test_a_closed_loop_is_closed_again_after_a_procedure_with_a_loop_of_its_own(
 ) -> None:
     bench.close_loop(matrix, gain=0.35, leak=0.001, dropped_modes=5)
     asked = {"im": matrix, "frames": 300, "gain": 0.2, "strehl": False}
-    assert "closed again as it was" in bench.check("loop", asked).warnings[-1]
-    assert "open the loop first" in bench.check("docrime", {}).warnings[-1]
+    assert "closed again with the same parameters" in bench.plan("loop", asked).warnings[-1]
+    assert "open the loop first" in bench.plan("docrime", {}).warnings[-1]
     result = bench.calibrate("loop", **asked)
     assert result.frames == 300
     wait_for(lambda: bench.state.loop.closed and bench.state.phase is Phase.LOOP, "the loop is closed again")
@@ -157,7 +158,7 @@ def test_a_closed_loop_is_closed_again_after_a_procedure_with_a_loop_of_its_own(
     wait_for(lambda: bench.state.mirror.peak > 0, "a shape on the mirror")
     # Who stops it wants the mirror flat, and finds it so.
     run = bench.start("loop", **{**asked, "frames": 10_000_000})
-    wait_for(lambda: bench.state.procedure is not None and bench.state.procedure.done > 100, "frames")
+    wait_for(lambda: bench.state.active_run is not None and bench.state.active_run.completed > 100, "frames")
     bench.abort()
     with pytest.raises(Aborted):
         run.wait(60)
@@ -167,7 +168,7 @@ def test_a_closed_loop_is_closed_again_after_a_procedure_with_a_loop_of_its_own(
 
 
 def test_sprint_on_a_stored_matrix(bench: Connection, matrix: str) -> None:
-    plan = bench.check("sprint", {"im": matrix})
+    plan = bench.plan("sprint", {"im": matrix})
     assert (plan.frames, plan.stroke) == (0, 0.0)
     run = bench.start("sprint", im=matrix)
     result = run.wait(120)
@@ -180,7 +181,7 @@ def test_sprint_on_a_stored_matrix(bench: Connection, matrix: str) -> None:
     assert made[f"sprint-{run.id}-im"].startswith("docrime")
 
 
-def test_gains_and_the_matrix_that_they_scale_both_stay_on_the_shelf(bench: Connection, matrix: str) -> None:
+def test_gains_and_the_matrix_that_they_scale_both_stay_in_the_store(bench: Connection, matrix: str) -> None:
     run = bench.start("gains", im=matrix, frames=300, accuracy=0.5, strehl=False)
     run.wait(120)
     kinds = {one.name: one.kind for one in bench.state.products}
@@ -200,11 +201,11 @@ def test_a_closed_loop_run_and_its_result(bench: Connection, matrix: str) -> Non
 
 def test_a_halted_run_has_a_flat_mirror_and_goes_on(bench: Connection) -> None:
     run = bench.start("docrime", frames=4000)
-    wait_for(lambda: bench.state.procedure is not None and bench.state.procedure.done > 300, "frames")
+    wait_for(lambda: bench.state.active_run is not None and bench.state.active_run.completed > 300, "frames")
     bench.pause()
-    wait_for(lambda: bench.state.procedure is not None and bench.state.procedure.paused, "halted")
+    wait_for(lambda: bench.state.active_run is not None and bench.state.active_run.paused, "halted")
     wait_for(lambda: bench.state.mirror.peak == 0.0, "a flat mirror")
-    done = bench.state.procedure.done
+    done = bench.state.active_run.completed
     bench.resume()
     result = run.wait(120)
     assert done < 4000 == result.frames
@@ -212,19 +213,19 @@ def test_a_halted_run_has_a_flat_mirror_and_goes_on(bench: Connection) -> None:
 
 
 def test_a_check_tells_frames_time_and_stroke_and_moves_nothing(bench: Connection) -> None:
-    plan = bench.check("escape", {"frames": 1500})
+    plan = bench.plan("escape", {"frames": 1500})
     assert plan.frames == 1500
     assert plan.seconds == pytest.approx(3.0)
     assert 0.1 < plan.stroke < 1
     assert bench.state.mirror.peak == 0.0
-    few = bench.check("docrime", {"frames": 20})
+    few = bench.plan("docrime", {"frames": 20})
     assert "20 frames cannot constrain the modes" in few.warnings[0]
     with pytest.raises(ConfigError, match="'frame' is no argument of this procedure; did you mean 'frames'"):
-        bench.check("escape", {"frame": 3})
+        bench.plan("escape", {"frame": 3})
     with pytest.raises(
         ConfigError, match="poke is 3; it must be at least 1e-06 and at most 1 of full stroke"
     ):
-        bench.check("escape", {"poke": 3.0})
+        bench.plan("escape", {"poke": 3.0})
 
 
 def test_a_failed_run_says_why_and_the_server_goes_on(bench: Connection) -> None:
@@ -254,7 +255,7 @@ def test_products_come_from_the_folders_of_the_server_only(
 def test_who_only_watches_writes_nothing_but_may_always_stop(served: Served, bench: Connection) -> None:
     with served.connect() as watcher:
         assert not watcher.holds_lease
-        with pytest.raises(LeaseHeld, match=r"has had the right to write since"):
+        with pytest.raises(LeaseHeld, match=r"has had control since"):
             watcher.start("docrime")
         with pytest.raises(LeaseHeld):
             watcher.acquire()
@@ -268,9 +269,7 @@ def test_who_only_watches_writes_nothing_but_may_always_stop(served: Served, ben
         wait_for(lambda: not bench.holds_lease and watcher.holds_lease, "the lease has changed hands")
         with pytest.raises(LeaseHeld):
             bench.set_loop(gain=0.3)
-        taken = [
-            line.text for line in watcher.log_after(-1) if "takes the right to write over from" in line.text
-        ]
+        taken = [line.text for line in watcher.log_after(-1) if "takes control over from" in line.text]
         assert taken
 
 
@@ -315,7 +314,7 @@ def test_two_clients_race_for_the_lease_a_thousand_times(served: Served, bench: 
 
 
 def test_a_run_whose_holder_vanished_is_aborted_and_the_fault_latched(system: Path, tmp_path: Path) -> None:
-    limits = ("--set", "server.lease_s=1.5", "--set", "server.abandoned_s=1")
+    limits = ("--set", "server.lease_s=1.5", "--set", "server.unattended_s=1")
     with serving(system, *limits, folder=tmp_path) as served, served.connect() as watcher:
         holder = served.connect(control=True)
         until_idle(watcher)
@@ -323,10 +322,10 @@ def test_a_run_whose_holder_vanished_is_aborted_and_the_fault_latched(system: Pa
         wait_for(lambda: watcher.state.mirror.peak > 0, "pokes")
         holder._link.close()  # its heartbeat ends, and it cannot give the lease back
         wait_for(lambda: watcher.state.phase is Phase.FAULT, "the fault")
-        assert "'docrime' (run 1) was left alone for" in watcher.state.fault.reason
-        wait_for(lambda: watcher.state.last is not None, "the end of the run")
-        assert watcher.state.last.finish is Finish.ABORTED
-        assert Path(watcher.state.last.products["im"]).name == "im.partial.fits"
+        assert "'docrime' (run 1) was without a client in control for" in watcher.state.fault.reason
+        wait_for(lambda: watcher.state.last_run is not None, "the end of the run")
+        assert watcher.state.last_run.finish is Finish.ABORTED
+        assert Path(watcher.state.last_run.products["im"]).name == "im.partial.fits"
         assert watcher.state.mirror.peak == 0.0
         watcher.acquire()
         with pytest.raises(RequestRefused, match="clear the fault first"):

@@ -20,7 +20,8 @@ from escape_hw.io.fits.matrix import load_matrix
 from escape_hw.remote.address import ServerListing, local_endpoint, register_server, unregister_server
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Phase
-from escape_hw.streams.segments import process_start, segments
+from escape_hw.streams.segments import segments
+from escape_hw.supervision import process_start
 from escape_sim.devices.twins import shared_bench
 from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build_library
 from escape_sim.stand_ins.bench_server import StandInBench
@@ -54,7 +55,7 @@ def whole(folder: Path) -> None:
         load_matrix(path)
 
 
-def test_the_guardian_flattens_the_mirror_of_an_engine_that_was_killed(system, bench, tmp_path) -> None:
+def test_the_fail_safe_process_flattens_the_mirror_of_a_killed_engine(system, bench, tmp_path) -> None:
     server, spy = bench
     with on_metal(system, server, tmp_path) as served, served.connect(control=True) as client:
         until_idle(client)
@@ -64,7 +65,7 @@ def test_the_guardian_flattens_the_mirror_of_an_engine_that_was_killed(system, b
         os.kill(running, signal.SIGKILL)
         with pytest.raises(CalibrationError, match=r"ended with its engine: the engine .* died; "):
             run.wait(60)
-        wait_for(lambda: guarded(client), "the guardian has done its work")
+        wait_for(lambda: guarded(client), "the fail-safe process has ended")
         assert spy.flat
         assert client.state.phase is Phase.FAULT
         assert not segments(pid=running)
@@ -80,30 +81,30 @@ def test_the_guardian_flattens_the_mirror_of_an_engine_that_was_killed(system, b
 
 
 def guarded(client: Connection) -> bool:
-    """Whether the fault says that the guardian has flattened the mirror."""
+    """Whether the fault says that the fail-safe process has flattened the mirror."""
     return client.state.fault is not None and "the mirror is flat" in client.state.fault.reason
 
 
-def guardian_of(served: Served) -> int:
-    """Process of the guardian; 0: there is none."""
+def failsafe_of(served: Served) -> int:
+    """Process number of the fail-safe process; 0 when there is none."""
     words = ("-f", "escape_hw.server.safety.failsafe", "-P", str(served.pid))
     found = subprocess.run(("pgrep", *words), capture_output=True, text=True, check=False).stdout.split()
     return int(found[0]) if found else 0
 
 
-def test_a_guardian_that_was_killed_is_replaced_and_does_its_work(system, bench, tmp_path) -> None:
+def test_a_killed_fail_safe_process_is_restarted_and_works(system, bench, tmp_path) -> None:
     server, spy = bench
     with on_metal(system, server, tmp_path) as served, served.connect(control=True) as client:
         until_idle(client)
-        first = guardian_of(served)
+        first = failsafe_of(served)
         os.kill(first, signal.SIGKILL)
-        wait_for(lambda: guardian_of(served) not in (0, first), "another guardian")
+        wait_for(lambda: failsafe_of(served) not in (0, first), "another fail-safe process")
         run = client.start("docrime", frames=10_000_000)
         wait_for(lambda: not spy.flat, "the mirror is poked")
         os.kill(client.state.engine_pid, signal.SIGKILL)
         with pytest.raises(CalibrationError, match=r"ended with its engine: the engine .* died; "):
             run.wait(60)
-        wait_for(lambda: guarded(client), "the guardian has done its work")
+        wait_for(lambda: guarded(client), "the fail-safe process has ended")
         assert spy.flat
 
 
@@ -142,7 +143,7 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
             wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
             served.kill()
             seconds = wait_for(lambda: spy.flat, "the mirror is flat")
-            wait_for(lambda: not served.engines(), "engine and guardian end")
+            wait_for(lambda: not served.engines(), "engine and fail-safe process end")
             wait_for(lambda: not client.connected, "the client notices")
             with pytest.raises(ServerGone):
                 client.start("docrime")
@@ -153,7 +154,7 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
         served.start()
         with served.connect() as client:
             notes = " / ".join(client.state.notes)
-        assert "did not end in order" in notes
+        assert "did not end cleanly" in notes
         assert "docrime" in notes
         assert str(partial.parent) in notes
 
@@ -176,10 +177,10 @@ def test_ten_kills_at_random_moments_of_a_calibration(system, bench, tmp_path, s
                 engine = client.state.engine_pid
                 if which == "engine":
                     os.kill(engine, signal.SIGKILL)
-                    wait_for(lambda: guarded(client), "the guardian has done its work")
+                    wait_for(lambda: guarded(client), "the fail-safe process has ended")
                 else:
                     served.kill()
-                    wait_for(lambda: not served.engines(), "engine and guardian end")
+                    wait_for(lambda: not served.engines(), "engine and fail-safe process end")
                     served.start()
             assert spy.last is None or spy.flat, (number, which)
             assert not segments(pid=engine), (number, which)
@@ -194,7 +195,7 @@ def test_an_engine_that_hangs_is_ended_and_its_mirror_made_flat(system, bench, t
     server, spy = bench
     with (
         serving(
-            system, "--mode", "hardware", "--set", OPTIONS[0], "--set", "server.silent_s=2",
+            system, "--mode", "hardware", "--set", OPTIONS[0], "--set", "server.engine_silence_s=2",
             folder=tmp_path, more=server.environment,
         ) as served,
         served.connect(control=True) as client,
@@ -203,7 +204,7 @@ def test_an_engine_that_hangs_is_ended_and_its_mirror_made_flat(system, bench, t
         client.start("docrime", frames=10_000_000)
         wait_for(lambda: not spy.flat and spy.last is not None, "the mirror is poked")
         os.kill(client.state.engine_pid, signal.SIGSTOP)
-        wait_for(lambda: guarded(client), "the guardian has done its work")
+        wait_for(lambda: guarded(client), "the fail-safe process has ended")
         assert "the engine was silent for 2." in client.state.fault.reason
         assert spy.flat
         with pytest.raises(RequestRefused, match="the engine has died; clear the fault to start it again"):

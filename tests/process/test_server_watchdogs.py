@@ -1,4 +1,4 @@
-"""Watchdogs of a served bench behind its real drivers: loop open, mirror flat, latched, told, and cleared."""
+"""Limits of a served bench with its real drivers: loop open, mirror flat, fault latched, cleared."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ REGION = "devices.wfs.region=[216,152,208,208]"
 #: Short enough for a test, and long enough for a machine whose processors all have other work; the loop's own
 #: patience with a camera ends after five seconds.
 LIMITS = {
-    "lease_s": 15, "abandoned_s": 1, "no_frames_s": 2.5, "diverging_factor": 2, "diverging_s": 0.4,
-    "silent_s": 60,
+    "lease_s": 15, "unattended_s": 1, "no_frames_s": 2.5, "diverging_factor": 2, "diverging_s": 0.4,
+    "engine_silence_s": 60,
 }  # fmt: skip
 
 
@@ -91,7 +91,7 @@ def made_safe(bench: Connection, spy: Spy, *words: str) -> None:
     fault = bench.state.fault
     assert fault is not None
     assert any(word in fault.reason for word in words), fault.reason
-    assert fault.way_out
+    assert fault.remedy
     wait_for(lambda: any("FAULT" in line.text for line in bench.log_after(-1)), "a line in the log")
     with pytest.raises(RequestRefused, match="clear the fault first"):
         bench.start("docrime", frames=500)
@@ -151,8 +151,10 @@ def test_a_poke_run_that_lost_its_lease(held, mirror) -> None:
     wait_for(lambda: watcher.state.mirror.peak > 0 and not mirror[1].flat, "pokes")
     bench.release()
     wait_for(lambda: watcher.state.fault is not None, "the fault")
-    wait_for(lambda: watcher.state.last is not None and watcher.state.last.name == "docrime", "its end")
+    wait_for(
+        lambda: watcher.state.last_run is not None and watcher.state.last_run.name == "docrime", "its end"
+    )
     watcher.acquire()
-    made_safe(watcher, mirror[1], "was left alone for")
-    assert watcher.state.last.finish is Finish.ABORTED
+    made_safe(watcher, mirror[1], "was without a client in control for")
+    assert watcher.state.last_run.finish is Finish.ABORTED
     watcher.release()

@@ -24,7 +24,7 @@ from escape_hw.errors import ConfigError, ServerGone
 from escape_hw.remote import keys
 from escape_hw.remote.address import resolve
 from escape_hw.remote.client import Connection, connect
-from escape_hw.remote.state import Phase
+from escape_hw.remote.state import SCHEMA, Phase
 
 PORT = 30000 + os.getpid() % 20000
 
@@ -68,7 +68,8 @@ def test_garbage_is_refused_and_counted(raw: zmq.Socket[bytes], parts: list[byte
 
 @given(
     document=st.recursive(
-        st.none() | st.booleans() | st.floats() | st.text(max_size=10) | st.sampled_from(["start", "hello"]),
+        st.none() | st.booleans() | st.floats() | st.text(max_size=10)
+        | st.sampled_from(["start_procedure", "hello"]),
         lambda inner: (
             st.lists(inner, max_size=3)
             | st.dictionaries(
@@ -85,7 +86,7 @@ def test_documents_that_are_no_requests_are_refused(raw: zmq.Socket[bytes], docu
 
 
 def test_what_is_too_large_is_refused_or_cut_off(raw: zmq.Socket[bytes], bench: Connection) -> None:
-    before = bench.state.refused
+    before = bench.state.refused_requests
     raw.send_multipart([b"1", b"x" * 100_000])
     reply = answer(raw)
     assert reply["error"]["message"].endswith("100000 bytes; a request has at most 65536")
@@ -93,30 +94,34 @@ def test_what_is_too_large_is_refused_or_cut_off(raw: zmq.Socket[bytes], bench: 
     # The connection was cut; the next request comes over a new one.
     raw.send_multipart([b"3", b"{}"])
     assert answer(raw)["ok"] is False
-    wait_for(lambda: bench.state.refused >= before + 2, "refusals are counted")
+    wait_for(lambda: bench.state.refused_requests >= before + 2, "refusals are counted")
     assert bench.state.fault is None
 
 
-def test_who_did_not_say_hello_is_not_heard(raw: zmq.Socket[bytes], bench: Connection) -> None:
+def test_a_client_that_is_not_registered_is_refused(raw: zmq.Socket[bytes], bench: Connection) -> None:
     request = {"verb": "open_loop", "client": bench.client}
     raw.send_multipart([b"1", json.dumps(request).encode()])
-    assert "say hello first" in answer(raw)["error"]["message"]
-    hello = {"verb": "hello", "client": bench.client, "schema_version": 1, "name": "x", "host": "y", "pid": 1}
+    assert "not registered under that client number" in answer(raw)["error"]["message"]
+    hello = {
+        "verb": "hello", "client": bench.client, "schema_version": SCHEMA, "name": "x", "host": "y", "pid": 1,
+    }  # fmt: skip
     raw.send_multipart([b"2", json.dumps(hello).encode()])
     assert "belongs to another connection" in answer(raw)["error"]["message"]
-    raw.send_multipart([b"3", json.dumps({**hello, "client": "0" * 8, "schema_version": 99}).encode()])
-    assert "this server speaks version 1, the client 99" in answer(raw)["error"]["message"]
+    for version in (1, 99):
+        other = {**hello, "client": "0" * 8, "schema_version": version}
+        raw.send_multipart([b"3", json.dumps(other).encode()])
+        assert f"the client version {version}; use the same version" in answer(raw)["error"]["message"]
 
 
-def test_a_client_that_was_forgotten_says_hello_again(served: Served, bench: Connection) -> None:
+def test_a_client_that_was_removed_registers_again(served: Served, bench: Connection) -> None:
     with served.connect() as late:
-        # To the server it is all one whether it forgot a number or never heard it.
+        # For the server, a removed number is the same as an unknown one.
         late.client = str(uuid.uuid4())
         assert late.procedures()
         wait_for(lambda: bench.state.clients >= 2, "both count")
         before = bench.state.clients
         late.client = str(uuid.uuid4())
-        # It asks for nothing: its sign of life alone makes it known.
+        # It sends no request: its heartbeat alone registers it.
         wait_for(lambda: bench.state.clients > before, "it is counted")
 
 
@@ -132,16 +137,16 @@ def test_slow_and_half_messages_on_a_plain_socket_stop_nothing(bench: Connection
                 one.sendall(b"\x03")
             except OSError:
                 continue  # cut off, as it should be
-        assert bench.check("docrime", {"frames": 500}).frames == 500
+        assert bench.plan("docrime", {"frames": 500}).frames == 500
     for one in lines:
         one.close()
 
 
 def test_a_flood_leaves_the_server_to_others(raw: zmq.Socket[bytes], bench: Connection) -> None:
     for _ in range(20_000):
-        raw.send_multipart([b"1", b"nonsense"])  # whose answers nobody takes
+        raw.send_multipart([b"1", b"nonsense"])  # replies are not read
     began = bench.state.serial
-    assert bench.check("docrime", {"frames": 500}).frames == 500
+    assert bench.plan("docrime", {"frames": 500}).frames == 500
     wait_for(lambda: bench.state.serial > began + 3, "states go on")
 
 
@@ -196,24 +201,24 @@ def test_from_afar_the_samples_come_over_the_wire(bench: Connection) -> None:
         assert sample.meta["top"] == 1023
         assert far.geometry().n_modes == 30
         with pytest.raises(ConfigError):
-            far.check("nothing")
+            far.plan("nothing")
         wait_for(lambda: far.connected and far.state.serial > 1, "events")
 
 
-def test_nobody_is_found_where_no_server_is(served: Served) -> None:
+def test_without_a_server_none_is_found(served: Served) -> None:
     with pytest.raises(
         ServerGone, match=r"no server of 'elsewhere' runs here .*start one with 'escape serve"
     ):
         connect("elsewhere")
     with pytest.raises(ConfigError, match="is no address"):
         connect("http://127.0.0.1:80")
-    with pytest.raises(ServerGone, match="no answer to 'hello'"):
+    with pytest.raises(ServerGone, match="no reply to 'hello'"):
         connect("tcp://127.0.0.1:9")
 
 
 @pytest.fixture
 def homes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
-    """Configuration of whoever serves, and of whoever connects, which is that of this process."""
+    """Key folders of the server and of the client; the latter is that of this process."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "client"))
     return tmp_path / "server", tmp_path / "client"
 
@@ -241,12 +246,12 @@ def test_with_keys_from_another_machine_and_nothing_without(
         served.connect() as local,
     ):
         until_idle(local)
-        with pytest.raises(ServerGone, match=r"If it asks for keys: escape keys trust 127\.0\.0\.2 KEY"):
+        with pytest.raises(ServerGone, match=r"If it requires keys: escape keys trust 127\.0\.0\.2 KEY"):
             connect(address)
         escape_keys(clients, "trust", "127.0.0.2", server.decode())
         with connect(address, control=True) as far:
             wait_for(lambda: far.latest("frames") is not None, "a frame")
-            assert far.check("docrime", {"frames": 300}).frames == 300
+            assert far.plan("docrime", {"frames": 300}).frames == 300
             wait_for(lambda: far.state.serial > 1 and far.holds_lease, "events")
         secret = keys.own_keys().secret
         stranger = zmq.curve_keypair()
@@ -258,11 +263,13 @@ def test_with_keys_from_another_machine_and_nothing_without(
             assert heard(address, public, hidden, other) == 0
         # Whom the operator lets in is in at once, and out again.
         escape_keys(running_servers, "allow", "stranger", stranger[0].decode())
-        wait_for(lambda: heard(address, *stranger, server) > 0, "the stranger is let in")
-        escape_keys(running_servers, "forget", "stranger")
+        wait_for(lambda: heard(address, *stranger, server) > 0, "the unknown client is allowed")
+        escape_keys(running_servers, "remove", "stranger")
         assert heard(address, *stranger, server) == 0
-        escape_keys(running_servers, "forget", "client")
-        with pytest.raises(ServerGone, match=r"Does it let this key in \(there: escape keys allow NAME"):
+        escape_keys(running_servers, "remove", "client")
+        with pytest.raises(
+            ServerGone, match=r"Check that it allows this key \(there: escape keys allow NAME"
+        ):
             connect(address)
         assert local.state.fault is None
 

@@ -1,4 +1,4 @@
-"""What one state of the air shifts a registration by, told from what pokes do to every frame."""
+"""Scatter of the registration by turbulence states, separated from that by pokes."""
 
 from __future__ import annotations
 

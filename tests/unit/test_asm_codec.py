@@ -16,7 +16,7 @@ from escape_drivers.asm.codec import HEADER_BYTES, MAX_PAYLOAD_BYTES, AsmCodec, 
 from escape_hw.api.adaptive_secondary import ShellState
 from escape_sim.emulators.asm import protocol as w
 from escape_sim.emulators.asm.controller import AsmController, AsmLimits
-from escape_sim.emulators.asm.server import ReplyWriter
+from escape_sim.emulators.asm.replies import ReplyWriter
 from escape_sim.mirror.shell import RealTimeActuators, Shell
 
 N_ACT = 21

@@ -265,7 +265,7 @@ def test_a_driver_that_says_it_is_simulated_is_believed(driver: str) -> None:
         ("devices.dm.sim_driver=sim-bmc", "devices.dm: no device driver 'sim-bmc' is installed"),
         (
             "devices.wfs.sim_driver=sim-alpao",
-            "devices.wfs: driver 'sim-alpao' makes a FakeMirror, not a Camera",
+            "devices.wfs: driver 'sim-alpao' creates a FakeMirror, not a Camera",
         ),
         ('devices.dm.sim_driver=""', "devices.dm.sim_driver: ''  names no driver"),
         ('devices.wfs.sim_driver=""', "devices.wfs.sim_driver: ''  names no driver"),

@@ -11,7 +11,8 @@ from escape_hw.calibration.sprint.covariance import LowRankNoise
 from escape_hw.calibration.sprint.cramer_rao_bound import compute_registration_bound, correlated_information
 from escape_hw.calibration.sprint.normal_equations import Priors, normal_equations
 from escape_hw.config.loader import load_system
-from escape_sim.models.shack_hartmann import make_model, nominal_grid
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import nominal_grid
 
 N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES, N_TRENDS = 7, 10, 5, 4, 3, 2
 
@@ -100,7 +101,7 @@ def test_patterns_beyond_what_noise_has_are_not_seen_as_less_than_it():
 
 def test_the_bound_of_uncorrelated_slopes_is_the_same_by_either_way():
     config = load_system("razor-shwfs", overrides=SMALL)
-    model, grid = make_model(config, None), nominal_grid(config)
+    model, grid = make_fast_model(config, None), nominal_grid(config)
     rng = np.random.default_rng(7)
     m2c = np.linalg.qr(rng.standard_normal((model.n_act, 8)))[0]
     matrix = InteractionMatrix(

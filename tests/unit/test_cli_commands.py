@@ -107,18 +107,20 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
         "method": "docrime-whitened",
         "modes": 94,
         "learning_rate": 1.0,
-        "solver": "effects",
+        "solver": "mixed-effects",
         "modes_choice": "snr",
         "loss": "squares",
-        "actuators": "found",
+        "actuators": "fitted",
         "also": (),
     }
     assert bench.calls == [("sprint", asked)]
     assert (
-        document("sprint", "razor-shwfs", "--im", im, "--solver", "light", "--out", tmp_path / "light")[0]
+        document(
+            "sprint", "razor-shwfs", "--im", im, "--solver", "registration-only", "--out", tmp_path / "light"
+        )[0]
         == 0
     )
-    assert bench.calls[1:] == [("sprint", {**asked, "solver": "light"})]
+    assert bench.calls[1:] == [("sprint", {**asked, "solver": "registration-only"})]
     assert not bench.benches
     product = load_matrix(found["products"]["im"])
     assert product.registration is not None

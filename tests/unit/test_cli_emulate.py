@@ -1,4 +1,4 @@
-"""``escape emulate``: lists, serves, complains, and says where it listens."""
+"""``escape emulate``: lists, serves, reports protocol violations, and says where it listens."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_a_quiet_run_is_reported(document):
     assert code == 0
     assert err.startswith("e727: tcp 127.0.0.1:")
     assert found["address"].startswith("tcp 127.0.0.1:")
-    assert (found["complaints"], found["condition"], found["commands"]) == ([], "at rest", 0)
+    assert (found["violations"], found["condition"], found["commands"]) == ([], "at rest", 0)
     assert {"schema", "system", "simulated", "seed"} <= set(found)
 
 
@@ -33,8 +33,8 @@ def test_a_serial_line_is_offered(document):
     assert found["address"].startswith("pty /dev/")
 
 
-def test_complaints_are_told_and_cost_the_exit_code(document, monkeypatch):
-    told = emulate._report_new_complaints
+def test_violations_are_reported_and_change_the_exit_code(document, monkeypatch):
+    told = emulate._report_new_violations
 
     def careless(one, name, emulator, number):
         if emulator.controller.received_commands:
@@ -44,12 +44,13 @@ def test_complaints_are_told_and_cost_the_exit_code(document, monkeypatch):
             assert wire.recv(64) == b"5\n"
         return told(one, name, emulator, number)
 
-    monkeypatch.setattr(emulate, "_report_new_complaints", careless, raising=True)
+    monkeypatch.setattr(emulate, "_report_new_violations", careless, raising=True)
     monkeypatch.setattr(emulate, "_POLL_S", 0.5)
     code, found, err = document("emulate", "e727", "--port", 0, "--seconds", 0.05)
     assert code == 1
-    assert found["complaints"][0] == "MOV 1 5000: error 5 (servo off or axis unreferenced)"
-    assert "e727: complaint: MOV 1 5000: error 5" in err
+    assert found["complaints"] == found["violations"], "the key of version 0.1.0"
+    assert found["violations"][0] == "MOV 1 5000: error 5 (servo off or axis unreferenced)"
+    assert "e727: protocol violation: MOV 1 5000: error 5" in err
 
 
 @pytest.mark.parametrize(
@@ -75,5 +76,5 @@ def test_ctrl_c_is_the_usual_end(document, monkeypatch):
     code, found, err = document("emulate", "e727", "--port", 0)
     assert code == 0
     assert "e727: stopped" in err
-    assert found["complaints"] == []
+    assert found["violations"] == []
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("e727")]

@@ -18,7 +18,7 @@ LINKED = ("--set", "devices.dm.mode=hardware", "--set", "devices.dm.options.repl
 @pytest.fixture
 def asm():
     """An emulated mirror and the options that lead to it."""
-    made = make_emulator(EmulatorRequest(port=0, options={"speed": "1000", "hold": "20", "rest": "60"}))
+    made = make_emulator(EmulatorRequest(port=0, options={"transition_speed": "1000", "hold_s": "20", "rest_s": "60"}))
     with made:
         port = made.start().rpartition(":")[2]
         yield made, ("maps-nir", *LINKED, "--set", f"devices.dm.options.port={port}")
@@ -110,7 +110,7 @@ def test_a_fault_is_cleared_only_by_who_says_that_it_was_seen_to(document, escap
     assert str(made.controller.shell.state) == "fault"
     code, found, _ = document("asm", "clear", *options, "--yes")
     assert (code, found["before"], found["after"]) == (0, "fault", "rested")
-    assert found["fault"] == "panic, as arranged"
+    assert found["fault"] == "panic (scripted)"
     code, found, _ = document("asm", "clear", *options)
     assert (code, found["changed"]) == (0, False)
 

@@ -61,7 +61,7 @@ def test_start_status_stop_on_the_wire(document, escape, stage):
     assert "this moves the modulator: centre, servos off" in err
     assert (found["modulation"], found["left"]) == (None, "parked")
     assert emulator.controller.state.describe() == "at rest"
-    assert emulator.complaints == ()
+    assert emulator.violations == ()
 
 
 def test_for_some_seconds_and_then_parked(document, stage):
@@ -77,7 +77,7 @@ def test_what_it_cannot_do_is_refused_before_it_turns(document, stage):
     code, found, err = document("modulator", "start", "razor-pywfs", "--radius", 30, *here)
     assert code == 3
     assert found["error"]["type"] == "SettingRejected"
-    assert "it does 0 to 0.001 rad" in err
+    assert "the range is 0 to 0.001 rad" in err
     assert not [line for line in emulator.controller.received_commands if line.startswith("WGO ")]
     assert emulator.controller.state.describe() == "at rest"
 

@@ -128,7 +128,7 @@ WRONG = {
         '"circle-11"',
         '"round"',
         '"round"',
-        'devices.dm.layout: "round"  is not allowed; expected: where the actuators stand: '
+        'devices.dm.layout: "round"  is not allowed; expected: arrangement of the actuators: '
         "'circle-N' or 'square-N' on an N x N grid, 'rings-336' or 'rings-672' on rings",
     ),
     "missing key": (
@@ -148,7 +148,7 @@ WRONG = {
         "region = [400, 400]",
         "region = [400, 400]",
         "devices.wfs.region: [400, 400]  has too few items; "
-        "expected: region read: x, y, width, height, pixels",
+        "expected: region: x, y, width, height, pixels",
     ),
     "number for array": (
         "frequency_hz = [17.0, 43.0]",
@@ -202,7 +202,7 @@ WRONG = {
         'kind = "kl"',
         'kind = "kl"\nfile = "modes.fits"',
         "modes.fits",
-        "basis.file: \"modes.fits\"  is not read with kind = 'kl'; remove it",
+        "basis.file: \"modes.fits\"  is not used with kind = 'kl'; remove it",
     ),
     "kind without basis file": (
         'kind = "kl"',

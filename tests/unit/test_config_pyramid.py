@@ -100,7 +100,7 @@ WRONG = {
         "[130.0, 128.0]",
         "[130.0, 170.0]",
         "pupils_px",
-        "sensor.pupils_px: [130.0, 170.0]  the region of 192 x 192 pixels cuts this image of 64 pixels",
+        "sensor.pupils_px: [130.0, 170.0]  the region of 192 x 192 pixels cuts off part of this image of 64 pixels",
     ),
     "more than the modulator reaches": (
         "max_tilt_rad = 1.0e-3",
@@ -112,8 +112,8 @@ WRONG = {
         "[twin.pyramid] # choice",
         "grid_offset_px = [1.0, 0.0]\n[twin.pyramid] # choice",
         "grid_offset_px",
-        "twin.wfs.grid_offset_px: [1.0, 0.0]  is for lenslets; pupil images are moved by "
-        "twin.pyramid.centre_offsets_px",
+        "twin.wfs.grid_offset_px: [1.0, 0.0]  applies to lenslets; use "
+        "twin.pyramid.centre_offsets_px to move pupil images",
     ),
 }
 
@@ -131,7 +131,7 @@ def test_modulation_needs_a_modulator() -> None:
     text = PYWFS[:start] + PYWFS[end:]
     assert complaint(text) == [
         f"bench.toml:{line_with(text, 'modulation = 3.0')}  sensor.modulation: 3.0  "
-        "needs a modulator, [devices.modulator]; 0 is a pyramid without modulation"
+        "needs a section [devices.modulator]; 0 is a pyramid without modulation"
     ]
     assert load_text(text, overrides=["sensor.modulation=0"]).devices.modulator is None
 
@@ -139,7 +139,7 @@ def test_modulation_needs_a_modulator() -> None:
 def test_imperfections_of_a_pyramid_are_no_lenslets_business() -> None:
     (line,) = complaint(SHWFS, overrides=["twin.pyramid.ellipse=0.1"])
     assert line == (
-        "--set  twin.pyramid.ellipse: 0.1  is not read with sensor.kind = 'shack-hartmann'; remove it"
+        "--set  twin.pyramid.ellipse: 0.1  is not used with sensor.kind = 'shack-hartmann'; remove it"
     )
 
 

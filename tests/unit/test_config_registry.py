@@ -103,12 +103,12 @@ def test_what_cannot_be_loaded_says_what_to_do(name: str, message: str) -> None:
     [
         (
             "plug-mirror",
-            "makes a str, not a DeformableMirror; plug_mirror:make must return one",
+            "creates a str, not a DeformableMirror; plug_mirror:make must return one",
         ),
-        ("plug-forgets", "makes a NoneType, not a DeformableMirror; plug_mirror:forgets must return one"),
+        ("plug-forgets", "creates a NoneType, not a DeformableMirror; plug_mirror:forgets must return one"),
         (
             "plug-fails",
-            r"cannot be made: plug_mirror:fails failed with AttributeError: .*no_such_key.* line",
+            r"cannot be created: plug_mirror:fails failed with AttributeError: .*no_such_key.* line",
         ),
     ],
 )
@@ -122,13 +122,13 @@ def test_what_makes_no_mirror_is_named_with_what_is_expected(name: str, message:
 def test_a_broken_model_is_named_with_what_is_expected() -> None:
     with pytest.raises(ConfigError, match=r"takes \(config\).*called as factory\(config, grid\)"):
         registry.model_factory("plug-model")
-    with pytest.raises(ConfigError, match="'plug-none' makes a SystemConfig, not a SyntheticModel; plug_mi"):
+    with pytest.raises(ConfigError, match="'plug-none' creates a SystemConfig, not a SyntheticModel; plug_mi"):
         registry.model_factory("plug-none")(load_system("razor-shwfs"), None)
 
 
 @pytest.mark.parametrize("factory", [3, lambda name: name])
 def test_what_is_no_factory_is_not_registered(monkeypatch: pytest.MonkeyPatch, factory: object) -> None:
-    monkeypatch.setattr(registry, "_OWN", {})
+    monkeypatch.setattr(registry, "_REGISTERED", {})
     with pytest.raises(ConfigError, match=r"'bench-mirror' is broken: .* factory\(name, config, shared"):
         registry.register_device("bench-mirror", factory)  # type: ignore[arg-type]
 
@@ -146,7 +146,7 @@ def test_a_name_offered_by_two_packages_is_refused(monkeypatch: pytest.MonkeyPat
     one = EntryPoint("twin", "package_one.devices:make", registry.DEVICES)
     two = EntryPoint("twin", "package_two:make", registry.DEVICES)
     monkeypatch.setattr(importlib.metadata, "entry_points", entries(one, two))
-    with pytest.raises(ConfigError, match=r"'twin' is offered twice: .*package_one.* and .*package_two"):
+    with pytest.raises(ConfigError, match=r"'twin' is provided twice: .*package_one.* and .*package_two"):
         registry.device_factory("twin")
 
 
@@ -164,7 +164,7 @@ def test_nothing_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_OWN", {})
+    monkeypatch.setattr(registry, "_REGISTERED", {})
     with pytest.raises(ConfigError, match="no device driver 'bench-mirror' is installed"):
         registry.device_factory("bench-mirror")
     for number in (1, 2):
@@ -175,7 +175,7 @@ def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPat
     assert "bench-mirror" not in registry.available(registry.MODELS)
     with pytest.raises(ConfigError, match="did you mean 'bench-mirror'"):
         registry.device_factory("bench-miror")
-    with pytest.raises(ConfigError, match="'sim-alpao' is offered by an installed package"):
+    with pytest.raises(ConfigError, match="'sim-alpao' is provided by an installed package"):
         registry.register_device("sim-alpao", factory)
 
 

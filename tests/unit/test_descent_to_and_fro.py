@@ -69,7 +69,7 @@ class Overshooting:
 
 
 def descend(problem, most=40, learning_rate=1.0):
-    context = SolverContext(None, None, np.arange(3), "effects", learning_rate, most, Priors())
+    context = SolverContext(None, None, np.arange(3), "mixed-effects", learning_rate, most, Priors())
     return run(_fit_mixed_effects(problem, Registration(shift_x=1.0, shift_y=-0.5), context))
 
 

@@ -1,4 +1,4 @@
-"""The engine's end of the channel: what waits there is told from silence and from the end."""
+"""The engine's end of the channel: unread messages are neither silence nor the end of the connection."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import threading
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from escape_hw.server.engine import runner as jobs
-from escape_hw.server.engine.request_handler import RequestHandler
+from escape_hw.server.engine.main import Engine
+from escape_hw.server.engine.state import EngineState, LoopParameters
 from escape_hw.server.ipc.channel import Channel, encode
+from escape_hw.supervision import BackgroundThread
 
 
 @pytest.fixture
@@ -24,36 +26,53 @@ def ends() -> Iterator[tuple[Channel, socket.socket]]:
     theirs.close()
 
 
-def test_what_waits_is_neither_silence_nor_the_end(ends: tuple[Channel, socket.socket]) -> None:
+def test_an_unread_message_is_neither_silence_nor_the_end(ends: tuple[Channel, socket.socket]) -> None:
     channel, theirs = ends
     assert not channel.has_unread
-    theirs.sendall(encode({"alive": True}))
+    theirs.sendall(encode({"heartbeat": True}))
     assert channel.has_unread
-    assert next(channel.messages()) == {"alive": True}
+    assert channel.silence_s == 0
+    assert next(channel.messages()) == {"heartbeat": True}
     assert not channel.has_unread
     theirs.close()
     assert not channel.has_unread
 
 
-def test_a_desk_that_had_no_time_to_listen_takes_nobody_for_silent(
-    ends: tuple[Channel, socket.socket], monkeypatch: pytest.MonkeyPatch
+def test_an_engine_that_had_no_time_to_read_does_not_take_the_front_end_for_silent(
+    ends: tuple[Channel, socket.socket],
 ) -> None:
     channel, theirs = ends
     reasons: list[str] = []
-    monkeypatch.setattr(jobs, "make_safe_now", lambda engine, reason: reasons.append(reason))
-    engine_state = SimpleNamespace(fault=None)
-    engine = SimpleNamespace(
-        setup=SimpleNamespace(front_end_timeout_s=0.1), engine_state=engine_state, channel=channel
-    )
-    request_handler = RequestHandler(engine, iter(()))
-    theirs.sendall(encode({"alive": True}))
-    threading.Thread(target=request_handler._watch_for_silence, daemon=True).start()
+    engine: Any = Engine.__new__(Engine)
+    engine._channel, engine._front_end_timeout_s = channel, 0.1
+    engine._state = EngineState(LoopParameters())
+    engine._owner = SimpleNamespace(request_safe_state=reasons.append)
+    theirs.sendall(encode({"heartbeat": True}))
+    silence = BackgroundThread("silence", engine._check_front_end, period_s=0.02)
+    silence.start()
     time.sleep(0.5)
     assert not reasons
-    # Taken, and nothing after it: now the front is silent.
+    # Read, and nothing after it: now the front end is silent.
     next(channel.messages())
     until = time.monotonic() + 10
     while not reasons and time.monotonic() < until:
         time.sleep(0.01)
-    engine_state.fault = "latched"
-    assert "the server's front was silent for" in reasons[0]
+    silence.stop()
+    assert "the server's front end was silent for" in reasons[0]
+
+
+def test_a_background_thread_that_fails_is_reported() -> None:
+    """A dead request handler or publisher must become a fault, not a silent stop."""
+    failures: list[Exception] = []
+    ended = threading.Event()
+
+    def fail() -> None:
+        raise RuntimeError("defect")
+
+    def on_failure(error: Exception) -> None:
+        failures.append(error)
+        ended.set()
+
+    BackgroundThread("requests", fail, on_failure=on_failure).start()
+    assert ended.wait(10)
+    assert [str(error) for error in failures] == ["defect"]

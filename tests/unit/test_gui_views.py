@@ -35,7 +35,7 @@ def test_a_painted_page_holds_the_matrix():
     matrix = fake.matrix(n=12, n_modes=20)
     layout = mosaic.fit_layout(matrix.valid.shape, 20, (600.0, 400.0), 100.0, 12.0)
     statistics = ModeStatistics.of(matrix.data, matrix.sigma)
-    values = mosaic.normalised(matrix.data, statistics, fade=False)
+    values = mosaic.normalise_modes(matrix.data, statistics, weight_by_snr=False)
     np.testing.assert_allclose(np.sqrt(np.mean(values**2, axis=0)), 1.0, rtol=1e-5)
     pages = mosaic.pages(layout, 20)
     assert pages * layout.per_page >= 20
@@ -73,7 +73,7 @@ def test_fading_hides_noise_and_keeps_signal():
 def test_modes_that_were_not_measured_stay_empty():
     data = fake.matrix(n=12, n_modes=4).data.copy()
     data[:, 2] = np.nan
-    values = mosaic.normalised(data, ModeStatistics.of(data, np.ones_like(data)), fade=True)
+    values = mosaic.normalise_modes(data, ModeStatistics.of(data, np.ones_like(data)), weight_by_snr=True)
     assert (mosaic.colour_indices(values[:, 2]) == mosaic.OUTSIDE).all()
     assert (mosaic.colour_indices(values[:, 1]) != mosaic.OUTSIDE).all()
 
@@ -97,7 +97,7 @@ def test_one_mode_in_every_matrix():
     }
     shown = {tile.title: tile for tile in tiles(matrices, 10)}
     assert list(shown) == [
-        "push-pull", "ESCAPE", "ESCAPE − push-pull", "Error of push-pull", "SNR of push-pull",
+        "push-pull", "ESCAPE", "ESCAPE − push-pull", "Standard error of push-pull", "SNR of push-pull",
     ]  # fmt: skip
     outside = ~matrices["ESCAPE"].valid
     for tile in shown.values():
@@ -119,7 +119,7 @@ def test_a_course_is_shown_in_the_papers_units():
     np.testing.assert_allclose(course.sigma, 0.1)
     assert np.isnan(course.step_norm[0])
     assert course.step_norm[1] == 0.3
-    drawn = course.normalised()
+    drawn = course.normalise()
     assert np.abs(drawn.values).max() <= 1.0
     np.testing.assert_allclose(drawn.values[1], [1, -1, -1, 2.9 / 3, 0])
     np.testing.assert_allclose(drawn.sigma[:2], [0.1 / 2, 0.1 / 71])
@@ -189,10 +189,10 @@ def test_lengths_of_time(seconds, text):
 
 def test_progress_in_words():
     run = ActiveRun(
-        id=1, name="docrime", arguments={}, stage="DO-CRIME", done=610, total=1000, remaining_s=252
+        id=1, name="docrime", arguments={}, stage="DO-CRIME", completed=610, total=1000, remaining_s=252
     )
     assert form.progress_line(run) == "DO-CRIME: 610 of 1000 frames, 4:12 min left"
-    assert form.progress_line(run.model_copy(update={"paused": True})).endswith("paused")
+    assert form.progress_line(run.model_copy(update={"paused": True})).startswith("Paused")
     endless = run.model_copy(update={"total": 0, "remaining_s": None})
     assert form.progress_line(endless) == "DO-CRIME: 610 frames"
     assert form.worst_mode(np.array([5.0, 3.1, np.nan, np.inf])) == "worst mode 2: SNR 3.1"

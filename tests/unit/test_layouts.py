@@ -89,7 +89,7 @@ def test_nearest_pairs_on_rings():
     [
         (np.zeros((5, 3)), r"\(5, 3\)"),
         (np.full((3, 2), np.nan), "finite"),
-        (np.array([[0.0, 0], [1, 0], [1, 0]]), "actuators 1 and 2 stand in the same place"),
+        (np.array([[0.0, 0], [1, 0], [1, 0]]), "actuators 1 and 2 have the same position"),
     ],
 )
 def test_impossible_positions_are_refused(positions, text):

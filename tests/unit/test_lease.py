@@ -1,4 +1,4 @@
-"""One client may write; it must live, and nobody else can speak for it."""
+"""One client has control while it sends messages, and no other connection can use its number."""
 
 from __future__ import annotations
 
@@ -28,16 +28,18 @@ def book(clock: Clock) -> LeaseManager:
 
 def comes(book: LeaseManager, number: int, route: bytes | None = None) -> RegisteredClient:
     client = f"{number:08x}-0000"
-    hello = RegisterClient(client=client, schema_version=1, name=f"client {number}", host="here", pid=number)
+    registration = RegisterClient(
+        client=client, schema_version=1, name=f"client {number}", host="here", pid=number
+    )
     route = b"r%d" % number if route is None else route
-    book.register_client(hello, route)
+    book.register_client(registration, route)
     return book.record_activity(client, route)
 
 
 def test_the_second_is_told_who_has_it(book: LeaseManager) -> None:
     one, other = comes(book, 1), comes(book, 2)
     assert book.acquire(one, False).name == "client 1"
-    with pytest.raises(LeaseHeld, match=r"client 1 on here \(process 1\) has had the right to write since"):
+    with pytest.raises(LeaseHeld, match=r"client 1 on here \(process 1\) has had control since"):
         book.acquire(other, False)
     book.require(one)
     with pytest.raises(LeaseHeld):
@@ -55,7 +57,7 @@ def test_it_is_taken_over_on_request_and_given_back(book: LeaseManager) -> None:
     assert book.lease.name == "client 2"
     book.release(other)
     assert book.lease is None
-    with pytest.raises(LeaseHeld, match="nobody has the right to write"):
+    with pytest.raises(LeaseHeld, match="no client has control"):
         book.require(one)
 
 
@@ -65,7 +67,7 @@ def test_a_holder_that_is_silent_loses_it(book: LeaseManager, clock: Clock) -> N
     clock.now += 5.0
     book.expire()
     assert book.lease is not None
-    book.record_activity(one.hello.client, one.route)
+    book.record_activity(one.registration.client, one.route)
     clock.now += 5.1
     book.expire()
     assert book.lease is None
@@ -75,14 +77,14 @@ def test_a_holder_that_is_silent_loses_it(book: LeaseManager, clock: Clock) -> N
     assert book.seconds_without_holder() == 0.0
 
 
-def test_nobody_speaks_for_another(book: LeaseManager) -> None:
+def test_no_connection_uses_the_number_of_another(book: LeaseManager) -> None:
     one = comes(book, 1)
     book.acquire(one, False)
     with pytest.raises(RequestRefused, match="belongs to another connection"):
-        comes(book, 1, b"somebody else")
-    with pytest.raises(RequestRefused, match="say hello first"):
-        book.record_activity(one.hello.client, b"somebody else")
-    with pytest.raises(RequestRefused, match="say hello first"):
+        comes(book, 1, b"another connection")
+    with pytest.raises(RequestRefused, match="not registered under that client number"):
+        book.record_activity(one.registration.client, b"another connection")
+    with pytest.raises(RequestRefused, match="not registered under that client number"):
         book.record_activity("0000000f-0000", b"x")
 
 
@@ -90,7 +92,7 @@ def test_too_many_are_refused_until_some_are_forgotten(book: LeaseManager, clock
     for number in range(MAX_CLIENTS):
         comes(book, number)
     assert book.count == MAX_CLIENTS
-    with pytest.raises(RequestRefused, match="clients are here already"):
+    with pytest.raises(RequestRefused, match="clients are registered already"):
         comes(book, MAX_CLIENTS)
     clock.now += 61
     book.expire()

@@ -91,7 +91,7 @@ def test_install_shows_first_and_changes_only_when_told(document, escape, tmp_pa
     root.mkdir()
     code, found, err = document("udev", "install", "--root", root)
     assert (code, found["changed"], found["written"]) == (1, False, [])
-    assert "say --yes" in err
+    assert "use --yes" in err
     assert {file["condition"] for file in found["files"]} == {"missing"}
     assert "20f7" in found["files"][0]["difference"]
     assert not list(root.iterdir())

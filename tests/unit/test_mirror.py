@@ -208,7 +208,7 @@ def test_a_failed_opening_leaves_nothing_half_open() -> None:
 
 def test_limits_that_do_not_fit_are_refused_on_opening_and_the_link_closed() -> None:
     dm = Flaky(MirrorLimits(disabled=(N,)))
-    with pytest.raises(SettingRejected, match=r"dm: its limits do not fit it: .*0\.\.20"):
+    with pytest.raises(SettingRejected, match=r"dm: its limits do not fit: .*0\.\.20"):
         dm.open()
     assert (dm.is_open, dm.closings) == (False, 1)
 
@@ -219,7 +219,7 @@ def test_a_layout_that_contradicts_the_actuators_is_refused() -> None:
         def info(self) -> DMInfo:
             return replace(super().info, layout=np.ones((5, 5), dtype=bool))
 
-    with pytest.raises(DeviceError, match="25 places for 21 actuators"):
+    with pytest.raises(DeviceError, match="25 positions for 21 actuators"):
         Odd().open()
 
 

@@ -35,7 +35,7 @@ def run(frames: int, memory: float, white: float, seed: int) -> PyramidPupils:
 @pytest.mark.parametrize(("memory", "white"), [(20.0, 0.0), (20.0, 0.6), (5.0, 0.3)])
 def test_motion_pokes_and_what_lasts(memory: float, white: float) -> None:
     found = [run(1500, memory, white, seed) for seed in range(4)]
-    assert np.mean([f.slope_statistics for f in found]) == pytest.approx(0.3, rel=0.03)
+    assert np.mean([f.motion for f in found]) == pytest.approx(0.3, rel=0.03)
     assert np.mean([f.pokes for f in found]) == pytest.approx(0.1, rel=0.03)
     assert np.mean([f.persistent_fraction for f in found]) == pytest.approx(
         (1 - white) * np.exp(-2 / memory), abs=0.04
@@ -64,7 +64,7 @@ def test_a_run_that_goes_on_later_tells_the_same() -> None:
     one, other = whole.annotate_geometry(pupils()), second.annotate_geometry(pupils())
     assert isinstance(one, PyramidPupils)
     assert isinstance(other, PyramidPupils)
-    assert (other.slope_statistics, other.pokes) == pytest.approx((one.slope_statistics, one.pokes))
+    assert (other.motion, other.pokes) == pytest.approx((one.motion, one.pokes))
     # Two pairs across the interruption are lost.
     assert other.n_effective == pytest.approx(one.n_effective, rel=0.03)
     assert other.persistent_fraction == pytest.approx(one.persistent_fraction, abs=0.02)

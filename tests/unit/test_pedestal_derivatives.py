@@ -15,7 +15,8 @@ from escape_hw.calibration.sprint.mixed_effects import SHAPE, WIDTH, Problem, St
 from escape_hw.calibration.sprint.normal_equations import Priors
 from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_jacobian, compute_fitted_matrix
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
-from escape_sim.models.shack_hartmann import ShackHartmannModel, make_model, nominal_grid
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import ShackHartmannModel, nominal_grid
 
 PLACE = Registration(-16.0, 31.0, -0.77, 1.9, 0.5)
 #: Half steps of the differences by the registration, and by width and pedestal.
@@ -24,7 +25,7 @@ STEPS, SMALL_STEP = (1.0, 1.0, 0.03, 0.1, 0.1), 3e-3
 
 @pytest.fixture(scope="module")
 def model() -> ShackHartmannModel:
-    return make_model(small_system.configuration(), None)
+    return make_fast_model(small_system.configuration(), None)
 
 
 @pytest.fixture(scope="module")

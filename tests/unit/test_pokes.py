@@ -21,7 +21,7 @@ def drawn(kind: str, n: int = 20_000) -> np.ndarray:
     return np.array([pokes() for _ in range(n)])
 
 
-@pytest.mark.parametrize("kind", ["white", "shaped"])
+@pytest.mark.parametrize("kind", ["white", "anticorrelated"])
 def test_they_have_the_rms_asked_for_and_the_modes_are_independent(kind):
     pokes = drawn(kind)
     np.testing.assert_allclose(pokes.std(axis=0), AMPLITUDE / np.sqrt(3), rtol=0.03)
@@ -37,7 +37,7 @@ def test_white_pokes_are_what_they_were():
 
 
 def test_shaped_pokes_alternate():
-    pokes = drawn("shaped") / AMPLITUDE
+    pokes = drawn("anticorrelated") / AMPLITUDE
     by_lag = [np.mean(pokes[k:] * pokes[: len(pokes) - k]) / np.mean(pokes**2) for k in (1, 2)]
     assert by_lag == pytest.approx([-ANTICORRELATION, ANTICORRELATION**2], abs=0.03)
 
@@ -49,7 +49,7 @@ def test_information_gain_is_the_power_of_the_whitened_pokes():
         seen = np.apply_along_axis(np.convolve, 0, pokes / AMPLITUDE, np.convolve(whitener, response))
         return float(np.square(seen).mean())
 
-    found = power(drawn("shaped")) / power(drawn("white"))
+    found = power(drawn("anticorrelated")) / power(drawn("white"))
     assert information_gain(whitener, response, ANTICORRELATION) == pytest.approx(found, rel=0.05)
     assert information_gain(whitener, response, 0.0) == 1.0
     # Without turbulence to whiten, a spectrum only loses what the response swallows.

@@ -54,7 +54,7 @@ def test_a_run_fills_the_streams(folder):
     assert len(geometry.layout) == 11
     state = source.state
     assert (state.system, state.simulated, state.phase) == ("razor-shwfs", True, Phase.STOPPED)
-    assert state.last.document["converged"] is True
+    assert state.last_run.document["converged"] is True
     assert [one.name for one in state.products][-1] == "escape"
     assert any("product escape" in line.text for line in source.log_after(-1))
     assert source.log_after(10_000) == ()
@@ -78,7 +78,7 @@ def test_a_run_goes_by_step_by_step(folder):
 
 def test_a_single_product_is_a_run_of_its_own(folder):
     source = ReplaySource(folder / "escape.fits")
-    assert source.state.last.document["method"] == "escape"
+    assert source.state.last_run.document["method"] == "escape"
     assert source.latest("registration") is not None
     assert ReplaySource(folder / "gains.fits").latest("gains").data.shape == (recorded_run.N_MODES,)
     assert ReplaySource(folder / "loop.fits").state.loop.strehl == pytest.approx(0.62)
@@ -87,9 +87,9 @@ def test_a_single_product_is_a_run_of_its_own(folder):
 def test_nothing_can_be_started(folder):
     source = ReplaySource(folder)
     assert source.procedures() == ()
-    with pytest.raises(ConfigError, match="recording"):
-        source.check("escape", {})
-    assert "recording" in READ_ONLY_REASON
+    with pytest.raises(ConfigError, match="recorded run"):
+        source.plan("escape", {})
+    assert "recorded run" in READ_ONLY_REASON
 
 
 def test_what_is_no_run_is_refused(folder, tmp_path):

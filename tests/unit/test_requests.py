@@ -10,6 +10,7 @@ import pytest
 from escape_hw.config.system import MAX_GAIN
 from escape_hw.errors import ConfigError
 from escape_hw.remote import requests
+from escape_hw.remote.state import ActiveRun, State
 
 CLIENT = "0123456789abcdef"
 
@@ -28,7 +29,7 @@ def test_a_gain_outside_the_configurations_range_is_refused(
         requests.build_request(kind, client=CLIENT, matrix=matrix, gain=gain)
 
 
-@pytest.mark.parametrize("kind", [requests.StartProcedure, requests.Check])
+@pytest.mark.parametrize("kind", [requests.StartProcedure, requests.PlanProcedure])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_an_argument_that_is_no_number_does_not_become_the_default(
     kind: type[requests.Request], value: float
@@ -43,3 +44,18 @@ def test_a_path_with_a_null_byte_is_refused() -> None:
     assert requests.build_request(requests.LoadProduct, client=CLIENT, path="/data/größe.fits")
     with pytest.raises(ConfigError, match="path"):
         requests.build_request(requests.LoadProduct, client=CLIENT, path="a\x00.fits")
+
+
+def test_attributes_of_version_0_1_0_still_work_with_a_deprecation_message() -> None:
+    state = State(active_run=ActiveRun(id=1, name="docrime", arguments={}, completed=7))
+    with pytest.warns(DeprecationWarning, match="State.procedure is now called active_run"):
+        run = state.procedure  # type: ignore[attr-defined]
+    with pytest.warns(DeprecationWarning, match="ActiveRun.done is now called completed"):
+        assert run.done == 7
+    with pytest.raises(AttributeError):
+        _ = state.nothing  # type: ignore[attr-defined]
+
+
+def test_the_first_request_of_another_version_is_understood_so_that_it_can_be_refused() -> None:
+    text = '{"verb": "hello", "client": "00000000", "schema_version": 1, "name": "x", "host": "y", "pid": 1}'
+    assert isinstance(requests.REQUESTS.validate_json(text), requests.RegisterClient)

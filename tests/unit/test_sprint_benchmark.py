@@ -13,7 +13,7 @@ from escape_benchmarks.peers.oopao import OopaoPeer, SolverResult
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.config.loader import load_system
-from escape_sim.models.shack_hartmann import make_model
+from escape_sim.models.factory import make_fast_model
 
 
 @pytest.fixture(scope="module")
@@ -23,17 +23,17 @@ def alike():
 
 @pytest.fixture(scope="module")
 def modes(alike):
-    surfaces = make_model(alike, None).influence_functions()
+    surfaces = make_fast_model(alike, None).influence_functions()
     return karhunen_loeve(*surfaces, 5, 4 * alike.system.pupil_m)
 
 
 def test_ours_and_oopaos_sensor_give_the_same_matrix_and_ours_solves_it(alike, modes):
     peer = OopaoPeer(alike, modes)
     theirs = peer.matrix(sprint.INJECTED, sprint.mirror(False))
-    ours = make_model(alike, None).modal_matrix(sprint.INJECTED, modes)
+    ours = make_fast_model(alike, None).modal_matrix(sprint.INJECTED, modes)
     scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
     assert np.linalg.norm(scale * ours - theirs) < 5e-6 * np.linalg.norm(theirs)
-    answer = sprint.EscapeSolver(alike, modes).solver("light", noise=False)(theirs)
+    answer = sprint.EscapeSolver(alike, modes).solver("registration-only", noise=False)(theirs)
     assert answer.valid
     error = np.abs(answer.registration.to_array() - sprint.INJECTED.to_array())
     assert (error < [0.01, 0.01, 1e-4, 1e-3, 1e-3]).all()
@@ -41,7 +41,7 @@ def test_ours_and_oopaos_sensor_give_the_same_matrix_and_ours_solves_it(alike, m
 
 def test_on_the_pyramid_both_solve_oopaos_matrix_and_ours_is_nearer():
     config = load_system("razor-pywfs", overrides=sprint._OOPAO_PYRAMID)
-    model = make_model(config, None)
+    model = make_fast_model(config, None)
     low = karhunen_loeve(*model.influence_functions(), 5, 4 * config.system.pupil_m)
     peer, at = OopaoPeer(config, low), sprint.planted(config)
     theirs = peer.matrix(at, sprint.mirror(False))
@@ -52,7 +52,7 @@ def test_on_the_pyramid_both_solve_oopaos_matrix_and_ours_is_nearer():
     peer.set_up()
     mine, other = (
         np.abs(solve(theirs).registration.to_array() - at.to_array())
-        for solve in (sprint.EscapeSolver(config, low).solver("light", noise=False), peer.solve)
+        for solve in (sprint.EscapeSolver(config, low).solver("registration-only", noise=False), peer.solve)
     )
     assert (mine < [0.02, 0.02, 1e-4, 1e-3, 1e-3]).all()
     assert (other < [0.2, 0.2, 1e-3, 0.05, 0.05]).all()

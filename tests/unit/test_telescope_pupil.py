@@ -1,4 +1,4 @@
-"""Obscuration, vanes and dirt take the light that they should."""
+"""Transmission of obscuration, vanes and contamination."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def test_the_pupil_of_a_telescope_keeps_the_right_power():
     )
 
 
-def soiled(seed=0, **dirt):
-    return pupil_transmission(TwinContamination(**dirt), D, X, np.random.default_rng(seed))
+def contaminated(seed=0, **settings):
+    return pupil_transmission(TwinContamination(**settings), D, X, np.random.default_rng(seed))
 
 
 def inside():
@@ -74,11 +74,11 @@ def inside():
 
 
 def test_a_clean_pupil_passes_everything():
-    assert (soiled() == 1).all()
+    assert (contaminated() == 1).all()
 
 
 def test_contaminated_arc():
-    share = soiled(edge_share=0.25, angle_deg=90.0, depth=0.2, transmission=0.4)
+    share = contaminated(edge_share=0.25, angle_deg=90.0, depth=0.2, transmission=0.4)
     lit = inside()
     part = (share < 1) & lit
     assert set(share[lit]) == {0.4, 1.0}
@@ -90,14 +90,14 @@ def test_contaminated_arc():
 
 
 def test_unevenness_has_its_size_and_is_seeded():
-    shares = [soiled(seed, unevenness=0.1)[inside()] for seed in range(20)]
+    shares = [contaminated(seed, unevenness=0.1)[inside()] for seed in range(20)]
     assert np.mean([s.std() for s in shares]) == pytest.approx(0.1, rel=0.3)
-    assert np.array_equal(shares[3], soiled(3, unevenness=0.1)[inside()])
+    assert np.array_equal(shares[3], contaminated(3, unevenness=0.1)[inside()])
     assert not np.array_equal(shares[3], shares[4])
 
 
 def test_an_uneven_edge_cuts_the_rim_only():
-    share = soiled(edge_unevenness=0.05)
+    share = contaminated(edge_unevenness=0.05)
     radius = np.hypot(X[:, None], X) / (D / 2)
     cut = (share == 0) & inside()
     assert 0.005 < cut.sum() / inside().sum() < 0.15

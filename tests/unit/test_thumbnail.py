@@ -15,7 +15,6 @@ from escape_hw.api.optical_gains import GainsResult
 from escape_hw.api.registration import Registration
 from escape_hw.api.representation import image_html, line_html, table_html
 from escape_hw.api.results import CalibrationResult, Estimate, RegistrationEstimate, SprintIteration
-from escape_hw.remote.html import state_html
 from escape_hw.remote.state import FaultState, LoopState, Phase, State
 
 
@@ -105,12 +104,13 @@ def test_gains_without_a_round_are_shown_as_such() -> None:
     assert "<svg" not in html
 
 
-def test_a_state_tells_the_fault_and_the_way_out() -> None:
+def test_a_state_shows_the_fault_and_the_remedy() -> None:
     state = State(
         system="razor", simulated=False, phase=Phase.FAULT,
-        fault=FaultState(reason="it broke", at_utc="", way_out="mend it"), loop=LoopState(closed=True, matrix="m"),
+        fault=FaultState(reason="it broke", at_utc="", remedy="Fix it."),
+        loop=LoopState(closed=True, matrix="m"),
     )  # fmt: skip
-    html = state_html(state)
+    html = state._repr_html_()
     assert "razor (HARDWARE)" in html
-    assert "it broke; mend it" in html
+    assert "it broke. Fix it." in html
     assert "closed on m" in html

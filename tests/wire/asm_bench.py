@@ -25,8 +25,8 @@ PATIENCE_S = 30.0
 
 @contextmanager
 def emulator(**options: object) -> Iterator[AsmEmulator]:
-    """An emulator on a free port; its steps are quick and its watchdog is patient unless told otherwise."""
-    chosen = {"speed": 1000, "hold": 20, "rest": 60, **options}
+    """An emulator on a free port; by default with fast transitions and a long watchdog time-out."""
+    chosen = {"transition_speed": 1000, "hold_s": 20, "rest_s": 60, **options}
     made = make_emulator(EmulatorRequest(port=0, options={k: str(v) for k, v in chosen.items()}))
     assert isinstance(made, AsmEmulator)
     with made:
@@ -97,7 +97,7 @@ class RawClient:
         while True:
             while (found := asm_wire.decode_frame(self._arrived)) is None:
                 data = self.socket.recv(65536)
-                assert data, "the emulator hung up"
+                assert data, "the emulator closed the connection"
                 self._arrived += data
             if found.kind == kind:
                 return found.payload

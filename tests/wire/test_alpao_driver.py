@@ -37,7 +37,7 @@ def test_every_call_of_a_session_in_order(asdk) -> None:
     assert [line.partition(" ")[0] for line in rest[:-3]] == ["asdkSend"] * (len(rest) - 3)
     assert rest[-4].split()[1:] == ["0", "0", "..", "0"], "flat comes before the reset"
     assert rest[-3:] == CLOSING
-    assert not asdk.complaints
+    assert not asdk.violations
 
 
 def test_a_stand_in_is_never_taken_for_metal(asdk) -> None:
@@ -92,7 +92,7 @@ def test_another_library_is_told_from_the_sdk() -> None:
 
 @pytest.mark.parametrize("peeks", [0, 1])
 def test_a_failed_init_says_why_and_is_never_reset(asdk, peeks) -> None:
-    asdk.script(f"set peeks {peeks}; asdkInit 1 error 0x22; asdkInit 2 half 0x20")
+    asdk.script(f"set errors_stay {peeks}; asdkInit 1 error 0x22; asdkInit 2 invalid_handle 0x20")
     dm = make("alpao")
     with pytest.raises(DeviceError, match=r"error 0x22, no interface in the configuration.*ACECFG"):
         dm.open()
@@ -103,7 +103,7 @@ def test_a_failed_init_says_why_and_is_never_reset(asdk, peeks) -> None:
     assert asdk.calls[1:] == ["asdkInit SIM97", "asdkRelease"]
     with dm:
         assert dm.is_open, "old entries on the error stack are no failure of this init"
-    assert not asdk.complaints
+    assert not asdk.violations
 
 
 def test_a_failure_without_a_reason_is_one(asdk) -> None:
@@ -125,7 +125,7 @@ def test_a_wrong_number_of_actuators_is_refused(asdk) -> None:
 def test_one_mirror_has_one_owner(asdk) -> None:
     with make("alpao"), pytest.raises(DeviceError, match="error 0x4, already in use"):
         make("alpao").open()
-    assert asdk.complaints == ["asdkInit: the mirror has an owner already"]
+    assert asdk.violations == ["asdkInit: the mirror has an owner already"]
 
 
 @pytest.mark.parametrize("number", sorted(ERRORS))
@@ -160,7 +160,7 @@ def test_patterns_reach_the_electronics_and_stop_before_anything_else(asdk) -> N
         assert not dm.is_playing
         dm.play_patterns(wave, repeats=0)
     assert asdk.names()[-5:] == ["asdkStop", "asdkSend", "asdkStop", "asdkReset", "asdkRelease"]
-    assert not asdk.complaints
+    assert not asdk.violations
 
 
 def test_a_pattern_that_breaks_a_limit_anywhere_is_refused_whole(asdk) -> None:
@@ -195,7 +195,7 @@ def test_whatever_is_sent_the_library_gets_finite_values_within_the_cap(values) 
         reached = asdk.shape(97)
     assert np.isfinite(reached).all()
     assert np.abs(reached).max() <= 0.8
-    assert not asdk.complaints
+    assert not asdk.violations
 
 
 @pytest.mark.parametrize("mode", ["refuse", "ignore", "accept"])

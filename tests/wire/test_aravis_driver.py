@@ -59,7 +59,7 @@ def test_every_call_of_a_session_in_order(arv) -> None:
         "arv_camera_create_stream", "arv_camera_start_acquisition", "arv_camera_stop_acquisition",
         "g_object_unref stream", "g_object_unref camera",
     ]  # fmt: skip
-    assert not arv.complaints
+    assert not arv.violations
     assert arv.library.escape_stand_in_leaks() == 0
 
 
@@ -68,11 +68,11 @@ def test_the_older_name_of_the_rate_switch_is_found(arv) -> None:
     with make("aravis") as camera:
         assert "arv_camera_set_boolean AcquisitionFrameRateEnabled 1" in arv.calls
         camera.next_frame(1.0)
-    assert not arv.complaints
+    assert not arv.violations
 
 
 def test_block_65535_is_followed_by_1_and_nothing_is_lost(arv) -> None:
-    arv.script("set first 65530")
+    arv.script("set first_frame 65530")
     with make("aravis", "devices.science.frame_rate_hz=200", "devices.science.exposure_s=1e-3") as camera:
         indices = [camera.next_frame(1.0).index for _ in range(12)]
         assert indices == list(range(65530, 65542))
@@ -80,7 +80,7 @@ def test_block_65535_is_followed_by_1_and_nothing_is_lost(arv) -> None:
 
 
 def test_lost_and_damaged_frames_are_counted(arv) -> None:
-    arv.script("arv_stream_timeout_pop_buffer 2 lose 3; arv_stream_timeout_pop_buffer 3 error 3")
+    arv.script("arv_stream_timeout_pop_buffer 2 drop 3; arv_stream_timeout_pop_buffer 3 error 3")
     with make("aravis", "devices.science.frame_rate_hz=500", "devices.science.exposure_s=1e-3") as camera:
         indices = [camera.next_frame(1.0).index for _ in range(3)]
         assert np.diff(indices).tolist() == [4, 2]
@@ -115,11 +115,11 @@ def test_newest_skips_what_waits(arv) -> None:
         first = camera.next_frame(1.0).index
         time.sleep(0.05)
         assert camera.next_frame(1.0).index - first > 10
-    assert not arv.complaints
+    assert not arv.violations
 
 
 def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
-    arv.script("set step 4")
+    arv.script("set increment 4")
     with make("aravis") as camera:
         made = camera.configure(replace(camera.settings, region=Region(3, 5, 101, 33), frame_rate_hz=20))
         assert made.region == Region(0, 4, 100, 32)
@@ -129,7 +129,7 @@ def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
                 replace(before, region=Region(0, 0, 720, 540), exposure_s=1e-3, frame_rate_hz=500)
             )
         assert camera.settings == before
-    assert not arv.complaints
+    assert not arv.violations
 
 
 def test_what_is_wrong_at_opening(arv) -> None:
@@ -175,21 +175,24 @@ def test_a_long_time_out_never_outlasts_close(arv) -> None:
     waiter.join(10)
     assert not waiter.is_alive()
     assert isinstance(outcome[0], NotOpen)
-    assert not arv.complaints
+    assert not arv.violations
 
 
 @pytest.mark.parametrize(
-    ("misuse", "complaint"),
+    ("misuse", "violation"),
     [
         (("g_object_unref camera", "g_object_unref camera"), "g_object_unref: no such object"),
-        (("stream", "g_object_unref camera"), "the camera goes before its stream"),
+        (("stream", "g_object_unref camera"), "the camera is released before its stream"),
         (("start",), "arv_camera_start_acquisition: no stream, or no buffer in it"),
-        (("stream", "push", "start", "g_object_unref stream"), "the stream goes while the camera acquires"),
+        (
+            ("stream", "push", "start", "g_object_unref stream"),
+            "the stream is released while the camera acquires",
+        ),
         (("stream", "push", "push again"), "a buffer pushed twice"),
         (("region",), "region 1 0 100 100 does not fit the sensor"),
     ],
 )
-def test_the_stand_in_catches_what_the_real_library_leaves_undefined(arv, misuse, complaint) -> None:
+def test_the_stand_in_catches_what_the_real_library_leaves_undefined(arv, misuse, violation) -> None:
     library = AravisLibrary("science", str(arv.path))
     library.open("SIMSCI")
     library.call("camera_set_boolean", b"AcquisitionFrameRateEnable", 1)
@@ -208,7 +211,7 @@ def test_the_stand_in_catches_what_the_real_library_leaves_undefined(arv, misuse
                 library.call("camera_set_region", 1, 0, 100, 100)
         else:
             c.g_object_unref(made[step.split()[1]])
-    assert any(complaint in line for line in arv.complaints), arv.complaints
+    assert any(violation in line for line in arv.violations), arv.violations
 
 
 # ---- Aravis's own simulated camera, where the library is installed --------------------------------------

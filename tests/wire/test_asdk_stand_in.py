@@ -42,7 +42,7 @@ def last(c, size=256):
 
 
 @pytest.mark.parametrize(
-    ("calls", "complaint"),
+    ("calls", "violation"),
     [
         (["asdkRelease"], None),
         (["asdkReset", "asdkRelease"], None),
@@ -56,7 +56,7 @@ def last(c, size=256):
         (["endless", "asdkStop", "asdkReset", "asdkRelease"], None),
     ],
 )
-def test_the_order_of_calls_is_watched(asdk, c, calls, complaint) -> None:
+def test_the_order_of_calls_is_watched(asdk, c, calls, violation) -> None:
     handle = init(c)
     for call in calls:
         if call == "send":
@@ -65,14 +65,14 @@ def test_the_order_of_calls_is_watched(asdk, c, calls, complaint) -> None:
             c.asdkSendPattern(handle, address(ZEROS), 1, 0)
         else:
             getattr(c, call)(handle)
-    assert asdk.complaints == ([complaint] if complaint else [])
+    assert asdk.violations == ([violation] if violation else [])
 
 
 def test_reset_after_a_failed_init_is_the_crash_of_the_real_library(asdk, c) -> None:
-    asdk.script("asdkInit 1 half 0x20")
+    asdk.script("asdkInit 1 invalid_handle 0x20")
     handle = init(c)
     c.asdkReset(handle)
-    assert asdk.complaints == ["asdkReset: asdkInit had failed; the real library may crash here"]
+    assert asdk.violations == ["asdkReset: asdkInit had failed; the real library may crash here"]
 
 
 def test_serial_numbers_are_spelt_exactly_and_a_second_owner_is_refused(asdk, c) -> None:
@@ -81,7 +81,7 @@ def test_serial_numbers_are_spelt_exactly_and_a_second_owner_is_refused(asdk, c)
     init(c)
     assert c.asdkInit(b"SIM97") is None
     assert last(c) == (0, 4)
-    assert asdk.complaints == ["asdkInit: the mirror has an owner already"]
+    assert asdk.violations == ["asdkInit: the mirror has an owner already"]
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1.0000001, -5.0])
@@ -90,8 +90,8 @@ def test_values_out_of_range_are_caught(asdk, c, bad) -> None:
     values[96] = bad
     assert c.asdkSend(handle, address(values)) == -1
     assert last(c) == (0, 0x11)
-    (complaint,) = asdk.complaints
-    assert complaint.startswith("asdkSend: value 96 is ")
+    (violation,) = asdk.violations
+    assert violation.startswith("asdkSend: value 96 is ")
     assert not asdk.shape(97).any()
 
 
@@ -112,7 +112,7 @@ def test_parameters_have_a_direction_a_range_and_no_case(asdk, c) -> None:
         assert c.asdkSet(handle, name, float(x)) == -1
         assert last(c) == (0, error)
     assert c.asdkGet(handle, b"SyncMode", byref(value)) == -1
-    assert asdk.complaints == ["asdkSet: TriggerIn = 3, out of range"]
+    assert asdk.violations == ["asdkSet: TriggerIn = 3, out of range"]
 
 
 def test_the_error_stack_goes_by_reading_the_text_only(asdk, c) -> None:
@@ -121,7 +121,7 @@ def test_the_error_stack_goes_by_reading_the_text_only(asdk, c) -> None:
     assert last(c, size=0) == (0, 0x24)
     assert last(c) == (0, 0x24)
     assert last(c)[0] == -1
-    asdk.script("set peeks 1")
+    asdk.script("set errors_stay 1")
     c.asdkInit(b"OTHER")
     assert [last(c) for _ in range(3)] == [(0, 0x24)] * 3
 
@@ -150,7 +150,7 @@ def test_a_fault_may_count_every_call(asdk, c) -> None:
     "rule", ["asdkSend 0 ignore", "asdkSend 1 explode", "asdkSend", "set range wide", "* 1 error x"]
 )
 def test_a_rule_that_means_nothing_is_refused(asdk, rule) -> None:
-    with pytest.raises(ValueError, match="rule 2 of the script means nothing"):
+    with pytest.raises(ValueError, match="rule 2 of the script is invalid"):
         asdk.script(f"# a comment\n{rule}")
 
 
@@ -181,3 +181,9 @@ def test_the_cache_lies_outside_the_package(asdk) -> None:
     assert "site-packages" not in str(asdk.path)
     assert not (asdk.path.parent / "asdk.c").exists()
     assert build_library("asdk") == asdk.path
+
+
+def test_script_words_of_version_0_1_0_are_accepted(asdk, capfd) -> None:
+    asdk.script("set peeks 1; asdkInit 1 half 0x20")
+    assert "deprecated: 'peeks' is now 'errors_stay'; the old word will be removed" in capfd.readouterr().err
+    asdk.script("asdkSend 1 lose 2")

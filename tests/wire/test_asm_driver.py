@@ -49,9 +49,9 @@ def on_the_twin() -> AsmMirror:
 @parametrize_device_checks({"asm": on_the_wire})
 def test_contract(factory: Factory, check: Check) -> None:
     factory()  # starts the emulator
-    before = len(_SHARED[0].complaints)
+    before = len(_SHARED[0].violations)
     check(factory)
-    assert not _SHARED[0].complaints[before:]
+    assert not _SHARED[0].violations[before:]
 
 
 def test_an_emulator_joins_the_twin() -> None:
@@ -78,7 +78,7 @@ def test_every_call_of_a_session_arrives_in_order() -> None:
             mirror.send(shape)
             mirror.send(0.5 * shape)
         calls = [(name, what) for name, what in made.server.calls if name != "HEARTBEAT"]
-        assert made.complaints == ()
+        assert made.violations == ()
     names = [name for name, _ in calls]
     assert names == [
         "SET_STATE", "SET_STATE", "SET_STATE", "COMMAND", "COMMAND", "COMMAND", "SET_STATE", "SET_STATE",
@@ -98,7 +98,7 @@ def test_every_call_of_a_session_arrives_in_order() -> None:
     assert not sent[2].any()
 
 
-def test_disabled_actuators_are_told_and_never_driven() -> None:
+def test_disabled_actuators_are_reported_and_never_driven() -> None:
     off = [7, 248, 249, 250, 251, 307, 308, 309, 310, 311, 312]
     with emulator() as made, driver(port_of(made), f"devices.dm.limits.disabled={off}") as mirror:
         assert made.server.calls[0] == ("SET_DISABLED", (tuple(off), "devices.dm.limits.disabled"))
@@ -122,7 +122,7 @@ def test_acknowledgements_bring_positions_and_times() -> None:
 
 def test_a_blind_sensor_is_nan_and_no_other() -> None:
     with emulator() as made, driver(port_of(made)) as mirror:
-        made.inject("stuck:5")
+        made.inject("unreadable:5")
         wait_for(lambda: bool(np.isnan(mirror.measured_positions()[5])), "the sensor went blind")
         assert np.isnan(mirror.measured_positions()).sum() == 1
 
@@ -165,7 +165,7 @@ def test_a_mirror_left_set_stays_set_and_is_found_so() -> None:
         assert made.controller.shell.state is ShellState.SET
         with driver(port_of(made), lift=False) as again:
             assert again.state is ShellState.SET
-        assert made.complaints == ()
+        assert made.violations == ()
 
 
 def test_many_may_look_while_one_controls() -> None:
@@ -177,17 +177,17 @@ def test_many_may_look_while_one_controls() -> None:
             assert "pid" in health.owner
             assert health.contaminated == owner.limits.disabled
         assert owner.send(np.zeros(336)).guard.is_unchanged
-        assert made.complaints == ()
+        assert made.violations == ()
 
 
-def test_nobody_looks_at_another_mirror_than_configured() -> None:
+def test_another_serial_number_is_refused() -> None:
     with emulator() as made:
         with pytest.raises(DeviceError, match=r"is 'SIM336', not 'MMT336'; correct devices.dm.serial"):
             driver(port_of(made), "devices.dm.serial=MMT336").observe_health()
-        assert made.complaints == ()
+        assert made.violations == ()
 
 
-def test_a_second_owner_is_refused_and_told_who_has_it() -> None:
+def test_a_second_owner_is_refused_with_the_name_of_the_first() -> None:
     with emulator() as made, driver(port_of(made)) as owner:
         with pytest.raises(DeviceError, match=r"not owner.*pid \d+ controls it"):
             driver(port_of(made)).open()
@@ -225,8 +225,8 @@ def test_another_mirror_than_configured_is_refused(
         assert not [name for name, _ in made.server.calls if name in ("SET_STATE", "COMMAND")]
 
 
-def test_fresh_dust_is_told_with_the_line_to_configure() -> None:
-    with emulator(dust="17") as made, pytest.raises(SettingRejected, match=r"disabled = \[17, 248"):
+def test_new_contamination_is_reported_with_the_line_to_configure() -> None:
+    with emulator(contaminated="17") as made, pytest.raises(SettingRejected, match=r"disabled = \[17, 248"):
         driver(port_of(made)).open()
 
 
@@ -247,7 +247,7 @@ def test_wrong_options_are_refused(word: str, message: str) -> None:
 
 
 def test_a_version_that_the_mirror_does_not_speak_is_named() -> None:
-    with emulator(versions="2,3") as made, pytest.raises(DeviceError, match="versions 2 to 3 are spoken"):
+    with emulator(versions="2,3") as made, pytest.raises(DeviceError, match="versions 2 to 3 are supported"):
         driver(port_of(made)).open()
 
 
@@ -296,9 +296,9 @@ def test_observers_see_what_the_owner_does() -> None:
             for observer in observers:
                 while observer.fault is None:
                     observer.sample(30.0)
-                assert observer.fault.text == "panic, as arranged"
+                assert observer.fault.text == "panic (scripted)"
         owner.recover()
-        assert made.complaints == ()
+        assert made.violations == ()
 
 
 def test_an_observer_that_sleeps_gets_the_newest() -> None:
@@ -310,7 +310,7 @@ def test_an_observer_that_sleeps_gets_the_newest() -> None:
             wait_for(lambda: time.monotonic_ns() - first.time_ns > 0.5e9, "time passes")
             behind = time.monotonic_ns() - observer.sample(30.0).time_ns
             assert behind < 0.4e9
-            wait_for(lambda: _told_health(observer), "health every second")
+            wait_for(lambda: _has_health(observer), "health every second")
             made.stop()
             with pytest.raises(DeviceError, match="link to"):
                 _watch_on(observer)
@@ -323,12 +323,12 @@ def _watch_on(observer: AsmObserver) -> None:
         observer.sample(30.0)
 
 
-def _told_health(observer: AsmObserver) -> bool:
+def _has_health(observer: AsmObserver) -> bool:
     observer.sample(30.0)
     return observer.health is not None
 
 
-def test_silence_is_told_to_an_observer() -> None:
+def test_silence_is_reported_to_an_observer() -> None:
     with emulator() as made, AsmObserver("watch", "127.0.0.1", port_of(made)) as observer:
         made.controller.parameters["telemetry_hz"] = 1e-9
         with contextlib.suppress(FrameTimeout):

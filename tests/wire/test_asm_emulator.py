@@ -18,11 +18,11 @@ from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.config.registry import emulator_factory
 from escape_hw.errors import ConfigError
 from escape_sim.emulators.asm import protocol as w
+from escape_sim.emulators.asm.connection import AsmConnection
 from escape_sim.emulators.asm.emulator import AsmEmulator
-from escape_sim.emulators.asm.server import AsmConnection
 
 
-def told(payload: bytes) -> tuple[int, str]:
+def refusal(payload: bytes) -> tuple[int, str]:
     """Code and text of a NAK."""
     return struct.unpack_from("<H", payload, 4)[0], w.read_text(payload[8:])
 
@@ -51,30 +51,30 @@ def running(client: RawClient) -> int:
         (frame(w.HEARTBEAT, 1), w.NOT_OWNER, "HEARTBEAT before HELLO"),
         (hello(1, role=7), w.UNSUPPORTED, "no role 7"),
         (hello(1, versions=(2, 9)), w.UNSUPPORTED, "versions 1 to 1"),
-        (frame(w.HELLO, 1, b"\x01"), w.BAD_LENGTH, "HELLO makes no sense"),
+        (frame(w.HELLO, 1, b"\x01"), w.BAD_LENGTH, "HELLO is malformed"),
     ],
     ids=["no hello", "role", "versions", "short hello"],  # the bytes hold the time
 )
 def test_a_bad_beginning_is_refused(request_: bytes, code: int, words: str) -> None:
     with emulator() as made, RawClient(port_of(made)) as client:
         client.send(request_)
-        found, text = told(client.reply(w.NAK))
+        found, text = refusal(client.reply(w.NAK))
         assert found == code
         assert words in text
-        assert any(words in complaint for complaint in made.complaints)
+        assert any(words in violation for violation in made.violations)
 
 
 @pytest.mark.parametrize(
     ("kind", "payload", "code", "words"),
     [
-        (w.SET_STATE, bytes([3]), w.WRONG_STATE, "no step leads from off to running"),
-        (w.SET_STATE, bytes([9]), w.BAD_LENGTH, "SET_STATE makes no sense"),
-        (w.SET_STATE, b"", w.BAD_LENGTH, "SET_STATE makes no sense"),
+        (w.SET_STATE, bytes([3]), w.WRONG_STATE, "no transition from off to running"),
+        (w.SET_STATE, bytes([9]), w.BAD_LENGTH, "SET_STATE is malformed"),
+        (w.SET_STATE, b"", w.BAD_LENGTH, "SET_STATE is malformed"),
         (w.HELLO, hello()[28:-4], w.WRONG_STATE, "HELLO for the second time"),
-        (w.SET_DISABLED, b"\xff\xff\x00", w.BAD_LENGTH, "SET_DISABLED makes no sense"),
+        (w.SET_DISABLED, b"\xff\xff\x00", w.BAD_LENGTH, "SET_DISABLED is malformed"),
         (w.SET_DISABLED, struct.pack("<H", 50) + b"\xff" * 50 + b"\0\0", w.BAD_LENGTH, "no actuator 399"),
         (w.GET_PARAM, b"\x01\x00x", w.BAD_LENGTH, "no parameter 'x'"),
-        (33, b"", w.UNSUPPORTED, "type 33 is unknown here"),
+        (33, b"", w.UNSUPPORTED, "type 33 is unknown"),
         (w.COMMAND, struct.pack("<IBxxx", 1, 1) + bytes(4 * 97), w.BAD_LENGTH, "bytes of command"),
         (w.COMMAND, struct.pack("<IBxxx", 1, 1) + bytes(4 * 336), w.WRONG_STATE, "it is off"),
     ],
@@ -84,10 +84,10 @@ def test_a_request_out_of_order_or_form_is_refused(kind: int, payload: bytes, co
         client.send(hello(1))
         client.reply(w.WELCOME)
         client.send(frame(kind, 2, payload))
-        found, text = told(client.reply(w.NAK))
+        found, text = refusal(client.reply(w.NAK))
         assert found == code
         assert words in text
-        assert any(words in complaint for complaint in made.complaints)
+        assert any(words in violation for violation in made.violations)
 
 
 def test_commands_that_are_not_fresh_finite_and_alone_are_refused() -> None:
@@ -103,17 +103,17 @@ def test_commands_that_are_not_fresh_finite_and_alone_are_refused() -> None:
             (command(last + 4, 7, float("inf")), "not finite"),
         ):
             client.send(data)
-            assert words in told(client.reply(w.NAK))[1]
+            assert words in refusal(client.reply(w.NAK))[1]
         assert made.controller.applied == 1
         assert made.controller.present_m[0] == pytest.approx(1e-7)
         # Several at once: only the newest is applied.
         client.send(command(last + 5, 8, 1e-7) + command(last + 6, 9, 2e-7) + command(last + 7, 10, 3e-7))
-        assert "newer" in told(client.reply(w.NAK))[1]
-        assert "newer" in told(client.reply(w.NAK))[1]
+        assert "newer" in refusal(client.reply(w.NAK))[1]
+        assert "newer" in refusal(client.reply(w.NAK))[1]
         client.reply(w.ACK)
         assert made.controller.applied == 2
         assert made.controller.present_m[0] == pytest.approx(3e-7)
-        assert any("did not wait" in complaint for complaint in made.complaints)
+        assert any("did not wait" in violation for violation in made.violations)
 
 
 def test_a_clock_that_runs_backwards_is_noticed() -> None:
@@ -123,26 +123,26 @@ def test_a_clock_that_runs_backwards_is_noticed() -> None:
         for sequence, sent_ns in ((2, 10**18), (3, 5)):
             client.send(frame(w.HEARTBEAT, sequence, sent_ns=sent_ns))
             client.reply(w.ACK)
-        assert made.complaints == ("test's clock runs backwards",)
+        assert made.violations == ("test's clock runs backwards",)
 
 
-def test_who_only_watches_moves_nothing() -> None:
+def test_an_observer_cannot_command() -> None:
     with emulator() as made, RawClient(port_of(made)) as client:
         client.send(hello(1, role=1))
         client.reply(w.WELCOME)
         client.send(frame(w.SET_STATE, 2, bytes([1])))
-        assert "only watches" in told(client.reply(w.NAK))[1]
+        assert "from an observer" in refusal(client.reply(w.NAK))[1]
         assert made.controller.shell.state is ShellState.OFF
         assert client.reply(w.TELEM)
 
 
 def test_a_shell_left_running_is_noticed_and_rested() -> None:
-    with emulator(hold=0.05, rest=0.2) as made:
+    with emulator(hold_s=0.05, rest_s=0.2) as made:
         with RawClient(port_of(made)) as client:
             running(client)
         wait_for(lambda: made.controller.shell.state is ShellState.RESTED, "the watchdog rests it")
-        assert "the owner left the shell running" in made.complaints
-        assert "watchdog" in made.controller.note
+        assert "the owner left the shell running" in made.violations
+        assert "watchdog" in made.controller.last_event
 
 
 def test_limits_of_the_mirror_itself_skip_a_command() -> None:
@@ -207,7 +207,7 @@ def in_pieces(connection: AsmConnection, wire: Wire, data: bytes, places: list[i
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(1, 4), st.lists(st.integers(0, 6000), max_size=8))
-def test_commands_in_any_pieces_are_applied_whole_and_once(count: int, places: list[int]) -> None:
+def test_commands_in_any_fragments_are_applied_once(count: int, places: list[int]) -> None:
     made, connection, wire = offline()
     data = b"".join(command(1 + k, k, k * 1e-7) for k in range(1, count + 1))
     in_pieces(connection, wire, data, places)
@@ -222,7 +222,7 @@ def test_commands_in_any_pieces_are_applied_whole_and_once(count: int, places: l
 
 @settings(deadline=None, max_examples=100)
 @given(st.integers(0, 2000), st.integers(0, 255), st.booleans(), st.lists(st.integers(0, 2000), max_size=4))
-def test_no_command_that_was_not_whole_is_applied(
+def test_incomplete_commands_are_not_applied(
     where: int, byte: int, cut_short: bool, places: list[int]
 ) -> None:
     made, connection, wire = offline()
@@ -279,11 +279,11 @@ def test_an_observer_that_does_not_read_gets_only_the_newest() -> None:
     ("options", "words"),
     [
         ({"dusty": "1"}, "--option dusty: unknown"),
-        ({"dust": "400"}, "numbers of actuators, 0 to 335"),
+        ({"contaminated": "400"}, "numbers of actuators, 0 to 335"),
         ({"fault": "explode@3"}, "write one of"),
         ({"fault": "skip"}, "KIND@NUMBER"),
-        ({"fault": "dust:x@1"}, "no number"),
-        ({"speed": "0"}, "must be positive"),
+        ({"fault": "contaminate:x@1"}, "not a number"),
+        ({"transition_speed": "0"}, "must be positive"),
         ({"versions": "1"}, "LOWEST,HIGHEST"),
     ],
 )
@@ -309,3 +309,16 @@ def test_contaminated_actuators_are_reported_with_what_their_neighbours_do() -> 
     assert shape[off] == pytest.approx(4e-7)
     flags = np.frombuffer(payload, np.uint8, 336, 16 + 3 * 4 * 336)
     assert set(np.flatnonzero(flags & 0b1000)) == set(off)
+
+
+def test_options_and_faults_of_version_0_1_0_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:
+    faults = "dust:3@1,stuck:4@2,calm@3,half@4,silent@5"
+    old = {"dust": "17", "speed": "10", "hold": "2", "rest": "4", "fault": faults}
+    made = emulator_factory("asm")(EmulatorRequest(options=old))
+    assert isinstance(made, AsmEmulator)
+    assert 17 in made.controller.contaminated
+    assert (made.controller.limits.hold_s, made.controller.limits.rest_s) == (2.0, 4.0)
+    kinds = [fault.kind for fault in made.server._faults.values()]
+    assert kinds == ["contaminate", "unreadable", "clear", "truncate", "stall"]
+    assert "deprecated: 'hold' is now 'hold_s'; the old word will be removed" in capsys.readouterr().err
+    assert made.report()["note"] == made.report()["last_event"] == ""

@@ -44,7 +44,7 @@ def ended(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
 @pytest.fixture
 def remote() -> Iterator[tuple[subprocess.Popen[str], int]]:
     """``escape emulate asm`` and its port."""
-    options = ["speed=1000", "hold=0.5", "rest=3.0"]
+    options = ["transition_speed=1000", "hold_s=0.5", "rest_s=3.0"]
     words = [*_ESCAPE, "emulate", "asm", "--port", "0", *(f"--option={option}" for option in options)]
     with ended(subprocess.Popen(words, stderr=subprocess.PIPE, text=True)) as process:
         assert process.stderr is not None
@@ -77,7 +77,7 @@ def test_a_peer_that_is_stopped_is_told_in_time_and_rests_when_it_goes_on(
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_client_that_dies_or_hangs_leaves_the_shell_at_rest(number: signal.Signals) -> None:
-    with emulator(hold=0.3, rest=1.5) as made:
+    with emulator(hold_s=0.3, rest_s=1.5) as made:
         words = [sys.executable, "-c", _CLIENT, str(port_of(made))]
         with ended(subprocess.Popen(words, stdout=subprocess.PIPE, text=True)) as client:
             assert client.stdout is not None
@@ -98,6 +98,9 @@ def test_the_command_tells_what_a_client_did_wrong(remote: tuple[subprocess.Pope
         client.send(frame(3, 1))
         client.reply(66)
     assert process.stderr is not None
-    assert "complaint: somebody: HEARTBEAT refused: HEARTBEAT before HELLO" in process.stderr.readline()
+    assert (
+        "protocol violation: unnamed client: HEARTBEAT refused: HEARTBEAT before HELLO"
+        in process.stderr.readline()
+    )
     process.send_signal(signal.SIGINT)
     assert process.wait(30) == 1

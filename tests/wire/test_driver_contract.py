@@ -16,5 +16,5 @@ def test_contract(factory: Factory, check: Check) -> None:
     for _, library in PARTS.values():
         fresh(library)
     check(factory)
-    complaints = {library: stand_in(library).complaints for _, library in PARTS.values()}
-    assert not any(complaints.values()), complaints
+    violations = {library: stand_in(library).violations for _, library in PARTS.values()}
+    assert not any(violations.values()), violations

@@ -29,7 +29,9 @@ def test_nothing_is_loaded_before_open(driver: str, key: str) -> None:
 
 def test_every_driver_stands_beside_the_direct_call(monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in("asdk"), stand_in("m3api")
-    monkeypatch.setattr(drivers, "time_alternately", lambda ours, peer, seconds: (ours(), peer()) and (3e-6, 2e-6))
+    monkeypatch.setattr(
+        drivers, "time_alternately", lambda ours, peer, seconds: (ours(), peer()) and (3e-6, 2e-6)
+    )
     rows = drivers.run()
     assert len(rows) == 4
     for row in rows:

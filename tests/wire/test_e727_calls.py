@@ -59,7 +59,7 @@ def test_opening_goes_in_the_order_of_the_manual(emulator):
         before = len(emulator.controller.received_commands)
     closing = ["ERR?", *confirmed("TWC", "MOV 1 1000 2 1000", "SVO 1 0 2 0", "SVA 1 0 2 0")]
     assert said(emulator, before) == closing
-    assert emulator.complaints == ()
+    assert emulator.violations == ()
 
 
 def test_a_zeroed_stage_with_servos_on_is_only_centred(emulator):
@@ -73,7 +73,7 @@ def test_a_zeroed_stage_with_servos_on_is_only_centred(emulator):
 
 
 def test_a_circle_is_written_started_at_once_and_triggered(emulator):
-    with driver(emulator, 'devices.modulator.stage.correct="none"') as stage:
+    with driver(emulator, 'devices.modulator.stage.correction_source="none"') as stage:
         before = len(emulator.controller.received_commands)
         assert stage.modulate(CIRCLE) == Modulation(141 * URAD, 1 / (66 * 50e-6))
         lines = said(emulator, before)
@@ -99,7 +99,7 @@ def test_a_circle_is_written_started_at_once_and_triggered(emulator):
         assert emulator.controller.waves.pulses_s(1, "1") == pytest.approx([0.0])
         stage.park()
         assert emulator.controller.state.describe() == "servo on"
-    assert emulator.complaints == ()
+    assert emulator.violations == ()
 
 
 def test_the_recorder_makes_the_circle_round(emulator):
@@ -126,18 +126,18 @@ def test_the_recorder_makes_the_circle_round(emulator):
 
 
 def test_slow_circles_are_drawn_by_the_controller(emulator):
-    with driver(emulator, 'devices.modulator.stage.correct="none"') as stage:
+    with driver(emulator, 'devices.modulator.stage.correction_source="none"') as stage:
         execute = stage.modulate(Modulation(100 * URAD, 0.5, (5 * URAD, -5 * URAD)))
         assert "WAV 1 X SIN_P 4000 200 905 4000 2000 2000" in emulator.controller.received_commands
         assert "WAV 2 X SIN_P 4000 200 895 4000 3000 2000" in emulator.controller.received_commands
         assert "WTR 1 10 1 2 10 1" in emulator.controller.received_commands
         assert execute.frequency_hz == pytest.approx(0.5)
-    assert emulator.complaints == ()
+    assert emulator.violations == ()
 
 
 def test_a_table_of_corrections_is_used_and_has_to_fit(emulator):
     keys = (
-        'devices.modulator.stage.correct="table"',
+        'devices.modulator.stage.correction_source="table"',
         "devices.modulator.stage.corrections=[[303.0,0.5,0.25,0.0,90.0]]",
     )
     with driver(emulator, *keys) as stage:
@@ -155,12 +155,12 @@ def test_auto_zero_may_be_forbidden(emulator, caplog):
     with driver(emulator, 'devices.modulator.stage.auto_zero="never"'):
         assert "servos on without auto-zero" in caplog.text
         assert "ATZ 1 NaN" not in emulator.controller.received_commands
-    assert all("before auto-zero" in complaint for complaint in emulator.complaints)
+    assert all("before auto-zero" in violation for violation in emulator.violations)
 
 
 def test_axes_may_be_crossed_reversed_and_weak(emulator):
     keys = ('devices.modulator.stage.axes=["2","1"]', "devices.modulator.stage.axis_gain=[-1.0,0.5]")
-    with driver(emulator, *keys, 'devices.modulator.stage.correct="none"') as stage:
+    with driver(emulator, *keys, 'devices.modulator.stage.correction_source="none"') as stage:
         stage.modulate(Modulation(100 * URAD, 500.0))
         tables = emulator.controller.waves.tables
         angle = 2 * np.pi * np.arange(40) / 40
@@ -186,7 +186,7 @@ def test_looking_at_a_closed_stage_moves_nothing(emulator):
     assert found.frequency_hz == pytest.approx(303.03, rel=1e-4)
 
 
-def test_somebody_elses_stop_is_noticed(emulator):
+def test_a_stop_by_another_client_is_noticed(emulator):
     with driver(emulator) as stage:
         stage.modulate(CIRCLE)
         emulator.controller.execute("\x18")
@@ -212,13 +212,13 @@ def test_the_wrong_controller_is_left_alone(emulator, override, says):
 def test_limits_are_the_controllers_own(emulator):
     with driver(emulator, "devices.modulator.max_tilt_rad=0.05") as stage:
         assert stage.info.max_tilt_rad == pytest.approx(1e-3)
-        with pytest.raises(SettingRejected, match=r"it does 0 to 0\.001 rad"):
+        with pytest.raises(SettingRejected, match=r"the range is 0 to 0\.001 rad"):
             stage.check(Modulation(1.1e-3, 300.0))
         with pytest.raises(SettingRejected, match=r"it does up to 1000 Hz"):
             stage.check(Modulation(1e-4, 1500.0))
 
 
-def test_auto_zero_that_fails_is_told(emulator):
+def test_auto_zero_that_fails_is_reported(emulator):
     emulator.controller.state.axes["2"].zero_failed = True
     with pytest.raises(
         DeviceError, match=r"refused 'ATZ 2': error 98, auto-zero failed; is the platform free"
@@ -253,9 +253,9 @@ def test_ctrl_c_during_auto_zero_stops_the_sweep(emulator):
     assert not stage.is_open
 
 
-def test_a_second_client_is_refused_and_told_why(emulator):
+def test_a_second_client_is_refused_with_a_reason(emulator):
     with driver(emulator), pytest.raises(DeviceLost, match=r"one at a time"):
         driver(emulator).open()
-    assert emulator.complaints == (
+    assert emulator.violations == (
         "second client from 127.0.0.1 refused: the controller serves one at a time",
     )

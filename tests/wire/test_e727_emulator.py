@@ -44,8 +44,8 @@ class Client:
         return np.array([[float(word) for word in row.split()] for row in rows if not row.startswith("#")])
 
     @property
-    def complaints(self) -> list[str]:
-        return self.controller.state.complaints
+    def violations(self) -> list[str]:
+        return self.controller.state.violations
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ WRONG = [
 def test_what_is_wrong_leaves_the_error_of_the_manual(servo, command, error):
     assert servo.error(command) == error
     assert servo.say("ERR?") == "0\n", "asking clears the error"
-    assert bool(servo.complaints) == (error != 10), "only stopping is no mistake"
+    assert bool(servo.violations) == (error != 10), "only stopping is no mistake"
 
 
 def test_the_servo_comes_first_and_volts_only_without_it(client):
@@ -87,11 +87,11 @@ def test_the_servo_comes_first_and_volts_only_without_it(client):
     assert client.say("SVA? 1") == "1=1.000000000e+01\n"
 
 
-def test_a_servo_before_auto_zero_is_complained_of():
+def test_a_servo_before_auto_zero_is_a_violation():
     client = Client(zeroed=False)
     assert client.say("ATZ?") == "1=0 \n2=0\n"
     assert client.error("SVO 1 1") == 0
-    assert client.complaints == ["SVO 1 1 before auto-zero: the sensor is off by an unknown amount"]
+    assert client.violations == ["SVO 1 1 before auto-zero: the sensor has an unknown offset"]
 
 
 def test_auto_zero_takes_its_time_and_the_full_range():
@@ -121,9 +121,9 @@ def test_a_failed_auto_zero_says_so():
 def test_errors_have_to_be_asked_for(client):
     client.say("SVO 1 1")
     client.say("SVO 2 1")
-    assert client.complaints == ["no ERR? after 'SVO 1 1' (then: 'SVO 2 1')"]
+    assert client.violations == ["no ERR? after 'SVO 1 1' (then: 'SVO 2 1')"]
     client.controller.end_session()
-    assert client.complaints[1:] == ["no ERR? after 'SVO 2 1' (then: 'hung up')"]
+    assert client.violations[1:] == ["no ERR? after 'SVO 2 1' (then: 'disconnected')"]
 
 
 def test_moves_keep_to_the_velocity_and_the_range(servo):
@@ -152,20 +152,20 @@ def circle(client: Client, points: int = 40, *, extra: str = "") -> None:
 def test_a_stage_follows_as_its_second_order_says(servo):
     circle(servo)
     assert servo.error("WGO 1 1 2 1") == 0
-    assert servo.complaints == []
+    assert servo.violations == []
     servo.wait(0.3)
     for command in ("DRC 1 1 2 2 2 2 3 1 1", "RTR 1", "WGR"):
         assert servo.error(command) == 0
     servo.wait(0.1)
     track = servo.table("DRR? 1 400 1 2 3")
     angle = np.exp(-2j * np.pi * np.arange(400) / 40)
-    x, y, told = (2 / 400 * (column - 1000) @ angle for column in track.T)
-    assert abs(told) == pytest.approx(100.0, rel=1e-6)
+    x, y, target = (2 / 400 * (column - 1000) @ angle for column in track.T)
+    assert abs(target) == pytest.approx(100.0, rel=1e-6)
     # 500 Hz; the closed loop is held for a servo period, which makes it half a period later.
     for found, lag, (f0, damping) in ((x, 0, (900.0, 0.75)), (y, 90, (750.0, 0.8))):
         s = 1j * 500 / f0
         ideal = 1 / (s**2 + 2 * damping * s + 1) * np.exp(-1j * np.pi * 500 * SERVO_S)
-        there = found / told * np.exp(1j * np.radians(lag))
+        there = found / target * np.exp(1j * np.radians(lag))
         assert there == pytest.approx(ideal, rel=5e-3)
 
 
@@ -181,13 +181,13 @@ def test_one_line_starts_both_axes_in_one_cycle_and_two_do_not(servo):
     assert servo.error("WGO 1 1") == 0
     servo.wait(0.01)
     assert servo.error("WGO 2 1") == 0
-    assert servo.complaints == ["WGO 2 starts while 1 turns already: the phase between the axes is lost"]
+    assert servo.violations == ["WGO 2 starts while 1 runs: their phase is undefined"]
 
 
 def test_a_start_far_from_the_first_point_is_a_jump(servo):
     circle(servo, extra="MOV 1 500 2 1000")
     assert servo.error("WGO 1 1 2 1") == 0
-    assert servo.complaints == ["WGO 1 starts with a jump of 400.0 urad; MOV there first"]
+    assert servo.violations == ["WGO 1 starts with a jump of 400.0 urad; MOV there first"]
 
 
 def test_a_turning_axis_takes_no_other_orders(servo):
@@ -261,19 +261,19 @@ def test_usb_transfers_are_even():
     pipe.write(b"ERR?\n\0")
     assert pipe.read(64, 0.0) == b"0\n"
     pipe.write(b"ERR?\n")
-    (complaint,) = pipe._controller.state.complaints
-    assert "pad to an even number" in complaint
+    (violation,) = pipe._controller.state.violations
+    assert "pad it to an even number" in violation
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
         ({"colour": "red"}, "e727 has no option 'colour'; it has serial, auto-zero, zeroed, fault"),
-        ({"auto-zero": "soon"}, "auto-zero=soon: give its duration in seconds"),
-        ({"auto-zero": "-1"}, "between 0 and 600 seconds"),
+        ({"auto-zero": "soon"}, "auto-zero=soon: not a number of seconds"),
+        ({"auto-zero": "-1"}, "must lie in 0..600 seconds"),
         ({"zeroed": "yes"}, "write 0 or 1"),
-        ({"fault": "drop"}, "fault 'drop': write KIND@NUMBER"),
-        ({"fault": "melt@3"}, "KIND one of lose, drop"),
+        ({"fault": "close"}, "fault 'close': write KIND@NUMBER"),
+        ({"fault": "melt@3"}, "KIND one of drop_command, drop_reply"),
     ],
 )
 def test_wrong_options_are_refused(options, says):
@@ -281,7 +281,7 @@ def test_wrong_options_are_refused(options, says):
         make_emulator(EmulatorRequest(port=0, options=options))
 
 
-def test_a_port_in_use_is_told():
+def test_a_port_in_use_is_reported():
     with make_emulator(EmulatorRequest(port=0)) as first:
         second = make_emulator(EmulatorRequest(port=first.server.port))
         with pytest.raises(ConfigError, match="choose another --port"):
@@ -289,8 +289,14 @@ def test_a_port_in_use_is_told():
 
 
 def test_faults_are_read_from_text():
-    assert [(fault.kind, fault.at) for fault in parse_fault_script("drop@12,close@40")] == [
-        ("drop", 12),
-        ("close", 40),
-    ]
+    assert parse_fault_script("drop_reply@12,close@40") == {12: "drop_reply", 40: "close"}
+
+
+def test_fault_words_of_version_0_1_0_are_accepted(capsys):
+    assert parse_fault_script("lose@1,drop@2,late@3,power@4") == {
+        1: "drop_command", 2: "drop_reply", 3: "delay", 4: "power_cut",
+    }  # fmt: skip
+    assert capsys.readouterr().err.splitlines()[0] == (
+        "deprecated: 'lose' is now 'drop_command'; the old word will be removed"
+    )
     assert gcs_syntax.ERRORS[73] == "wave generator active"

@@ -85,4 +85,4 @@ def test_moves_waves_recorder_and_errors(kind):
     assert found["recorded"] == pytest.approx([900.0, 1100.0])
     assert (found["while turning"], found["too far"], found["stopped"]) == (73, 7, 10)
     assert found["clock"] == pytest.approx(5e-5)
-    assert [text.split(": ")[1].split(" (")[0] for text in emulator.complaints] == ["error 73", "error 7"]
+    assert [text.split(": ")[1].split(" (")[0] for text in emulator.violations] == ["error 73", "error 7"]

@@ -62,7 +62,7 @@ def length(driver: str) -> int:
     library = fresh(PARTS[driver][1])
     device = make(driver)
     USES[driver](device)
-    assert not library.complaints
+    assert not library.violations
     return library.n_calls
 
 
@@ -82,7 +82,7 @@ def test_a_fault_at_each_call(driver: str, action: str) -> None:
         assert not device.is_open, f"call {number}: still open"
         device.close()
         if action != "ignore":  # a library that lies about what it did cannot be used correctly
-            assert not library.complaints, f"call {number} of {library.calls}: {library.complaints}"
+            assert not library.violations, f"call {number} of {library.calls}: {library.violations}"
         if driver == "alpao" and not action.startswith("unplug"):
             assert not library.shape(97).any(), f"call {number}: the mirror is not at zero"
         if driver == "aravis":
@@ -109,4 +109,4 @@ def test_an_unplugged_device_says_so_and_what_to_do(driver: str, call: str) -> N
     except DeviceLost:
         assert driver == "alpao", "nobody can flatten a mirror that has gone, and it says so"
     assert not device.is_open
-    assert not library.complaints
+    assert not library.violations

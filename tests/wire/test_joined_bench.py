@@ -57,7 +57,7 @@ def test_real_drivers_calibrate_and_close_the_loop_as_the_twins_devices_do(serve
     assert through_drivers[1].lost == twin[1].lost
     assert server.requests[RequestKind.SEND] > 300
     for name in ("asdk", "m3api", "aravis"):
-        assert not stand_in(name).complaints
+        assert not stand_in(name).violations
 
 
 def test_the_science_camera_sees_the_same_beam(server) -> None:
@@ -101,7 +101,7 @@ def test_a_bench_that_goes_away_is_a_lost_device(server) -> None:
         b"\x01\0\0\0\x04\0\0\0abcd",
     ],
 )
-def test_nonsense_on_the_socket_disturbs_nobody(server, nonsense) -> None:
+def test_invalid_bytes_on_the_socket_disturb_no_other_client(server, nonsense) -> None:
     with system("hardware") as bench:
         with socket.socket(socket.AF_UNIX) as stranger:
             stranger.connect(server.environment["ESCAPE_STAND_IN_BENCH"])

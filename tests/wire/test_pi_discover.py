@@ -25,7 +25,7 @@ def test_a_controller_is_found_with_lines_to_paste():
     assert section["serial"] == "116000123"
     assert section["wire"] == {"kind": "tcp", "host": "127.0.0.1", "port": int(address.split(":")[1])}
     assert again == found
-    assert not emulator.complaints
+    assert not emulator.violations
 
 
 def test_a_host_without_a_controller_is_passed_over():

@@ -37,4 +37,4 @@ def test_the_modulators_driver_turns_the_twins_beam() -> None:
             assert circle.cycle_period_s == pytest.approx(66 * 50e-6)
         assert circle.cycle_period_s is None
         assert server.modulator is not None
-        assert server.modulator.complaints == ()
+        assert server.modulator.violations == ()

@@ -25,10 +25,12 @@ from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.config.choices import Solver
 from escape_hw.config.loader import load_system
+from escape_sim.mirror.influence_functions import pitch_on_pupil
 from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, surface_nodes
+from escape_sim.models.factory import make_fast_model
 from escape_sim.models.pyramid import nominal_pupils
-from escape_sim.models.shack_hartmann import NODES, make_model, nominal_grid
-from escape_sim.optics.pupil import pitch_on_pupil, pupil_geometry
+from escape_sim.models.shack_hartmann import NODES, nominal_grid
+from escape_sim.optics.pupil import pupil_geometry
 
 if TYPE_CHECKING:
     from escape_hw.api.sensor import SensorGeometry
@@ -51,7 +53,7 @@ OTHER_PARAMETERS = (1.0, 2.0, 0.0)
 #: What counts as found from afar, in the units of the parameters; there is no noise in these.
 CAPTURE_TOLERANCE = np.array([5.0, 5.0, 0.1, 0.5, 0.5])
 #: Gain and registration only, and with what the model does not know.
-_SOLVERS: tuple[Solver, ...] = ("light", "effects")
+_SOLVERS: tuple[Solver, ...] = ("registration-only", "mixed-effects")
 _OOPAO_SENSOR = ("sensor.pitch_px=16", "sensor.spot_px=2")
 #: OOPAO's pupil images stand on a square around the middle of its grid.
 _OOPAO_PYRAMID = (
@@ -77,7 +79,7 @@ def run() -> list[BenchmarkRow]:
         oopao = OopaoPeer(oopao_like, modes)
         rows += _matrices(oopao_like, oopao, what)
         rows += _times(oopao_like, oopao, what, NOISE)
-        rows += _exact(oopao_like, oopao, what, (("no noise, light", "light"),))
+        rows += _exact(oopao_like, oopao, what, (("no noise, light", "registration-only"),))
         rows += _accuracy(oopao_like, bench, oopao, what)
         rows += _capture_rows(oopao_like, oopao, what)
         rows += _specula_rows(bench, modes)
@@ -94,7 +96,10 @@ def pyramid_rows() -> list[BenchmarkRow]:
         rows += _matrices(oopao_like, oopao, what)
         rows += _times(oopao_like, oopao, what, 0.0)
         rows += _exact(
-            oopao_like, oopao, what, (("no noise, light", "light"), ("no noise, with misfit", "effects"))
+            oopao_like,
+            oopao,
+            what,
+            (("no noise, light", "registration-only"), ("no noise, with misfit", "mixed-effects")),
         )
         rows += _capture_rows(oopao_like, oopao, what)
     return rows
@@ -107,7 +112,7 @@ def injected(config: SystemConfig) -> Registration:
 
 
 def _low_modes(config: SystemConfig) -> list[NDArray[np.float64]]:
-    surfaces = make_model(config, None).influence_functions()
+    surfaces = make_fast_model(config, None).influence_functions()
     m2c = karhunen_loeve(*surfaces, max(MODES), 4 * config.system.pupil_m)
     return [m2c[:, :n] for n in MODES]
 
@@ -127,7 +132,7 @@ class EscapeSolver:
     def solver(self, solver_name: Solver, noise: bool = True) -> Solve:
         """The model built, and the solver on it, told of the noise or of none."""
         grid = _sensor(self.config)
-        model = make_model(self.config, grid)
+        model = make_fast_model(self.config, grid)
 
         def solve(data: NDArray[np.float64]) -> SolverResult:
             sigma = np.full(data.shape, _sigma(data) if noise else 0.0, np.float32)
@@ -147,7 +152,7 @@ class EscapeSolver:
 
     def matrix(self, registration: Registration) -> NDArray[np.float64]:
         """What our model says is measured under a registration."""
-        return modal_matrix(make_model(self.config, None), registration, self.m2c)
+        return modal_matrix(make_fast_model(self.config, None), registration, self.m2c)
 
 
 def mirror(real: bool) -> MirrorUnderTest:
@@ -158,7 +163,7 @@ def mirror(real: bool) -> MirrorUnderTest:
 
 def _matrices(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
     """The synthetic matrix, alone and with what a step of the descent needs."""
-    model, m2c, at = make_model(config, None), oopao.m2c, injected(config)
+    model, m2c, at = make_fast_model(config, None), oopao.m2c, injected(config)
     ours, theirs = modal_matrix(model, at, m2c), oopao.matrix(at, mirror(False))
     scale = float(np.vdot(ours, theirs) / np.vdot(ours, ours))
     note = f"relative difference {np.linalg.norm(scale * ours - theirs) / np.linalg.norm(theirs):.1e}"
@@ -220,8 +225,8 @@ def _times(config: SystemConfig, oopao: OopaoPeer, what: str, noise: float) -> l
     if noisy:
         data = _draws(data)[0]
     peer_label, note = f"{oopao.name}, 6 iterations", f"OOPAO's matrix, {noise:.0%} noise"
-    set_up = time_alternately(lambda: make_model(config, None), oopao.set_up, rounds=2)
-    wide_up = time_alternately(lambda: list(make_model(config, None).variants()), None, rounds=2)[0]
+    set_up = time_alternately(lambda: make_fast_model(config, None), oopao.set_up, rounds=2)
+    wide_up = time_alternately(lambda: list(make_fast_model(config, None).variants()), None, rounds=2)[0]
     light, full = (ours.solver(solver_name, noise=noisy) for solver_name in _SOLVERS)
     solve = time_alternately(lambda: light(data), lambda: oopao.solve(data), rounds=3)
     wide = time_alternately(lambda: full(data), None, rounds=3)[0]
@@ -270,14 +275,14 @@ def _accuracy(
             our_data = _errors(solve, matrices, INJECTED)
             rows += _error_rows(what, f"{kind} mirror, {label}", our_data, theirs, peer_label)
         if kind == "ideal":
-            our_data = _errors(own.solver("light"), _draws(own.matrix(INJECTED)), INJECTED)
+            our_data = _errors(own.solver("registration-only"), _draws(own.matrix(INJECTED)), INJECTED)
             rows += _error_rows(what, "ideal mirror, each its own sensor", our_data, theirs, peer_label)
     return rows
 
 
 def _capture_rows(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
     """How many far registrations are found, and how many wrong ones are vouched for."""
-    light = EscapeSolver(config, oopao.m2c).solver("light", noise=False)
+    light = EscapeSolver(config, oopao.m2c).solver("registration-only", noise=False)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
     # The same share of the pupil on every sensor.
     tolerance = CAPTURE_TOLERANCE * ([config.sensor.n_sub / INJECTED_N_SUB] * 2 + [1] * 3)
@@ -311,9 +316,9 @@ def _capture_rows(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[Ben
 
 def _specula_rows(config: SystemConfig, modes: NDArray[np.float64]) -> list[BenchmarkRow]:
     ours = EscapeSolver(config, modes)
-    light, what = ours.solver("light"), f"sprint, {modes.shape[1]} modes"
+    light, what = ours.solver("registration-only"), f"sprint, {modes.shape[1]} modes"
     our_data = _draws(ours.matrix(INJECTED_EQUAL_SCALINGS))
-    peer = specula_peer(config, modes, make_model(config, None))
+    peer = specula_peer(config, modes, make_fast_model(config, None))
     label, note = "each its own sensor, light", "one scaling injected; SPECULA knows no more"
     if peer is None:
         seconds = time_alternately(lambda: light(our_data[0]), None, rounds=2)[0]

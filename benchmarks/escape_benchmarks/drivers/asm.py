@@ -74,7 +74,7 @@ def _codec_row(section: MirrorConfig) -> BenchmarkRow:
 @contextlib.contextmanager
 def _emulator() -> Iterator[int]:
     """An emulator in a process of its own; gives its port."""
-    options = ["speed=1000", "hold=30", "rest=60"]
+    options = ["transition_speed=1000", "hold_s=30", "rest_s=60"]
     words = [*_ESCAPE, "emulate", "asm", "--port", "0", *(f"--option={option}" for option in options)]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     try:

@@ -63,7 +63,7 @@ def _mirror(asdk: StandIn) -> list[BenchmarkRow]:
 def _camera(m3api: StandIn) -> list[BenchmarkRow]:
     rows = []
     for dim, what in ((1, "no pixel saturated"), (0, "some saturated")):
-        m3api.clear(record=False).script(f"set pace 0; set dim {dim}")
+        m3api.clear(record=False).script(f"set real_time 0; set attenuation {dim}")
         with _device("ximea", "wfs", m3api) as camera:
             rows.append(_frame(m3api, camera, what))
     return rows

@@ -12,7 +12,7 @@ from escape_benchmarks.optics.pyramid import pyramid_rows
 from escape_hw.api.benchmark import BenchmarkRow, time_alternately
 from escape_hw.api.registration import Registration
 from escape_hw.config.loader import load_system
-from escape_sim.models import shack_hartmann as fast_model
+from escape_sim.models.factory import make_fast_model
 from escape_sim.oopao import models as oopao_model
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def _rate(stage: str, ours_s: float, peer_s: float | None, peer: str) -> Benchma
 
 
 def _matrix(config: SystemConfig, peer: str) -> BenchmarkRow:
-    ours, theirs = fast_model.make_model(config, None), oopao_model.make_model(config, None)
+    ours, theirs = make_fast_model(config, None), oopao_model.make_model(config, None)
     at = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
     a, b = ours.zonal_matrix(at), theirs.zonal_matrix(at)
     agreement = float(np.linalg.norm(a - b) / np.linalg.norm(b))

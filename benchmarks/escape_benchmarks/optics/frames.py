@@ -11,8 +11,15 @@ import numpy as np
 from escape_hw.api.modulator import Modulation
 from escape_hw.bench import Bench
 from escape_hw.config.sensor import PyramidSection
-from escape_sim.oopao.library import SourceAndTelescope, make_pyramid, make_source, oopao, quiet
-from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.mirror.influence_functions import actuator_positions, pitch_on_pupil
+from escape_sim.oopao.library import (
+    SourceAndTelescope,
+    make_pyramid,
+    make_source,
+    oopao_classes,
+    suppress_output,
+)
+from escape_sim.optics.pupil import pupil_geometry
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
@@ -46,13 +53,13 @@ def oopao_frame(config: SystemConfig) -> Callable[[], object]:
     A Shack-Hartmann sensor has its cheapest sampling, eight pixels per lenslet. A pyramid has the
     region's size, with the images on a square.
     """
-    lib, pupil = oopao(), pupil_geometry(config)
+    lib, pupil = oopao_classes(), pupil_geometry(config)
     twin, scale = config.twin, 1.0 if config.twin.atmosphere else _SCALE
     diameter = config.system.pupil_m * scale
     light = make_source(pupil.amplitude, diameter, config.system.wavelength_m)
     power = float(np.square(pupil.amplitude, dtype=float).sum()) * light.photons_per_unit
     telescope, source = light.telescope, light.source
-    with quiet():
+    with suppress_output():
         # As many photons per frame as the twin has.
         rate = config.devices.wfs.frame_rate_hz
         photons = twin.star.electrons(1 / rate) if twin.star else twin.wfs.photons_per_frame
@@ -78,7 +85,7 @@ def oopao_frame(config: SystemConfig) -> Callable[[], object]:
     counter = iter(range(1 << 62))
 
     def call() -> object:
-        with quiet():
+        with suppress_output():
             atmosphere.update()
             mirror.coefs = paths[next(counter) % _N_COMMANDS]
             # '**' starts a new propagation; '*' goes on with it.
@@ -117,6 +124,6 @@ def _sensor(config: SystemConfig, light: SourceAndTelescope, n_sub: int) -> Any:
         sensor = make_pyramid(light, n_sub, spare // 4 * 2, (spare - spare // 4 * 2) // 2)
         sensor.modulation = config.sensor.modulation
         return sensor
-    return oopao().ShackHartmann(
+    return oopao_classes().ShackHartmann(
         nSubap=n_sub, telescope=light.telescope, lightRatio=config.sensor.min_flux, threshold_cog=0
     )

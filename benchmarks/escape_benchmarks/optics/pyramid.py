@@ -16,9 +16,9 @@ from escape_hw.api.benchmark import BenchmarkRow, time_alternately
 from escape_hw.api.registration import Registration
 from escape_hw.config.loader import load_system
 from escape_hw.config.sensor import PyramidSection
-from escape_sim.models import shack_hartmann as fast_model
+from escape_sim.models.factory import make_fast_model
 from escape_sim.oopao import models as oopao_model
-from escape_sim.oopao.library import oopao, quiet
+from escape_sim.oopao.library import oopao_classes, suppress_output
 from escape_sim.oopao.optics import OOPAOPyramid
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import WORKERS, PyramidOptics
@@ -81,7 +81,7 @@ def _frames(stage: str, config: SystemConfig, peer: str, note: str) -> Benchmark
 def _matrix(config: SystemConfig, peer: str) -> BenchmarkRow:
     """The matrix of all actuators under a registration."""
     start = time.perf_counter()
-    ours = fast_model.make_model(config, None)
+    ours = make_fast_model(config, None)
     built_s = time.perf_counter() - start
     theirs = oopao_model.make_model(config, None)
     at = Registration(62.0, -138.0, 0.9, -1.7, 0.8)
@@ -115,11 +115,11 @@ def _kernel(case: _Case, peer: str) -> BenchmarkRow:
     path = (1e-7 * np.random.default_rng(0).standard_normal((n, n))).astype(np.float32)
     a, b = fast.frame(path), slow.frame(path)
     agreement = float(np.abs(a - b).max() / b.max())
-    with quiet():
-        given = oopao().OPD_map(path.astype(float))
+    with suppress_output():
+        given = oopao_classes().OPD_map(path.astype(float))
 
     def theirs() -> None:
-        with quiet():
+        with suppress_output():
             slow.light.source**slow.light.telescope * given * slow.sensor
 
     ours_s, peer_s = time_alternately(lambda: fast.frame(path), theirs, seconds=2.0, rounds=5)

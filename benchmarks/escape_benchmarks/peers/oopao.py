@@ -14,11 +14,18 @@ from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.config.sensor import PyramidSection
+from escape_sim.mirror.influence_functions import actuator_positions, pitch_on_pupil
 from escape_sim.models.pyramid import nominal_pupils
-from escape_sim.oopao.library import SourceAndTelescope, make_source, mis_registration, oopao, quiet
+from escape_sim.oopao.library import (
+    SourceAndTelescope,
+    make_source,
+    mis_registration,
+    oopao_classes,
+    suppress_output,
+)
 from escape_sim.oopao.optics import OOPAOPyramid
 from escape_sim.optics.modulation import ModulationPath
-from escape_sim.optics.pupil import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import PupilGeometry, pupil_geometry
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
@@ -73,8 +80,8 @@ class OopaoPeer:
             "pitch": pitch_on_pupil(config) * scale,
             "print_dm_properties": False,
         }
-        with quiet():
-            mirror = oopao().DeformableMirror(mechCoupling=config.devices.dm.coupling, **self._place)
+        with suppress_output():
+            mirror = oopao_classes().DeformableMirror(mechCoupling=config.devices.dm.coupling, **self._place)
         self._parts = SimpleNamespace(
             tel=light.telescope, ngs=light.source, dm=mirror, wfs=sensor, atm=None, param=None
         )
@@ -99,9 +106,9 @@ class OopaoPeer:
         """
         p = self._parts
         moved = mis_registration(registration, self._sub_aperture)
-        with quiet():
+        with suppress_output():
             measure = import_module("OOPAO.calibration.InteractionMatrix").InteractionMatrix
-            mirror = oopao().DeformableMirror(mechCoupling=real.coupling, misReg=moved, **self._place)
+            mirror = oopao_classes().DeformableMirror(mechCoupling=real.coupling, misReg=moved, **self._place)
             acting = real.gains[:, None] * self.m2c
             found = measure(
                 p.ngs, p.tel, mirror, p.wfs, acting,
@@ -111,13 +118,13 @@ class OopaoPeer:
 
     def set_up(self) -> None:
         """Calculate the sensitivities about zero."""
-        with quiet():
+        with suppress_output():
             self._solver = import_module("OOPAO.SPRINT").SPRINT(
                 self._parts,
                 SimpleNamespace(modes=self.m2c, extra="KL"),
                 n_mis_reg=len(PARAMETERS),
                 ind_mis_reg=list(_PARAMETERS),
-                mis_registration_zero_point=oopao().MisRegistration(),
+                mis_registration_zero_point=oopao_classes().MisRegistration(),
             )
 
     def solve(self, data: NDArray[np.float64], iterations: int = 6) -> SolverResult:
@@ -126,7 +133,7 @@ class OopaoPeer:
         if solver is None:
             raise RuntimeError("set_up() comes first")
         # Where it diverges it divides by zero; what comes of that is counted, not printed.
-        with quiet(), warnings.catch_warnings():
+        with suppress_output(), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
             solver.estimate(
                 self._parts, self._sign * data, n_iteration=iterations, precision=6, display=False, plot=False
@@ -142,8 +149,8 @@ def _sensor(config: SystemConfig, pupil: PupilGeometry) -> tuple[SourceAndTelesc
     diameter = config.system.pupil_m * _SCALE
     if not isinstance(config.sensor, PyramidSection):
         light = make_source(pupil.amplitude, diameter, config.system.wavelength_m)
-        with quiet():
-            return light, oopao().ShackHartmann(
+        with suppress_output():
+            return light, oopao_classes().ShackHartmann(
                 nSubap=pupil.n_sub,
                 telescope=light.telescope,
                 lightRatio=config.sensor.min_flux,
@@ -156,7 +163,7 @@ def _sensor(config: SystemConfig, pupil: PupilGeometry) -> tuple[SourceAndTelesc
         diameter_m=diameter,
     )  # fmt: skip
     sensor = pyramid.sensor
-    with quiet():
+    with suppress_output():
         # Its choice of pixels would differ from ours along the rim.
         sensor.userValidSignal = pupils.valid
         sensor.initialization()

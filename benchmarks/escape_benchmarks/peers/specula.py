@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from escape_benchmarks.peers.oopao import SolverResult
 from escape_hw.api.registration import Registration
-from escape_sim.oopao.library import quiet
+from escape_sim.oopao.library import suppress_output
 from escape_sim.optics.pupil import pupil_geometry
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class SpeculaPeer:
     def __init__(self, config: SystemConfig, m2c: NDArray[np.float64], model: SyntheticModel) -> None:
         # The back end must be chosen before anything else of SPECULA's is imported.
         logging.getLogger("specula").setLevel(logging.ERROR)
-        with quiet():
+        with suppress_output():
             import_module("specula").init(-1, precision=0)
             kind: Any = import_module("specula.processing_objects.sprint_sh_synim").SprintShSynim
         surfaces, _, pixel = model.influence_functions()

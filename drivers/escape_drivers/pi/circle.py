@@ -139,14 +139,14 @@ class CircleGenerator:
             measured = self._measure(modulation, turn)
             pairs = zip(measured, response, strict=True)
             self.error = max(abs(available / known - 1) for available, known in pairs)
-            if self.error <= max(self._stage.round_within, _NOISE_RAD / modulation.radius_rad):
+            if self.error <= max(self._stage.circle_tolerance, _NOISE_RAD / modulation.radius_rad):
                 return
             response = self._responses[turn.servo_periods] = measured
         raise DeviceError(
             self._name,
             f"draws {modulation} with an error of {self.error:.1%} of the radius after {_ROUNDS} "
             "corrections; is the mirror's load too high for this frequency? The limit is "
-            "devices.modulator.stage.round_within",
+            "devices.modulator.stage.circle_tolerance",
         )
 
     def stop(self) -> None:
@@ -194,10 +194,10 @@ class CircleGenerator:
         """What the axes are known to make of a circle: measured, from the table, or nothing."""
         if turn.servo_periods in self._responses:
             return self._responses[turn.servo_periods]
-        rows = self._stage.corrections if self._stage.correct != "none" else ()
+        rows = self._stage.corrections if self._stage.correction_source != "none" else ()
         frequency = turn.frequency_hz(self._travel.servo_s)
         near = [row for row in rows if abs(row[0] / frequency - 1) < 0.005]
-        if not near and self._stage.correct == "table":
+        if not near and self._stage.correction_source == "table":
             available = ", ".join(f"{row[0]:g}" for row in rows)
             raise SettingRejected(
                 self._name,
@@ -209,7 +209,7 @@ class CircleGenerator:
     def _is_measurable(self, modulation: Modulation) -> bool:
         """Whether the circle is checked with the recorder."""
         is_moving = modulation.radius_rad > 0 and modulation.frequency_hz >= _SLOWEST_HZ
-        return self._stage.correct == "recorder" and is_moving
+        return self._stage.correction_source == "recorder" and is_moving
 
     def _measure(self, modulation: Modulation, turn: CycleTiming) -> AxisResponse:
         """Amplitude and phase of both axes relative to their targets."""

@@ -25,13 +25,7 @@ from escape_hw.remote.state import Arguments, ProcedureParameter
 
 
 class ArgumentForm(QWidget):
-    """One row for each argument; what may be left out stands empty.
-
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
-    """
+    """One row for each argument; what may be left out stands empty."""
 
     #: Anything was edited.
     edited = Signal()
@@ -53,7 +47,6 @@ class ArgumentForm(QWidget):
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
 
     def sizeHint(self) -> QSize:
-        """As high as its arguments."""
         parameter_hint, page = super().sizeHint(), self._area.widget()
         return parameter_hint if page is None else QSize(parameter_hint.width(), page.sizeHint().height())
 

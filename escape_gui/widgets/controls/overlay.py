@@ -1,24 +1,17 @@
-"""A page of text over the window: the keys, or the help of a panel. Escape closes it."""
+"""A page of text over the window: keyboard shortcuts, or the help of a panel."""
 
 from __future__ import annotations
 
 from PySide6.QtCore import QEvent, QObject, Qt
 from PySide6.QtGui import QKeyEvent
-from PySide6.QtWidgets import QFrame, QHBoxLayout, QLabel, QPushButton, QTextBrowser, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QFrame, QLabel, QPushButton, QTextBrowser, QWidget
 
 from escape_gui.theme import Theme
+from escape_gui.widgets.layouts import column, row
 
 
 class Overlay(QFrame):
-    """Lies over its window until it is closed; the panels below go on.
-
-    Parameters
-    ----------
-    window
-        Over what it lies.
-    theme
-        Look.
-    """
+    """Page of text over a window, closed by Escape; the panels below keep updating."""
 
     def __init__(self, window: QWidget, theme: Theme) -> None:
         super().__init__(window)
@@ -27,23 +20,16 @@ class Overlay(QFrame):
         self._title = QLabel()
         self._text = QTextBrowser()
         self._text.setOpenExternalLinks(True)
-        shut = QPushButton("Close (Esc)")
-        shut.clicked.connect(self.hide)
-        head = QHBoxLayout()
-        head.addWidget(self._title)
-        head.addStretch()
-        head.addWidget(shut)
-        column = QVBoxLayout(self)
-        column.setContentsMargins(16, 12, 16, 16)
-        column.addLayout(head)
-        column.addWidget(self._text)
+        close_button = QPushButton("Close (Esc)")
+        close_button.clicked.connect(self.hide)
+        head = row(self._title, None, close_button)
+        column(head, self._text, parent=self).setContentsMargins(16, 12, 16, 16)
         window.installEventFilter(self)
         theme.changed.connect(self._apply_theme)
         self._apply_theme()
         self.hide()
 
     def open(self, title: str, text: str, *, markdown: bool = False) -> None:
-        """Show a page."""
         self._title.setText(title)
         self.setAccessibleName(title)
         if markdown:
@@ -57,7 +43,7 @@ class Overlay(QFrame):
 
     @property
     def page(self) -> str:
-        """The text shown, without its markup."""
+        """The text shown, without markup."""
         return self._text.toPlainText()
 
     def _place(self) -> None:
@@ -76,14 +62,12 @@ class Overlay(QFrame):
         )
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Escape closes it."""
         if event.key() == Qt.Key.Key_Escape:
             self.hide()
         else:
             super().keyPressEvent(event)
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
-        """Stay in the middle."""
         if event.type() is QEvent.Type.Resize and self.isVisible():
             self._place()
         return False

@@ -1,4 +1,4 @@
-"""A condition as shape, word and colour, so that no colour needs to be told apart."""
+"""A condition as shape, text and colour, readable with any colour vision."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPolygonF
 from PySide6.QtWidgets import QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
+from escape_hw.remote.state import DeviceHealth
 
 
 class Level(Enum):
-    """How good a condition is, with the palette's colour for it."""
+    """Severity of a condition; the value is its colour in the palette."""
 
     NEUTRAL = "muted"
     GOOD = "good"
@@ -21,34 +22,37 @@ class Level(Enum):
     ERROR = "bad"
 
 
-class StatusIndicator(QWidget):
-    """Shape, word and colour: disc good, ring quiet, play mark active, triangle warning, square bad.
+HEALTH_LEVELS: dict[DeviceHealth, Level] = {
+    DeviceHealth.OK: Level.GOOD,
+    DeviceHealth.STALE: Level.WARNING,
+    DeviceHealth.LOST: Level.ERROR,
+    DeviceHealth.FAULT: Level.ERROR,
+    DeviceHealth.CLOSED: Level.NEUTRAL,
+}
 
-    Parameters
-    ----------
-    theme
-        Colours and font.
-    widest
-        The longest word it will show; keeps the width, so that nothing beside it moves.
+
+class StatusIndicator(QWidget):
+    """Text beside a shape: disc good, ring neutral, play mark active, triangle warning, square error.
+
+    ``widest_text`` sets the minimum width, so that neighbours do not move when the text changes.
     """
 
     def __init__(self, theme: Theme, widest_text: str = "") -> None:
         super().__init__()
         self._theme = theme
-        self._widest = widest_text
+        self._widest_text = widest_text
         self.level = Level.NEUTRAL
-        self.word = ""
+        self.text = ""
         self.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Fixed)
         theme.changed.connect(self._apply_theme)
         self._apply_theme()
 
-    def set_status(self, level: Level, word: str) -> None:
-        """Show a condition."""
-        if (level, word) == (self.level, self.word):
+    def set_status(self, level: Level, text: str) -> None:
+        if (level, text) == (self.level, self.text):
             return
-        longer = len(word) > len(self._widest) and len(word) != len(self.word)
-        self.level, self.word = level, word
-        self.setAccessibleName(word)
+        longer = len(text) > len(self._widest_text) and len(text) != len(self.text)
+        self.level, self.text = level, text
+        self.setAccessibleName(text)
         if longer:
             self.updateGeometry()
         self.update()
@@ -59,32 +63,25 @@ class StatusIndicator(QWidget):
         self.update()
 
     def sizeHint(self) -> QSize:
-        """Room for the widest word."""
         metrics = self.fontMetrics()
-        width = max(metrics.horizontalAdvance(word) for word in (self._widest, self.word))
+        width = max(metrics.horizontalAdvance(text) for text in (self._widest_text, self.text))
         return QSize(width + round(1.9 * metrics.height()), round(1.5 * metrics.height()))
 
     def paintEvent(self, event: QPaintEvent) -> None:
-        """Draw it."""
         painter = QPainter(self)
         painter.setRenderHint(QPainter.RenderHint.Antialiasing)
         colour = self._theme.colour(self.level.value)
         side = 0.62 * self.fontMetrics().height()
-        box = QRectF(0.5 * side, (self.height() - side) / 2, side, side)
-        draw_mark(painter, box, self.level, colour)
+        _draw_shape(painter, QRectF(0.5 * side, (self.height() - side) / 2, side, side), self.level, colour)
         painter.setPen(colour)
         text = QRectF(self.rect()).adjusted(2.1 * side, 0, 0, 0)
-        painter.drawText(text, Qt.AlignmentFlag.AlignVCenter | Qt.AlignmentFlag.AlignLeft, self.word)
+        painter.drawText(text, Qt.AlignmentFlag.AlignVCenter | Qt.AlignmentFlag.AlignLeft, self.text)
 
 
-def draw_mark(painter: QPainter, box: QRectF, level: Level, colour: QColor) -> None:
-    """Draw a level's shape into a square."""
+def _draw_shape(painter: QPainter, box: QRectF, level: Level, colour: QColor) -> None:
     painter.setPen(colour)
-    painter.setBrush(colour)
-    if level is Level.NEUTRAL:
-        painter.setBrush(Qt.BrushStyle.NoBrush)
-        painter.drawEllipse(box)
-    elif level is Level.GOOD:
+    painter.setBrush(Qt.BrushStyle.NoBrush if level is Level.NEUTRAL else colour)
+    if level in (Level.NEUTRAL, Level.GOOD):
         painter.drawEllipse(box)
     elif level is Level.ERROR:
         painter.drawRect(box)

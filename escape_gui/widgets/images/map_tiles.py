@@ -1,4 +1,4 @@
-"""Pairs of maps under their titles, as many as there are, in a grid."""
+"""Grid of slope maps with titles."""
 
 from __future__ import annotations
 
@@ -8,28 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtCore import QRect, QSize, Qt
 from PySide6.QtGui import QImage, QPainter, QPaintEvent, QResizeEvent
-from PySide6.QtWidgets import QGridLayout, QLabel, QSizePolicy, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QGridLayout, QLabel, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
 from escape_gui.views.mode_detail import MapTile
 from escape_gui.views.mode_mosaic import colour_indices
 from escape_gui.widgets.images.colour_scale import DIVERGING, SEQUENTIAL, lookup_table
+from escape_gui.widgets.layouts import column
 
-#: Height of a line of a title, at normal letter size.
+#: Height of a line of a title at font scale 1, pixels.
 _LINE = 14
 
 
 def best_columns(count: int, width: float, height: float, title: float) -> int:
-    """Columns that make pictures twice as wide as high, below titles, largest.
+    """Number of columns for which ``count`` images with an aspect ratio of 2 : 1 are largest.
 
-    Parameters
-    ----------
-    count
-        Number of pictures.
-    width, height
-        Of all of them together, in pixels.
-    title
-        Height of a title, in pixels.
+    ``width`` and ``height`` are those of the grid, ``title`` is the height above each image, in pixels.
     """
 
     def size(columns: int) -> float:
@@ -40,7 +34,7 @@ def best_columns(count: int, width: float, height: float, title: float) -> int:
 
 
 class MapImage(QWidget):
-    """One picture, as large as there is room, its pixels square and sharp."""
+    """An image with square pixels, as large as the widget permits."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,7 +43,6 @@ class MapImage(QWidget):
         self.setMinimumHeight(32)
 
     def show_tile(self, tile: MapTile) -> None:
-        """Show a tile's maps."""
         low, high = tile.limits
         centred = tile.maps - (low + high) / 2
         colours = lookup_table(DIVERGING if tile.signed else SEQUENTIAL)
@@ -57,12 +50,10 @@ class MapImage(QWidget):
         self.update()
 
     def sizeHint(self) -> QSize:
-        """As large as its pixels, at least."""
         rows, columns = self._pixels.shape[:2]
         return QSize(columns, rows)
 
     def paintEvent(self, event: QPaintEvent) -> None:
-        """Draw it in the middle."""
         rows, columns = self._pixels.shape[:2]
         if not rows:
             return
@@ -74,13 +65,7 @@ class MapImage(QWidget):
 
 
 class MapTiles(QWidget):
-    """One mode as several matrices see it.
-
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
-    """
+    """Tiles of one mode in a grid."""
 
     def __init__(self, theme: Theme) -> None:
         super().__init__()
@@ -94,16 +79,13 @@ class MapTiles(QWidget):
 
     @property
     def titles(self) -> tuple[str, ...]:
-        """What is shown."""
         return tuple(one.title for one in self._tiles)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Arrange them anew."""
         super().resizeEvent(event)
         self._arrange()
 
     def _arrange(self) -> None:
-        """As many beside each other as make the pictures largest."""
         title = 4 * self._theme.pixels(_LINE)
         columns = best_columns(len(self._tiles), self.width(), self.height(), title)
         if columns != self._columns:
@@ -112,30 +94,25 @@ class MapTiles(QWidget):
                 self._grid.addWidget(holder, *divmod(number, columns))
 
     def show_tiles(self, tiles: Sequence[MapTile]) -> None:
-        """Show these instead of what was shown before."""
         self._tiles = tuple(tiles)
         while len(self._tile_widgets) < len(self._tiles):
             self._add_tile_widget()
-        for number, (holder, title, picture) in enumerate(self._tile_widgets):
+        for number, (holder, title, image) in enumerate(self._tile_widgets):
             holder.setVisible(number < len(self._tiles))
             if number < len(self._tiles):
                 title.setText(self._title(self._tiles[number]))
-                picture.show_tile(self._tiles[number])
+                image.show_tile(self._tiles[number])
         self._arrange()
 
     def _add_tile_widget(self) -> None:
-        holder, title, picture = QWidget(), QLabel(), MapImage()
+        holder, title, image = QWidget(), QLabel(), MapImage()
         title.setWordWrap(True)
         title.setFont(self._theme.font(0.9))
-        # Words wrap rather than make a column wider than the others.
+        # Titles wrap, so that all columns have the same width.
         title.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Minimum)
-        column = QVBoxLayout(holder)
-        column.setContentsMargins(0, 0, 0, 0)
-        column.setSpacing(2)
-        column.addWidget(title)
-        column.addWidget(picture, 1)
+        column(title, (image, 1), parent=holder, spacing=2)
         self._grid.addWidget(holder, *divmod(len(self._tile_widgets), self._columns))
-        self._tile_widgets.append((holder, title, picture))
+        self._tile_widgets.append((holder, title, image))
 
     def _title(self, tile: MapTile) -> str:
         low, high = tile.limits
@@ -144,7 +121,6 @@ class MapTiles(QWidget):
         return f"<b>{tile.title}</b><br><span style='color:{muted}'>{tile.note}<br>colours {scale}</span>"
 
     def apply_theme(self) -> None:
-        """Follow the palette."""
         for _, title, _ in self._tile_widgets:
             title.setFont(self._theme.font(0.9))
         self.show_tiles(self._tiles)

@@ -1,4 +1,4 @@
-"""Arrows over a picture, all drawn as one path."""
+"""Slopes as arrows over an image, drawn as one path, and the outlines of sub-apertures."""
 
 from __future__ import annotations
 
@@ -11,20 +11,14 @@ from numpy.typing import NDArray
 from escape_gui.theme import Theme
 from escape_hw.remote.state import Geometry
 
-#: So few outlines are pupils of a pyramid, which are round.
-_PUPILS = 8
-#: Length of an arrow of one pixel, in half widths of a sub-aperture.
-_PER_PIXEL = 0.8
+#: Up to this number, outlines are the circular pupils of a pyramid sensor.
+_MAX_PUPILS = 8
+#: Length of the arrow of a slope of one pixel, in half widths of a sub-aperture.
+_ARROW_SCALE = 0.8
 
 
 class Quiver(pg.PlotCurveItem):  # type: ignore[misc]
-    """Arrows at the sub-apertures' centres; a dot of the shaft's width marks where each begins.
-
-    Parameters
-    ----------
-    theme
-        Colours.
-    """
+    """Arrows that start at the centres of the sub-apertures."""
 
     def __init__(self, theme: Theme) -> None:
         super().__init__()
@@ -37,14 +31,13 @@ class Quiver(pg.PlotCurveItem):  # type: ignore[misc]
         self.apply_theme()
 
     def set_geometry(self, geometry: Geometry) -> None:
-        """Take the centres; only lenslet sensors have one for each slope."""
-        places = np.asarray(geometry.outlines_px, float).reshape(-1, 3)
-        self._x, self._y = places[:, 0], places[:, 1]
-        self._length = _PER_PIXEL * float(places[:, 2].mean()) if len(places) else 1.0
+        outlines = np.asarray(geometry.outlines_px, float).reshape(-1, 3)
+        self._x, self._y = outlines[:, 0], outlines[:, 1]
+        self._length = _ARROW_SCALE * float(outlines[:, 2].mean()) if len(outlines) else 1.0
         self.setData([], [])
 
     def show_slopes(self, slopes: NDArray[np.floating]) -> None:
-        """Show slopes ``(2 n,)`` in pixels, all x and then all y."""
+        """Show slopes ``(2 * n,)`` in pixels, all x, then all y; nothing if their number does not match."""
         n = self._x.size
         if slopes.size != 2 * n or n == 0:
             self.setData([], [])
@@ -55,16 +48,26 @@ class Quiver(pg.PlotCurveItem):  # type: ignore[misc]
         self.setData(x, y, connect="pairs")
 
     def apply_theme(self) -> None:
-        """Take the theme's colours."""
         self.setPen(pg.mkPen(self._theme.series(0), width=1))
 
 
 def outline_points(outlines: Sequence[tuple[float, float, float]]) -> NDArray[np.float64]:
-    """Squares around sub-apertures or circles around a pyramid's pupils ``(2, points)``, NaN between them."""
-    round_ones = len(outlines) <= _PUPILS
-    angle = np.linspace(0, 2 * np.pi, 49) if round_ones else np.pi / 4 + np.linspace(0, 2 * np.pi, 5)
-    size = 1.0 if round_ones else np.sqrt(2)
-    shape = np.append(size * np.exp(1j * angle), np.nan)
-    places = np.asarray(outlines, float).reshape(-1, 3)
-    points = (places[:, :1] + 1j * places[:, 1:2] + places[:, 2:] * shape).ravel()
+    """Squares around sub-apertures, or circles around the pupils of a pyramid sensor.
+
+    Parameters
+    ----------
+    outlines
+        Centre x, y and half width of each, in pixels.
+
+    Returns
+    -------
+    ndarray
+        Points ``(2, n_points)``, NaN between the outlines.
+    """
+    circles = len(outlines) <= _MAX_PUPILS
+    angle = np.linspace(0, 2 * np.pi, 49) if circles else np.pi / 4 + np.linspace(0, 2 * np.pi, 5)
+    radius = 1.0 if circles else np.sqrt(2)
+    shape = np.append(radius * np.exp(1j * angle), np.nan)
+    table = np.asarray(outlines, float).reshape(-1, 3)
+    points = (table[:, :1] + 1j * table[:, 1:2] + table[:, 2:] * shape).ravel()
     return np.stack([points.real, points.imag])

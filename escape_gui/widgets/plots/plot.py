@@ -1,4 +1,4 @@
-"""Plots in the theme's colours: axes, curves, error bars, error bands."""
+"""Plots in the colours of the theme: live curves, strip charts, error bars, error bands."""
 
 from __future__ import annotations
 
@@ -13,35 +13,26 @@ from PySide6.QtGui import QColor
 
 from escape_gui.theme import Theme
 
+#: Dashes by number of the curve, so that curves differ not only in colour.
+DASHES = (
+    Qt.PenStyle.SolidLine, Qt.PenStyle.DashLine, Qt.PenStyle.DotLine, Qt.PenStyle.DashDotLine,
+    Qt.PenStyle.DashDotDotLine,
+)  # fmt: skip
+#: Markers by number of the curve: pyqtgraph's name, and the character for it in texts.
+MARKERS = (("o", "●"), ("s", "■"), ("t1", "▲"), ("d", "◆"), ("t", "▼"), ("star", "★"))
+
 
 def reparent_menu(plot: pg.PlotItem) -> None:
-    """Give a plot's menu, which nobody sees, to the widget that the plot stands in."""
+    """Make the (disabled) menu of a plot a child of the widget, so that it is deleted with the widget."""
     plot.setMenuEnabled(False)
-    # Without its flags it would become a part of the widget, and be seen.
+    # The flags keep it a separate, hidden window.
     plot.ctrlMenu.setParent(plot.getViewWidget(), plot.ctrlMenu.windowFlags())
 
 
-#: Dashes that go with the colours of curves, so that colour is never the only difference.
-DASHES = (
-    Qt.PenStyle.SolidLine,
-    Qt.PenStyle.DashLine,
-    Qt.PenStyle.DotLine,
-    Qt.PenStyle.DashDotLine,
-    Qt.PenStyle.DashDotDotLine,
-)
-
-
 class Plot(pg.PlotWidget):  # type: ignore[misc]
-    """Axes with a label and a unit each; no grid, for drawing one costs ten times as much as all curves.
+    """A plot for live curves; ``x`` and ``y`` are the labels of the axes, with units.
 
-    Parameters
-    ----------
-    theme
-        Colours and fonts.
-    name
-        What it shows, for screen readers.
-    x, y
-        Labels with units.
+    It has no grid, which takes ten times as long to draw as the curves.
     """
 
     def __init__(self, theme: Theme, name: str, x: str, y: str) -> None:
@@ -55,15 +46,14 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         self.setMinimumSize(120, 64)
         for side in ("left", "bottom"):
-            axis = self.getAxis(side)
-            axis.enableAutoSIPrefix(False)
+            self.getAxis(side).enableAutoSIPrefix(False)
         theme.changed.connect(self.apply_theme)
         self.apply_theme()
 
     def curve(self, number: int, *, alone: bool = False, **options: Any) -> Any:
-        """A new curve in colour and dash ``number``, solid when it is ``alone``.
+        """Add a curve in colour and dash ``number``, solid if ``alone``.
 
-        The pen's width is 1, for wider ones cost five times as much.
+        The line width is 1, because wider lines take five times as long to draw.
         """
         item = pg.PlotDataItem(pen=self._pen(number, alone), **options)
         self.addItem(item)
@@ -71,11 +61,10 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         return item
 
     def pin_left_axis(self, characters: int = 6) -> None:
-        """Keep the left axis as wide as its numbers may become, so that plots above each other align."""
+        """Fix the width of the left axis, so that plots above each other are aligned."""
         self.getAxis("left").setWidth(self._theme.pixels(9 * characters))
 
     def hide_bottom_label(self) -> None:
-        """The plot below says what the axis is."""
         del self._labels["bottom"]
         self.getAxis("bottom").showLabel(False)
 
@@ -84,7 +73,6 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         return pg.mkPen(self._theme.series(number), width=1, style=dash)
 
     def apply_theme(self) -> None:
-        """Take the theme's colours and fonts."""
         colours = self._theme.colours
         self.setBackground(colours.field)
         small = self._theme.font(0.85)
@@ -94,92 +82,121 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
             axis.setTextPen(colours.muted)
             axis.setTickFont(small)
         for side, label in self._labels.items():
-            axis = self.getAxis(side)
-            axis.setLabel(label, color=colours.muted, **{"font-size": f"{small.pointSizeF():.1f}pt"})
+            size = f"{small.pointSizeF():.1f}pt"
+            self.getAxis(side).setLabel(label, color=colours.muted, **{"font-size": size})
         for item, number, alone in self._curves:
             item.setPen(self._pen(number, alone))
 
 
-#: Markers and dashes by number of the curve, with the character that stands for each in words.
-MARKERS = (("o", "●"), ("s", "■"), ("t1", "▲"), ("d", "◆"), ("t", "▼"), ("star", "★"))
+class TimeSeriesBuffer:
+    """Times and values of the last ``size`` entries."""
+
+    def __init__(self, size: int) -> None:
+        self._times = np.full(2 * size, np.nan)
+        self._values = np.full(2 * size, np.nan)
+        self._size, self._end = size, 0
+
+    def add(self, time: float, value: float) -> None:
+        """Add an entry; times in seconds, increasing."""
+        if self._end == self._times.size:
+            for buffer in (self._times, self._values):
+                buffer[: self._size] = buffer[self._size :]
+            self._end = self._size
+        self._times[self._end], self._values[self._end] = time, value
+        self._end += 1
+
+    def clear(self) -> None:
+        self._end = 0
+
+    @property
+    def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times and values ``(n,)``, oldest first; views that the next :meth:`add` may overwrite."""
+        part = slice(max(self._end - self._size, 0), self._end)
+        return self._times[part], self._values[part]
 
 
-def style_axis(
-    theme: Theme,
-    axis: pg.AxisItem,
-    label: str,
-    unit: str = "",
-    colour: QColor | None = None,
-    stacked: bool = False,
-) -> None:
-    """Give an axis its words and colours; the unit in brackets, ``stacked`` on a line of its own."""
+class StripChart(Plot):
+    """A quantity over the last ``span_s`` seconds."""
+
+    def __init__(self, theme: Theme, name: str, y: str, span_s: float = 120.0, number: int = 0) -> None:
+        super().__init__(theme, name, "time before now [s]", y)
+        self.span_s = span_s
+        self._line = self.curve(number, alone=True, connect="finite")
+        self.setXRange(-span_s, 0, padding=0.0)
+        self.getPlotItem().enableAutoRange(axis="y")
+        self.pin_left_axis()
+
+    def show_history(self, history: TimeSeriesBuffer, now: float) -> None:
+        times, values = history.arrays
+        recent = times > now - self.span_s
+        self._line.setData(times[recent] - now, values[recent])
+
+
+class PlotGrid(pg.GraphicsLayoutWidget):  # type: ignore[misc]
+    """Plots above each other, with grid lines, rebuilt by the subclass in :meth:`build`."""
+
+    def __init__(self, theme: Theme) -> None:
+        super().__init__()
+        self._theme = theme
+        theme.changed.connect(self.build)
+
+    def build(self) -> None:
+        """Remove all plots. A subclass extends this method to add its plots, in the colours of the theme."""
+        for item in tuple(self.ci.items):
+            if isinstance(item, pg.PlotItem):
+                item.ctrlMenu.deleteLater()
+        self.clear()
+        self.setBackground(self._theme.colour("field"))
+
+    def add_plot(self, row: int = 0) -> pg.PlotItem:
+        """Add a plot without menu and mouse interaction."""
+        plot = self.addPlot(row=row, col=0, enableMenu=False)
+        reparent_menu(plot)
+        plot.hideButtons()
+        plot.setMouseEnabled(x=False, y=False)
+        plot.showGrid(x=True, y=True, alpha=0.18)
+        return plot
+
+
+def style_axis(theme: Theme, axis: pg.AxisItem, label: str, colour: QColor | None = None) -> None:
+    """Set label and colours of an axis."""
     text = theme.colour("text") if colour is None else colour
     axis.setPen(theme.colour("line"))
     axis.setTextPen(text)
     axis.setTickFont(theme.font(0.85))
     axis.enableAutoSIPrefix(False)
-    size = f"{theme.font(0.9).pointSizeF()}pt"
-    words = f"{label}<br>[{unit}]" if unit and stacked else f"{label} [{unit}]" if unit else label
-    axis.setLabel(words, color=text.name(), **{"font-size": size})
-
-
-def add_plot(grid: pg.GraphicsLayoutWidget, row: int = 0) -> pg.PlotItem:
-    """A plot in a row of a grid, without menus and hands."""
-    plot = grid.addPlot(row=row, col=0, enableMenu=False)
-    reparent_menu(plot)
-    plot.hideButtons()
-    plot.setMouseEnabled(x=False, y=False)
-    plot.showGrid(x=True, y=True, alpha=0.18)
-    return plot
-
-
-def clear(grid: pg.GraphicsLayoutWidget) -> None:
-    """Take the plots out of a grid, with the menus that they leave behind."""
-    for item in tuple(grid.ci.items):
-        if isinstance(item, pg.PlotItem):
-            item.ctrlMenu.deleteLater()
-    grid.clear()
+    axis.setLabel(label, color=text.name(), **{"font-size": f"{theme.font(0.9).pointSizeF()}pt"})
 
 
 @dataclass(slots=True, eq=False)
 class ErrorCurve:
-    """A line with markers and error bars, made once and filled again and again.
-
-    Parameters
-    ----------
-    line
-        Markers and the line between them.
-    bars
-        Error bars.
-    """
+    """A line with markers, and error bars."""
 
     line: pg.PlotDataItem
     bars: pg.ErrorBarItem
 
     @classmethod
     def make(cls, theme: Theme, number: int, *, joined: bool = True, size: float = 6.0) -> ErrorCurve:
-        """Curve ``number`` of a plot, in its colour, marker and dash."""
+        """Create a curve in colour, marker and dash ``number``; without a line unless ``joined``."""
         colour = theme.series(number)
         pen = pg.mkPen(colour, width=1, style=DASHES[number % len(DASHES)]) if joined else None
         line = pg.PlotDataItem(
             pen=pen, symbol=MARKERS[number % len(MARKERS)][0], symbolSize=size, symbolBrush=colour,
             symbolPen=None, connect="finite",
         )  # fmt: skip
-        bars = pg.ErrorBarItem(
-            x=np.zeros(1), y=np.zeros(1), height=np.zeros(1), pen=pg.mkPen(colour, width=1)
-        )
+        zero = np.zeros(1)
+        bars = pg.ErrorBarItem(x=zero, y=zero, height=zero, pen=pg.mkPen(colour, width=1))
         bars.setVisible(False)
         return cls(line, bars)
 
     def add_to(self, box: Any) -> None:
-        """Put it into a plot or a view box."""
         box.addItem(self.bars)
         box.addItem(self.line)
 
     def set(
         self, x: NDArray[Any], y: NDArray[np.float64], sigma: NDArray[np.float64] | None, cap: float = 0.0
     ) -> None:
-        """Other points; errors that are not finite have no bar."""
+        """Set points ``(n,)`` and standard errors; errors that are not finite have no bar."""
         drawn = np.isfinite(y).any()
         self.line.setData(np.asarray(x, float) if drawn else np.zeros(0), y if drawn else np.zeros(0))
         known = np.isfinite(y) & np.isfinite(sigma) if sigma is not None else np.zeros(y.shape, bool)
@@ -189,30 +206,21 @@ class ErrorCurve:
 
 
 class ErrorBand:
-    """A line with a translucent band of one standard error.
-
-    Parameters
-    ----------
-    colour
-        Of line and band.
-    width
-        Of the line, in pixels.
-    """
+    """A line with a translucent band of one standard error."""
 
     def __init__(self, colour: QColor, width: float = 1.0) -> None:
-        veil = QColor(colour)
-        veil.setAlphaF(0.22)
+        translucent = QColor(colour)
+        translucent.setAlphaF(0.22)
         self.line = pg.PlotDataItem(pen=pg.mkPen(colour, width=width), connect="finite")
         self._low, self._high = pg.PlotCurveItem(pen=None), pg.PlotCurveItem(pen=None)
-        self.fill = pg.FillBetweenItem(self._low, self._high, brush=veil)
+        self.fill = pg.FillBetweenItem(self._low, self._high, brush=translucent)
 
     def add_to(self, box: Any) -> None:
-        """Put it into a plot or a view box."""
         for item in (self.fill, self._low, self._high, self.line):
             box.addItem(item)
 
     def set(self, x: NDArray[Any], y: NDArray[np.float64], sigma: NDArray[np.float64]) -> None:
-        """Another course; where its error is not known there is no band."""
+        """Set points ``(n,)`` and standard errors; errors that are not finite have no band."""
         x = np.asarray(x, float)
         self.line.setData(x, y)
         known = np.isfinite(y) & np.isfinite(sigma)
@@ -225,6 +233,6 @@ class ErrorBand:
 def reference_line(
     theme: Theme, value: float, *, horizontal: bool, colour: QColor | None = None
 ) -> pg.InfiniteLine:
-    """A dashed reference line."""
+    """A dashed straight line."""
     pen = pg.mkPen(colour or theme.colour("muted"), width=1, style=Qt.PenStyle.DashLine)
     return pg.InfiniteLine(value, angle=0 if horizontal else 90, pen=pen)

@@ -12,9 +12,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
+from escape_hw.config.renamed import update_document
+from escape_hw.config.system import SystemConfig
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.io.fits.run_state import RunState, load_state, save_state
 
@@ -126,7 +129,7 @@ def _require_same_run(path: Path, saved: Mapping[str, Any], now: Mapping[str, An
                 f"{path}: its {names.get(key, key)} is {saved.get(key)!r}, this run's is {now[key]!r}; "
                 "resume it as it was begun, or begin anew"
             )
-    changed = sorted(_changed_keys(str(saved.get("configuration", "")), now["configuration"]))
+    changed = sorted(_changed_keys(path, str(saved.get("configuration", "")), now["configuration"]))
     if changed:
         more = f" and {len(changed) - _MAX_LISTED} more" if len(changed) > _MAX_LISTED else ""
         raise IncompatibleProduct(
@@ -137,9 +140,17 @@ def _require_same_run(path: Path, saved: Mapping[str, Any], now: Mapping[str, An
         raise IncompatibleProduct(f"{path}: its modal basis is not this system's; begin anew")
 
 
-def _changed_keys(one: str, other: str) -> set[str]:
-    """Keys whose values differ between two configurations as TOML text."""
-    a, b = dict(_flatten_keys(tomllib.loads(one))), dict(_flatten_keys(tomllib.loads(other)))
+def _changed_keys(path: Path, saved: str, now: str) -> set[str]:
+    """Keys whose values differ between the configuration of a state file and the present one (TOML text)."""
+    document = tomllib.loads(saved)
+    update_document(document)
+    try:
+        config = SystemConfig.model_validate(document)
+    except ValidationError as error:
+        raise IncompatibleProduct(
+            f"{path}: its configuration is not valid in this version: {error}"
+        ) from error
+    a, b = dict(_flatten_keys(tomllib.loads(config.to_toml()))), dict(_flatten_keys(tomllib.loads(now)))
     return {key for key in a.keys() | b.keys() if a.get(key) != b.get(key)}
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.config.choices import PokePattern
+from escape_hw.config.renamed import present_value
 
 #: How strongly shaped pokes alternate in sign. More gains little (:func:`~.pokes.information_gain`) and asks
 #: the mirror for ever larger steps.
@@ -77,7 +78,8 @@ class AnticorrelatedPokes(RandomPokes):
 
 def select_random_pokes(kind: PokePattern) -> type[PokeSequence]:
     """The random pokes that the configuration asks for (``calibration.pokes``)."""
-    return AnticorrelatedPokes if kind == "shaped" else RandomPokes
+    kind = present_value("calibration.pokes", kind)
+    return AnticorrelatedPokes if kind == "anticorrelated" else RandomPokes
 
 
 class PushPullPokes:

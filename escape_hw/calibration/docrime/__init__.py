@@ -1,1 +1,5 @@
-"""DO-CRIME: estimation of interaction matrix, temporal response and whitening filter from random pokes, and the open- and closed-loop measurements. The numerics are pure; ``acquisition``, ``open_loop`` and ``closed_loop`` move hardware."""
+"""DO-CRIME: interaction matrix, temporal response and whitening filter from random pokes.
+
+The numerics are pure; ``acquisition``, ``open_loop`` and ``closed_loop`` move hardware. The mode-by-mode
+methods are in ``push_pull``.
+"""

@@ -132,7 +132,7 @@ def fit_recorded_frames(
     data = telemetry_from_frames(*record, before=2 * c.whiten_order + c.lags)
     fit = yield from fit_telemetry(
         data, template, bench.model(grid), order=order, lags=c.lags, learning_rate=c.learning_rate,
-        solver=c.solver, loss=c.loss, also=c.also, actuators=c.actuators,
+        solver=c.solver, loss=c.loss, also=c.extra_parameters, actuators=c.actuator_model,
     )  # fmt: skip
     return fit
 
@@ -245,8 +245,8 @@ def calibrate_short_run_closed_loop(
     fit = yield from fit_telemetry(
         data, closed_loop.matrix, bench.model(geometry), order=order, lags=c.lags, known=closed_loop.response,
         start=None if registration is None else registration.registration,
-        learning_rate=c.learning_rate, solver=c.solver, loss=c.loss, also=c.also,
-        actuators=c.actuators,
+        learning_rate=c.learning_rate, solver=c.solver, loss=c.loss, also=c.extra_parameters,
+        actuators=c.actuator_model,
     )  # fmt: skip
     result = build_short_run_result(
         bench, fit, geometry, closed_loop.matrix.m2c, frames=frames, lost=buffer.lost, poke=float(poke), order=order,

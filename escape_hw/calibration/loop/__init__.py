@@ -1,1 +1,4 @@
-"""The closed loop of the procedures: running it frame by frame, its controller and live settings, its divergence rules, its performance and the search for its gain. The pure controller and reconstructor are in ``escape_hw.pipeline``."""
+"""The closed loop of the procedures: execution, live settings, divergence rules, performance, gain search.
+
+The pure controller and reconstructor are in ``escape_hw.pipeline``.
+"""

@@ -163,7 +163,7 @@ def build_extra_parameters(
     if "pupil_shift" in also:
         if not isinstance(model, HasPupilShift):
             raise ConfigError(
-                f"calibration.also: the model '{model.name}' of this sensor knows no shift of the pupil; "
+                f"calibration.extra_parameters: the model '{model.name}' of this sensor knows no shift of the pupil; "
                 "it is for a pyramid and calibration.model = 'fast'"
             )
         parameters.append(PupilShift(model, model.with_pupil_shift(_PUPIL_SHIFT_SIGMA, 0.0), "pupil_shift_x"))

@@ -37,6 +37,7 @@ from escape_hw.config.choices import (
     ModesChoice,
     Solver,
 )
+from escape_hw.config.renamed import present_value
 from escape_hw.config.system import CalibrationSection
 from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 
@@ -58,9 +59,9 @@ def sprint_options_from_config(section: CalibrationSection) -> SprintOptions:
         "modes_choice": section.modes_choice,
         "solver": section.solver,
         "loss": section.loss,
-        "actuators": section.actuators,
+        "actuators": section.actuator_model,
         "learning_rate": section.learning_rate,
-        "also": section.also,
+        "also": section.extra_parameters,
     }
 
 
@@ -98,7 +99,7 @@ def fit_registration(
     *,
     modes: NDArray[np.intp] | int | None = None,
     modes_choice: ModesChoice = "snr",
-    solver: Solver = "effects",
+    solver: Solver = "mixed-effects",
     loss: Loss = "squares",
     learning_rate: float = 1.0,
     start: Registration | None = None,
@@ -108,7 +109,7 @@ def fit_registration(
     update_priors: bool = False,
     coarse_search: bool = True,
     also: Sequence[ExtraParameter] = (),
-    actuators: ActuatorModel = "found",
+    actuators: ActuatorModel = "fitted",
 ) -> Procedure[SprintFit]:
     """Registration, gain and their standard errors from an interaction matrix.
 
@@ -123,10 +124,10 @@ def fit_registration(
     choice
         Which are the best, see :func:`~.mode_choice.choose_modes`.
     solver
-        ``"effects"``: with all that the model does not know as random effects. ``"light"``: gain and
+        ``"mixed-effects"``: with all that the model does not know as random effects. ``"registration-only"``: gain and
         registration are the only unknowns; several times faster and as good on a mirror that is like its
         model, less accurate on a real one, and its error bars know nothing of unequal actuators.
-        ``"frozen"``: the same with the derivatives of the start. ``"batches"``: the paper's, a few modes at
+        ``"frozen-derivatives"``: the same with the derivatives of the start. ``"batches"``: the paper's, a few modes at
         a time (:mod:`~.batches`). ``"diagonal"``: the original's gain for every mode (:mod:`~.diagonal`).
     loss
         ``"squares"``, or ``"huber"``: sub-apertures that do not fit in with the others count less
@@ -150,10 +151,10 @@ def fit_registration(
         Whether to come from afar first, low modes before high ones (:mod:`~.capture`). Without it the
         descent is from ``start`` alone, on all modes at once.
     also
-        What to fit beside the registration (:mod:`~.build_extra_parameters`), by the solver ``"effects"``.
+        What to fit beside the registration (:mod:`~.build_extra_parameters`), by the solver ``"mixed-effects"``.
     actuators
-        ``"solution"``: the estimate keeps what was found of every actuator, and a matrix made from it has it,
-        too. ``"alike"``: it does not, and the matrix is that of the model's actuators. The fit is the same.
+        ``"fitted"``: the estimate keeps what was found of every actuator, and a matrix made from it has it,
+        too. ``"nominal"``: it does not, and the matrix is that of the model's actuators. The fit is the same.
 
     Returns
     -------
@@ -174,13 +175,15 @@ def fit_registration(
     """
     if not 0 < learning_rate <= 1:
         raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
+    solver = present_value("calibration.solver", solver)
+    actuators = present_value("calibration.actuator_model", actuators)
     _require_one_of("solver", solver, SOLVERS)
     _require_one_of("choice", modes_choice, MODES_CHOICES)
     _require_one_of("loss", loss, LOSSES)
-    if also and solver != "effects":
+    if also and solver != "mixed-effects":
         raise ConfigError(
-            f"calibration.solver = '{solver}' fits gain and registration alone; what calibration.also "
-            "asks for takes solver = 'effects'"
+            f"calibration.solver = '{solver}' fits gain and registration alone; what calibration.extra_parameters "
+            "asks for takes solver = 'mixed-effects'"
         )
     _require_one_of("actuators", actuators, ACTUATOR_MODELS)
     initial = start or Registration()
@@ -205,7 +208,7 @@ def fit_registration(
             weighted = without_huber.with_slope_weights(robust_weights)
             solution = yield from solve(context, weighted, solution.alpha, False)
         estimate = _build_estimate(context, weighted, solution, covariance)
-        if actuators == "found" and solution.actuator_corrections is not None:
+        if actuators == "fitted" and solution.actuator_corrections is not None:
             estimate = replace(estimate, actuator_corrections=solution.actuator_corrections())
     yield context.progress(estimate.sigma)
     return SprintFit(estimate, solution.zonal_matrix, solution.estimate_priors)

@@ -138,7 +138,7 @@ def solve(
         steps = BatchProblem(weighted, model, rate).descend(start, max_iterations)
         fit, added_covariance = yield from _record_steps(steps, context)
         return _solution_from_least_squares(fit, model, added_covariance)
-    frozen = context.solver == "frozen"
+    frozen = context.solver == "frozen-derivatives"
     if coarse_search:
         search = search_registration(
             context.matrix, model, context.columns, start, max_iterations, rate, frozen
@@ -146,11 +146,11 @@ def solve(
         least_squares_fit = yield from _record_steps(search, context)
         start = least_squares_fit.alpha
     # From afar all slopes count, those that the model is none of, too.
-    if context.solver != "effects" and (not coarse_search or isinstance(model, HasSlopeWeights)):
+    if context.solver != "mixed-effects" and (not coarse_search or isinstance(model, HasSlopeWeights)):
         least_squares_fit = yield from _record_steps(
             LeastSquaresProblem(weighted, model, rate, frozen).descend(start, max_iterations), context
         )
-    if context.solver != "effects":
+    if context.solver != "mixed-effects":
         return _solution_from_least_squares(least_squares_fit, model)
     problem = MixedEffectsProblem(weighted, model, context.priors, extras=context.extras)
     return (yield from _fit_mixed_effects(problem, Registration.from_array(start), context))

@@ -131,10 +131,10 @@ def fit_telemetry(
     start: Registration | None = None,
     known: TemporalResponse | None = None,
     learning_rate: float = 1.0,
-    solver: Solver = "effects",
+    solver: Solver = "mixed-effects",
     loss: Loss = "squares",
     also: Sequence[ExtraParameter] = (),
-    actuators: ActuatorModel = "found",
+    actuators: ActuatorModel = "fitted",
 ) -> Procedure[TelemetryFit]:
     """Registration, gain and temporal response from a stretch of telemetry.
 
@@ -190,7 +190,7 @@ def fit_telemetry(
             solver=solver, loss=loss, start=start, learning_rate=learning_rate,
             covariance=covariance, priors=priors, coarse_search=start is None, also=also,
             # Single actuators are looked for once, in the end.
-            actuators=actuators if number == rounds - 1 else "alike",
+            actuators=actuators if number == rounds - 1 else "nominal",
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal_matrix() @ template.m2c

@@ -37,16 +37,16 @@ class AlarmMonitor:
     ----------
     start
         Registration that tracking began with.
-    largest_shift
+    max_shift
         How far the mirror may shift before a new calibration is due, % of a sub-aperture.
     response
         The temporal response that the matrix was measured with, where it is known.
     """
 
     def __init__(
-        self, start: Registration, largest_shift: float, response: TemporalResponse | None = None
+        self, start: Registration, max_shift: float, response: TemporalResponse | None = None
     ) -> None:
-        self._start, self._largest_shift, self._response = start.to_array(), largest_shift, response
+        self._start, self._max_shift, self._response = start.to_array(), max_shift, response
         self._noise: deque[float] = deque(maxlen=_BASELINE_UPDATES)
         self._misfit: deque[float] = deque(maxlen=_BASELINE_UPDATES)
         self._last: dict[str, int] = {}
@@ -104,10 +104,10 @@ class AlarmMonitor:
                 "disable it (devices.dm.limits.disabled) if it is dead"
             )
         moved = float(np.abs(live.registration.registration.to_array() - self._start)[:2].max())
-        if moved > self._largest_shift:
+        if moved > self._max_shift:
             new_alarms["limit"] = (
                 f"the mirror has shifted by {moved:.0f} % of a sub-aperture since the start, more than "
-                f"tracking.largest_shift ({self._largest_shift:g}); calibrate anew"
+                f"tracking.max_shift ({self._max_shift:g}); calibrate anew"
             )
         return new_alarms
 

@@ -224,7 +224,7 @@ class _Tracker:
         self.response, self.memory = response, memory_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
         self.in_use = ActiveReconstructor(matrix, invert_matrix(matrix, self.dropped), start, 1.0)
-        self.alarm_monitor = AlarmMonitor(start.registration, t.largest_shift, response)
+        self.alarm_monitor = AlarmMonitor(start.registration, t.max_shift, response)
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         self.buffer = TelemetryBuffer(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
@@ -343,7 +343,7 @@ class _Tracker:
         except TooFewFrames:
             return None
         synthetic = synthesise_calibration(self.bench, self.grid, live.registration, self.in_use.matrix.m2c)
-        worth = self.bench.config.tracking.worth
+        worth = self.bench.config.tracking.exchange_threshold
         proposal = propose_exchange(
             synthetic.matrix, self.model, live, self.in_use, self.dropped, seconds, worth
         )
@@ -380,7 +380,7 @@ class _Tracker:
 
     def _exchange_matrix(self, proposal: ExchangeProposal, running: bool) -> bool:
         """Take a matrix into use, or only propose it."""
-        limit = self.bench.config.tracking.limit
+        limit = self.bench.config.tracking.exchange_limit
         allowed = running and self.exchange and proposal.evidence.mismatch <= limit
         self.result.exchanges.append(accept_proposal(proposal) if allowed else proposal.evidence)
         if allowed:

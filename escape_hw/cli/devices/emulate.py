@@ -13,7 +13,7 @@ from escape_hw.cli.context import CommandContext, command_context
 if TYPE_CHECKING:
     from escape_hw.api.emulator import Emulator
 
-#: How often new complaints are looked for, in seconds.
+#: Period in seconds at which new protocol violations are reported.
 _POLL_S = 0.2
 
 
@@ -48,7 +48,7 @@ def emulate(
         request = EmulatorRequest(host, port, pty, dict(map(_parse_option, option or ())))
         emulator = emulator_factory(name)(request)
         context.result({**document, "emulator": name, **_serve(context, name, emulator, seconds)})
-        if emulator.complaints:
+        if emulator.violations:
             context.code = context.code or 1
 
 
@@ -70,19 +70,21 @@ def _serve(context: CommandContext, name: str, emulator: Emulator, seconds: floa
     try:
         context.notify(f"{name}: {address}")
         while deadline is None or time.monotonic() < deadline:
-            n_reported = _report_new_complaints(context, name, emulator, n_reported)
+            n_reported = _report_new_violations(context, name, emulator, n_reported)
             time.sleep(_POLL_S if deadline is None else min(_POLL_S, max(deadline - time.monotonic(), 0)))
     except KeyboardInterrupt:
         context.notify(f"{name}: stopped")
     finally:
         emulator.stop()
-    _report_new_complaints(context, name, emulator, n_reported)
-    return {"address": address, "complaints": list(emulator.complaints), **emulator.report()}
+    _report_new_violations(context, name, emulator, n_reported)
+    violations = list(emulator.violations)
+    # "complaints" is the name of version 0.1.0.
+    return {"address": address, "violations": violations, "complaints": violations, **emulator.report()}
 
 
-def _report_new_complaints(context: CommandContext, name: str, emulator: Emulator, n_reported: int) -> int:
-    """Tell the complaints after number ``n_reported``; returns how many are told by now."""
-    complaints = emulator.complaints
-    for complaint in complaints[n_reported:]:
-        context.notify(f"{name}: complaint: {complaint}")
-    return len(complaints)
+def _report_new_violations(context: CommandContext, name: str, emulator: Emulator, n_reported: int) -> int:
+    """Report the violations after the first ``n_reported``; returns their present number."""
+    violations = emulator.violations
+    for violation in violations[n_reported:]:
+        context.notify(f"{name}: protocol violation: {violation}")
+    return len(violations)

@@ -1,1 +1,1 @@
-"""Commands for configurations, the server, the window, keys, streams, benchmarks and the set-up of the computer."""
+"""Commands for configurations, server, window, keys, streams, benchmarks, set-up of the computer."""

@@ -13,7 +13,7 @@ from escape_hw.cli.context import command_context
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
-config_app = typer.Typer(help="Check, start and describe configurations.", no_args_is_help=True)
+config_app = typer.Typer(help="Check, create and describe configurations.", no_args_is_help=True)
 
 
 def systems(json: options.Json = False) -> None:
@@ -35,13 +35,9 @@ def systems(json: options.Json = False) -> None:
 
 def _describe(config: SystemConfig) -> dict[str, Any]:
     return {
-        "name": config.system.name,
-        "description": config.system.description,
-        "mode": config.system.mode,
-        "sensor": config.sensor.kind,
-        "n_act": config.devices.dm.n_act,
-        "n_modes": config.basis.n_modes,
-    }
+        "name": config.system.name, "description": config.system.description, "mode": config.system.mode,
+        "sensor": config.sensor.kind, "n_act": config.devices.dm.n_act, "n_modes": config.basis.n_modes,
+    }  # fmt: skip
 
 
 @config_app.command("check")
@@ -52,12 +48,12 @@ def check(
     mode: options.Mode = None,
     json: options.Json = False,
 ) -> None:
-    """Check a configuration; tells every mistake at once with file, line, key and allowed range."""
+    """Check a configuration; reports all errors with file, line, key and allowed range."""
     with command_context("config check", json=json) as context:
         from escape_hw.io.documents import header_fields
 
         config = context.load_config(options.SystemSelection.of(file, set, seed, mode))
-        context.show(f"{file}: sound ({config.system.name}, mode {config.system.mode})")
+        context.show(f"{file}: valid ({config.system.name}, mode {config.system.mode})")
         document = header_fields("config check", config.system.name, config.simulated, config.system.seed)
         context.result({**document, "file": file, "valid": True})
 
@@ -65,13 +61,13 @@ def check(
 @config_app.command("init")
 def init(
     name: Annotated[str, typer.Argument(help="Name of the new system.")] = "my-system",
-    base: Annotated[str, typer.Option("--base", help="System whose values it starts with.")] = "razor-shwfs",
+    base: Annotated[str, typer.Option("--base", help="System whose values are used.")] = "razor-shwfs",
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="File to write (default: standard output).")
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Start a configuration: every key with what it means, its unit and its range."""
+    """Write a new configuration: every key with its meaning, unit and range."""
     with command_context("config init", json=json) as context:
         from escape_hw.config.templates import starter_text
         from escape_hw.errors import ConfigError
@@ -93,8 +89,7 @@ def init(
 
 @config_app.command("schema")
 def schema(json: options.Json = False) -> None:
-    """Print the JSON schema of the system files, for editors that check while you type."""
-    # The schema is one JSON document in any case.
+    """Print the JSON schema of the system files, for editors."""
     with command_context("config schema", json=True) as context:
         from escape_hw.config.templates import json_schema
 

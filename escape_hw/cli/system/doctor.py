@@ -21,9 +21,9 @@ def doctor(
     mode: options.Mode = None,
     json: options.Json = False,
 ) -> None:
-    """Look whether this computer can drive real devices; opens none.
+    """Check that this computer is set up for real devices. Opens none.
 
-    Exit codes of its own: 0 all is well, 1 something is not as it should be, 2 something will not work.
+    Exit codes: 0 no finding, 1 warnings, 2 errors.
     """
     with command_context("doctor", json=json) as context:
         from escape_hw.io.documents import header_fields

@@ -1,4 +1,4 @@
-"""``escape gui``: the window; it lives in a package of its own, which is found by its entry point."""
+"""``escape gui`` and ``escape replay``: start the window, which is found by its entry point."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ def gui(
     system: Annotated[
         str | None,
         typer.Argument(
-            help="System whose server to look at; one is started on the twin where none runs. Or a "
-            "recording: a FITS product, the folder of a run."
+            help="System to connect to; its server is started in simulation if none runs. Or a recording: "
+            "a FITS product or a run folder."
         ),
     ] = None,
     connect: Annotated[
-        str | None, typer.Option("--connect", metavar="ADDRESS", help="Look at this server: tcp://HOST:PORT.")
+        str | None, typer.Option("--connect", metavar="ADDRESS", help="Connect to this server: tcp://HOST:PORT.")
     ] = None,
     screenshot: Annotated[
         Path | None,
-        typer.Option("--screenshot", metavar="FILE", help="Take a picture of the window, and end."),
+        typer.Option("--screenshot", metavar="FILE", help="Save an image of the window and exit."),
     ] = None,
     reset_settings: Annotated[
-        bool, typer.Option("--reset-settings", help="Forget look and layout of the last time.")
+        bool, typer.Option("--reset-settings", help="Discard the saved appearance and layout.")
     ] = False,
 ) -> None:
-    """Show the window: live views, calibrations, the loop."""
+    """Open the window: live views, calibrations, the loop."""
     with command_context("gui") as context:
         from escape_hw.config.registry import window_runner
         from escape_hw.errors import ConfigError
 
         if system and connect:
-            raise ConfigError("a system or --connect, not both: an address says which system it is")
+            raise ConfigError("give a system or --connect, not both")
         context.code = window_runner()(system or "", connect or "", screenshot, reset_settings)
 
 
 def replay(
-    recording: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or a FITS product.")],
+    recording: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder or FITS product.")],
     screenshot: Annotated[
         Path | None,
-        typer.Option("--screenshot", metavar="FILE", help="Take a picture of the window, and end."),
+        typer.Option("--screenshot", metavar="FILE", help="Save an image of the window and exit."),
     ] = None,
 ) -> None:
-    """Show a finished run in the window, step by step if wanted."""
+    """Replay a finished run in the window."""
     with command_context("replay") as context:
         from escape_hw.config.registry import window_runner
         from escape_hw.errors import ProductError

@@ -1,4 +1,4 @@
-"""``escape keys``: who may reach a server from another machine."""
+"""``escape keys``: keys for connections between computers."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from escape_hw.cli import options
 from escape_hw.cli.context import command_context
 
 app = typer.Typer(
-    no_args_is_help=True, help="Keys for servers and clients on different machines (escape serve --bind)."
+    no_args_is_help=True, help="Keys for servers and clients on different computers (escape serve --bind)."
 )
 #: A key may begin with a minus sign.
 _ANY = {"ignore_unknown_options": True}
-Name = Annotated[str, typer.Argument(help="What to call it.")]
+Name = Annotated[str, typer.Argument(help="Name of the client or server.")]
 Key = Annotated[str, typer.Argument(help="Its public key, 40 characters.")]
 
 
@@ -27,27 +27,27 @@ def _document(**content: Any) -> dict[str, Any]:
 @app.command("make")
 def make(
     replace: Annotated[
-        bool, typer.Option("--replace", help="Make new ones; the old ones open nothing.")
+        bool, typer.Option("--replace", help="Replace existing keys, which become invalid.")
     ] = False,
     json: options.Json = False,
 ) -> None:
-    """Make your keys, and tell the public one."""
+    """Create your key pair and print the public key."""
     with command_context("keys", json=json) as context:
         from escape_hw.remote.keys import keys_folder, make_keys
 
         public = make_keys(replace).public.decode()
         context.result(_document(public=public, folder=str(keys_folder())))
-        context.show(f"public key: {public}", f"(in {keys_folder()}; the secret one never leaves it)")
-        # Keys hold characters that mean something to a shell, but never a single quote.
+        context.show(f"public key: {public}", f"(in {keys_folder()}; the secret key stays there)")
+        # Keys contain shell metacharacters, but no single quote.
         context.show(
-            f"at a server that shall let you in: escape keys allow NAME '{public}'",
-            f"at a client of your server: escape keys trust HOST '{public}'",
+            f"on the server that you connect to: escape keys allow NAME '{public}'",
+            f"on clients of your server: escape keys trust HOST '{public}'",
         )
 
 
 @app.command("list")
 def list_keys(json: options.Json = False) -> None:
-    """Your public key, the clients that you let in, the servers that you trust."""
+    """List your public key, the allowed clients and the trusted servers."""
     with command_context("keys", json=json) as context:
         from escape_hw.remote.keys import allowed_keys, own_keys, trusted_keys
 
@@ -65,18 +65,18 @@ def list_keys(json: options.Json = False) -> None:
 
 @app.command("allow", context_settings=_ANY)
 def allow(name: Name, key: Key, json: options.Json = False) -> None:
-    """Let a client in to your servers; counts at once."""
+    """Allow a client to connect to your servers, at once."""
     with command_context("keys", json=json) as context:
         from escape_hw.remote import keys
 
         keys.allow(name, key)
         context.result(_document(allowed=name))
-        context.show(f"{name} is let in")
+        context.show(f"{name} is allowed")
 
 
 @app.command("trust", context_settings=_ANY)
 def trust(host: Name, key: Key, json: options.Json = False) -> None:
-    """Take the server on a host for the right one when it has this key."""
+    """Trust the server on a host if it has this key."""
     with command_context("keys", json=json) as context:
         from escape_hw.remote import keys
 
@@ -85,14 +85,22 @@ def trust(host: Name, key: Key, json: options.Json = False) -> None:
         context.show(f"the server on {host} is trusted")
 
 
-@app.command("forget")
-def forget(name: Name, json: options.Json = False) -> None:
-    """Let a client in no longer, trust a server no longer."""
+@app.command("remove")
+def remove(name: Name, json: options.Json = False) -> None:
+    """Remove an allowed client or a trusted server."""
     with command_context("keys", json=json) as context:
         from escape_hw.errors import ConfigError
         from escape_hw.remote import keys
 
-        if not keys.forget(name):
-            raise ConfigError(f"'{name}' is neither a client that is let in nor a server that is trusted")
-        context.result(_document(forgotten=name))
-        context.show(f"{name} is forgotten")
+        if not keys.remove(name):
+            raise ConfigError(f"'{name}' is neither an allowed client nor a trusted server")
+        # "forgotten" is the key of version 0.1.0.
+        context.result(_document(removed=name, forgotten=name))
+        context.show(f"{name} is removed")
+
+
+@app.command("forget", hidden=True)
+def forget(name: Name, json: options.Json = False) -> None:
+    """Deprecated name of ``remove``."""
+    typer.echo("escape keys forget is now called escape keys remove", err=True)
+    remove(name, json)

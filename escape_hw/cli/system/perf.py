@@ -133,14 +133,14 @@ def run_benchmarks(stages: Sequence[str] = ()) -> list[BenchmarkRow]:
     ConfigError
         A stage does not exist.
     """
-    from escape_hw.api.benchmark import single_thread
+    from escape_hw.api.concurrency import limit_to_one_thread
 
     known = find_benchmarks()
     unknown = [name for name in stages if name not in known]
     if unknown:
         raise ConfigError(f"unknown stage {unknown[0]!r}; there are: {', '.join(known) or 'none'}")
     rows: list[BenchmarkRow] = []
-    with single_thread():
+    with limit_to_one_thread():
         for name in stages or known:
             benchmark = cast("Benchmark", known[name].load())
             rows += benchmark()

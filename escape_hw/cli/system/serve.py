@@ -1,4 +1,4 @@
-"""``escape serve``: one process that owns a system, for screens, scripts and notebooks."""
+"""``escape serve``: a server that owns a system, for windows, scripts and notebooks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def serve(
     port: Annotated[
         int | None,
         typer.Option(
-            "--port", min=1, max=65534, help="Listen on TCP as well; events come from the next port."
+            "--port", min=1, max=65534, help="Listen on TCP as well; events use the next port."
         ),
     ] = None,
     bind: Annotated[
@@ -30,10 +30,10 @@ def serve(
     ] = _LOOPBACK,
     read: Annotated[
         list[Path] | None,
-        typer.Option("--read", metavar="FOLDER", help="Clients may load products from there; repeatable."),
+        typer.Option("--read", metavar="FOLDER", help="Folder that clients may load from; repeatable."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Where runs go (default: your user data).")
+        Path | None, typer.Option("--out", metavar="DIR", help="Parent of run folders (default: user data).")
     ] = None,
     set: options.Set = None,
     seed: options.Seed = None,
@@ -41,14 +41,14 @@ def serve(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Own the devices of a system, and serve screens, scripts and notebooks until stopped."""
+    """Open the devices of a system, and serve windows, scripts and notebooks until stopped."""
     with command_context("serve", json=json, quiet=quiet) as context:
         from escape_hw.errors import ConfigError
         from escape_hw.io.run_folder import default_runs_folder
         from escape_hw.server.frontend.server import Server
 
         if port is None and bind != _LOOPBACK:
-            raise ConfigError(f"--bind {bind} needs a --port; without one nothing listens on the network")
+            raise ConfigError(f"--bind {bind} needs --port; without it the server has local sockets only")
         config = context.load_config(options.SystemSelection.of(system, set, seed, mode))
         runs = default_runs_folder() if out is None else out.expanduser().absolute()
         with Server(config, bind, port) as server:
@@ -68,9 +68,9 @@ def _print_listing(context: CommandContext, config: SystemConfig, listing: Serve
     name = config.system.name
     document = header_fields("serve", name, config.simulated, config.system.seed)
     context.result({**document, **asdict(listing)})
-    # Whoever reads the document waits for it, and not for the end.
+    # Printed now: programs that start a server read its addresses while it runs.
     context.print_document()
     kind = "simulated" if config.simulated else "HARDWARE"
     where = f", {listing.tcp}" if listing.tcp else ""
     context.notify(f"serve: {name} ({kind}), process {listing.pid}{where}; Ctrl-C ends it")
-    context.notify(f"serve: look at it with 'escape gui --connect {name}', or escape_hw.connect(\"{name}\")")
+    context.notify(f"serve: connect with 'escape gui {name}' or escape_hw.connect(\"{name}\")")

@@ -18,22 +18,22 @@ if TYPE_CHECKING:
 
     from escape_hw.streams.monitor import StreamStatus
 
-#: Seconds between two looks.
+#: Seconds between two updates.
 _PERIOD_S = 1.0
 
 
 def streams(
     remove_orphaned: Annotated[
-        bool, typer.Option("--reap", help="Remove what dead servers left behind.")
+        bool, typer.Option("--reap", help="Remove shared memory of dead servers.")
     ] = False,
     seconds: Annotated[
         float | None, typer.Option("--seconds", min=0, help="How long to watch (default: until Ctrl-C).")
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Watch the streams of this computer's servers: rate, size, who writes and reads, how regularly.
+    """Show the streams of this computer's servers: rate, size, writer, readers, intervals.
 
-    With --json, or where the output is no terminal, it looks for a second and ends.
+    With --json, or without a terminal, it measures for a second and ends.
     """
     with command_context("streams", json=json) as context:
         from escape_hw.io.documents import header_fields
@@ -43,7 +43,7 @@ def streams(
         for segment in removed:
             context.notify(f"removed {segment.name}: its process {segment.pid} has ended")
         if remove_orphaned and not removed:
-            context.notify("nothing to remove: every stream's process lives")
+            context.notify("nothing to remove: the process of every stream is alive")
         rows = () if remove_orphaned else _watch_streams(context, seconds)
         document = header_fields("streams", None, None, None)
         context.result(
@@ -52,7 +52,7 @@ def streams(
 
 
 def _watch_streams(context: CommandContext, seconds: float | None) -> tuple[StreamStatus, ...]:
-    """Show the streams for a while; the last look."""
+    """Show the streams for a while; returns the last rows."""
     from rich.console import Console
     from rich.live import Live
 
@@ -81,18 +81,10 @@ def _table(rows: Iterable[StreamStatus]) -> RichTable:
     from escape_hw.report.tables import Table
 
     headings = (
-        "stream",
-        "entries",
-        "Hz",
-        "shape",
-        "MB",
-        "writer",
-        "readers",
-        "age s",
-        "spacing us p50/p99/max",
-    )
+        "stream", "entries", "Hz", "shape", "MB", "writer", "readers", "age s", "interval us p50/p99/max",
+    )  # fmt: skip
     cells = tuple(_cells(row) for row in rows)
-    title = None if cells else "no streams: no server runs here (escape serve SYSTEM starts one)"
+    title = None if cells else "no streams: no server is running (start one with escape serve SYSTEM)"
     return rich_table(Table(headings, cells), title)
 
 

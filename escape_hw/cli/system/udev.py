@@ -1,4 +1,4 @@
-"""``escape udev``: rules and limits of the machine."""
+"""``escape udev``: device rules and limits of this computer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Root = Annotated[
 
 @app.command("show")
 def show(root: Root = Path("/"), json: options.Json = False) -> None:
-    """Tell what is installed and what 'install' would change; changes nothing."""
+    """Show what is installed and what 'install' would change."""
     with command_context("udev show", json=json) as context:
         from escape_hw.runtime.host.udev import plan_changes
 
@@ -35,10 +35,10 @@ def show(root: Root = Path("/"), json: options.Json = False) -> None:
 @app.command("install")
 def install(
     root: Root = Path("/"),
-    yes: Annotated[bool, typer.Option("--yes", help="Do it without asking.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
     json: options.Json = False,
 ) -> None:
-    """Show what would change, ask, and change it. Exit code 1: nothing was changed, but should be."""
+    """Show the changes, ask, and apply them. Exit code 1: changes are needed but were not applied."""
     with command_context("udev install", json=json) as context:
         from escape_hw.runtime.host import udev
 
@@ -47,25 +47,23 @@ def install(
         context.show(*_format_changes(changes))
         written: list[Path] = []
         if due and not udev.is_writable(due):
-            context.notify(
-                f"not permitted; give this command: sudo {Path(sys.argv[0]).absolute()} udev install"
-            )
+            context.notify(f"not permitted; run: sudo {Path(sys.argv[0]).absolute()} udev install")
         elif due and (yes or _confirm(context)):
             written = udev.apply_changes(due)
             context.show(*(f"written: {path}" for path in written))
             for failure in udev.reload_rules() if root == Path("/") else ():
                 context.notify(failure)
         steps = udev.remaining_commands(getpass.getuser())
-        context.show("still to be done by hand, once:", *(f"  {step}" for step in steps))
+        context.show("remaining manual steps, once:", *(f"  {step}" for step in steps))
         _result(context, "udev install", changes, written, met=len(written) == len(due))
 
 
 def _confirm(context: CommandContext) -> bool:
-    """Ask, where there is somebody to ask."""
+    """Ask on a terminal; without one the answer is no."""
     if context.json or not sys.stdin.isatty():
-        context.notify("nothing was changed; say --yes to have it done without being asked")
+        context.notify("nothing was changed; use --yes to apply the changes without confirmation")
         return False
-    return typer.confirm("Change it?", err=True)
+    return typer.confirm("Apply these changes?", err=True)
 
 
 def _format_changes(changes: list[Change]) -> list[str]:
@@ -81,14 +79,7 @@ def _result(
 ) -> None:
     from escape_hw.io.documents import header_fields
 
-    files = [
-        {
-            "source": change.source,
-            "target": change.target,
-            "condition": change.condition,
-            "difference": change.difference,
-        }
-        for change in changes
-    ]
+    keys = ("source", "target", "condition", "difference")
+    files = [{key: getattr(change, key) for key in keys} for change in changes]
     document = {**header_fields(command, None, None, None), "changed": bool(written)}
     context.result({**document, "files": files, "written": written}, met=met)

@@ -1,1 +1,4 @@
-"""Finding lenslets and pupil images on the camera. Slopes computed on that geometry are in escape_hw.pipeline.slopes."""
+"""Finding lenslets and pupil images on the camera.
+
+Slopes computed on that geometry are in escape_hw.pipeline.slopes.
+"""

@@ -1,1 +1,4 @@
-"""Science images: frame stack, diffraction image and Strehl ratios. Measuring the model PSF is in escape_hw.calibration.acquisition."""
+"""Science images: frame stack, diffraction image and Strehl ratios.
+
+Measuring the model PSF is in escape_hw.calibration.acquisition.
+"""

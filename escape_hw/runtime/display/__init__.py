@@ -1,1 +1,1 @@
-"""Progress bars for terminals and notebooks."""
+"""Progress bars for terminals and notebooks. Reports and figures are in ``escape_hw.report``."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from escape_hw.config.choices import ESTIMATORS, POKE_PATTERNS
+from escape_hw.config.renamed import update_document
 from escape_hw.errors import ConfigError, ProductError
 from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun, parameter, present_names
 from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
@@ -105,6 +106,7 @@ class CalibrationProcedure(ProcedureSpec["CalibrationResult"]):
             raise ProductError(
                 f"{path}: cannot be read ({error}); is {folder} the folder of a run?"
             ) from error
+        update_document(config)
         found = {}
         for one in cls.parameters():
             if one.sets_config:

@@ -26,6 +26,7 @@ from typing import (
     get_type_hints,
 )
 
+from escape_hw.config.renamed import present_value
 from escape_hw.deprecation import renamed_text, warn_renamed
 from escape_hw.errors import ConfigError
 
@@ -109,6 +110,7 @@ class Parameter:
         words = (
             [word.strip() for word in value.split(",") if word.strip()] if self.kind == "choices" else [value]
         )
+        words = [present_value(self.config_key, word) for word in words]
         for word in words if self.choices else ():
             if word not in self.choices:
                 raise ConfigError(f"{label} is '{word}'; it is one of {', '.join(self.choices)}")

@@ -1,1 +1,1 @@
-"""The process that owns the devices: request handler, procedures, closed loop, streams and published state. Anything that talks to clients directly is in server.frontend."""
+"""The engine process: devices, loop, procedures, streams, published state. No contact with clients."""

@@ -1,26 +1,22 @@
-"""Devices, geometry and numbers of a bench as the state tells them."""
+"""Devices, illumination and geometry of a bench, as documents for clients."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import singledispatch
-from typing import TYPE_CHECKING
 
 from escape_hw.api.camera import Frame
 from escape_hw.api.device import Device
-from escape_hw.api.pyramid import PyramidPupils
-from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
+from escape_hw.api.outlines import outlines
+from escape_hw.api.sensor import SensorGeometry
+from escape_hw.bench import Bench
 from escape_hw.remote.state import DeviceHealth, DeviceState, Geometry, Illumination
 from escape_hw.runtime.session.record import actuator_layout, actuator_positions
-
-if TYPE_CHECKING:
-    from escape_hw.bench import Bench
 
 Facts = dict[str, float | str]
 
 
 def device_states(bench: Bench, device_messages: Mapping[str, str]) -> tuple[DeviceState, ...]:
-    """The devices of a bench; ``device_messages`` by name."""
+    """State of every device; ``device_messages`` holds their problems by name."""
     return tuple(
         _device(name, kind, getattr(bench, name), device_messages)
         for name, kind in (
@@ -63,36 +59,19 @@ def _facts(device: Device) -> Facts:
 
 
 def illumination_of(frame: Frame, full_scale: int) -> Illumination:
-    """How bright a frame is."""
+    """Saturation and peak of a frame."""
     return Illumination(
         saturated=frame.n_saturated / frame.data.size, peak=float(frame.data.max()) / full_scale
     )
 
 
 def geometry_of(bench: Bench, grid: SensorGeometry | None) -> Geometry:
-    """Where slopes and actuators stand."""
+    """Positions of the sub-apertures and actuators."""
     valid = () if grid is None else tuple("".join("1" if one else "0" for one in row) for row in grid.valid)
     return Geometry(
         valid=valid,
         layout=actuator_layout(bench),
-        places_m=actuator_positions(bench),
+        positions_m=actuator_positions(bench),
         outlines_px=() if grid is None else outlines(grid),
         n_modes=bench.config.basis.n_modes,
     )
-
-
-@singledispatch
-def outlines(grid: SensorGeometry) -> tuple[tuple[float, float, float], ...]:
-    """Outlines on the camera: (x, y, half width) in pixels each."""
-    raise TypeError(f"a sensor of kind '{grid.kind}' has no outlines")
-
-
-@outlines.register
-def _lenslets(grid: SubApertureGrid) -> tuple[tuple[float, float, float], ...]:
-    half = grid.pitch_px / 2
-    return tuple((float(x), float(y), half) for x, y in grid.centres_px())
-
-
-@outlines.register
-def _pupils(grid: PyramidPupils) -> tuple[tuple[float, float, float], ...]:
-    return tuple((float(x), float(y), grid.diameter_px / 2) for x, y in grid.centres_px)

@@ -88,7 +88,7 @@ class ProcedureRegistry:
         for one in parameters:
             value = arguments.get(one.name)
             if one.kind == "matrix" and value is not None:
-                arguments[one.name] = product_store.matrix(value)
+                arguments[one.name] = product_store.matrix_path(value)
             elif one.kind == "matrix" and one.required:
                 raise ConfigError(f"{one.name} is missing; name a matrix that the server holds")
             elif one.kind == "run" and value is not None:

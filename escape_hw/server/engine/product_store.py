@@ -1,4 +1,4 @@
-"""The products that the engine holds, by name."""
+"""Store of the products that requests may name."""
 
 from __future__ import annotations
 
@@ -16,13 +16,7 @@ from escape_hw.remote.state import ProductEntry
 
 
 class ProductStore:
-    """Products by name; each lies in a file, and only that is remembered.
-
-    Parameters
-    ----------
-    folders
-        Where files may lie that a client asks to load.
-    """
+    """Products by name. Only the paths are stored, not the contents."""
 
     def __init__(self, folders: Iterable[Path]) -> None:
         self._folders = tuple(folder.resolve() for folder in folders)
@@ -30,63 +24,51 @@ class ProductStore:
 
     @property
     def products(self) -> tuple[ProductEntry, ...]:
-        """What lies here, the newest last."""
+        """The products, the newest last."""
         return tuple(self._products.values())
 
-    def matrix(self, name: str) -> Path:
-        """The file of a matrix.
-
-        Raises
-        ------
-        ConfigError
-            There is none of that name.
-        """
+    def matrix_path(self, name: str) -> Path:
+        """Path of a matrix (ConfigError: there is no matrix of that name)."""
         product = self._products.get(name)
         if product is None or product.kind != "matrix":
-            known = ", ".join(one.name for one in self.products if one.kind == "matrix") or "none yet"
-            raise ConfigError(f"no matrix is called '{name}' (there are: {known}); load it, or calibrate")
+            known = ", ".join(one.name for one in self.products if one.kind == "matrix") or "none"
+            raise ConfigError(f"there is no matrix '{name}' (available: {known}); load it, or calibrate")
         return Path(product.path)
 
     def readable_path(self, path: str) -> Path:
-        """A path that a client named, if it lies where the server may read.
+        """Resolve a path from a client.
 
         Raises
         ------
         ProductError
-            It lies elsewhere; says where it may lie.
+            The path is outside the folders that clients may load from.
         """
         resolved = Path(path).expanduser().resolve()
         if not any(resolved.is_relative_to(folder) for folder in self._folders):
             where = ", ".join(map(str, self._folders))
             raise ProductError(
-                f"{resolved}: this server reads from {where} only; copy it there, or start the server with "
-                "--read FOLDER"
+                f"{resolved}: this server reads from {where} only; copy the file there, or start the server "
+                "with --read FOLDER"
             )
         return resolved
 
     def load(self, path: str, name: str | None = None) -> ProductEntry:
-        """Put a file on the shelf.
+        """Add a file that a client named (ProductError: the path is not allowed, or as for :meth:`add`)."""
+        return self.add(self.readable_path(path), name)
+
+    def add(self, path: Path, name: str | None = None) -> ProductEntry:
+        """Add a file under a name, by default its own; a product of the same name is replaced.
 
         Raises
         ------
         ProductError
-            It may not be read, is damaged, or of a kind that nobody asks for by name.
-        """
-        return self.put(self.readable_path(path), name)
-
-    def put(self, path: Path, name: str | None = None) -> ProductEntry:
-        """Put a file on the shelf that the server itself wrote.
-
-        Raises
-        ------
-        ProductError
-            As for :meth:`load`.
+            The file cannot be read, is damaged, or of another kind.
         """
         hdus, _ = fits_file.read(path)
         kind = str(fits_file.header_dict(hdus).get("KIND", ""))
         describe = _KINDS.get(kind)
         if describe is None:
-            raise ProductError(f"{path}: it is of kind '{kind}'; a server takes {', '.join(_KINDS)}")
+            raise ProductError(f"{path}: a product of kind '{kind}'; a server loads {', '.join(_KINDS)}")
         word, summary = describe(path)
         valid_name = re.sub(r"[^\w .+@:-]", "-", path.stem if name is None else name)[:80]
         product = ProductEntry(name=valid_name, kind=word, path=str(path), summary=summary)
@@ -102,12 +84,12 @@ def _matrix(path: Path) -> tuple[str, str]:
 
 def _gains(path: Path) -> tuple[str, str]:
     result = load_gains(path).result
-    return "gains", f"gains beside {result.method}, {len(result.rounds)} rounds"
+    return "gains", f"gains relative to {result.method}, {len(result.rounds)} rounds"
 
 
 def _psf(path: Path) -> tuple[str, str]:
     result = load_loop(path).result
-    return "psf", f"loop on {result.method}, {result.frames} frames"
+    return "psf", f"loop with {result.method}, {result.frames} frames"
 
 
 _KINDS: dict[str, Callable[[Path], tuple[str, Any]]] = {

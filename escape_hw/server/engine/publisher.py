@@ -1,4 +1,4 @@
-"""What passes through a bench, into shared memory for whoever looks, and counted on the way."""
+"""Publishes frames, slopes, commands and results in shared memory."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from escape_hw.streams.segments import segment_name
 
 log = logging.getLogger(__name__)
 
-#: Least room of a ring's entry, so that what grows seldom outgrows it.
+#: Least capacity of a ring's entry, so that growing arrays seldom need a new ring.
 _MIN_BYTES = 16384
-#: Entries kept of streams that are recorded at full rate: as long as a recorder may be held up.
+#: Entries kept of streams that are recorded at full rate; they bridge delays of the recorder.
 _SLOTS = {"frames": 16, "slopes": 64, "modes": 64, "commands": 64}
 
 
 class StreamPublisher:
-    """Rings by stream, made when something is written for the first time.
+    """One ring per stream, created with its first entry.
 
     Parameters
     ----------
@@ -38,12 +38,12 @@ class StreamPublisher:
 
     Attributes
     ----------
-    frame, command
-        The newest frame and command, for statistics.
+    latest_frame, latest_command
+        The newest frame and command ``(n_act,)``, fraction of full stroke; ``None`` before the first.
     frames, commands
-        How many there were.
-    grid, geometries
-        The sensor's geometry that slopes were last made on, ``None`` before it was found; how many so far.
+        Counts.
+    grid, geometry_version
+        The sensor's geometry, ``None`` before it was measured, and a number that changes with it.
     residual_nm
         Newest rms residual of a closed loop; 0 before the first.
     """
@@ -52,51 +52,43 @@ class StreamPublisher:
         self._system = system
         self._rings: dict[str, RingWriter] = {}
         self._failed_streams: set[str] = set()
-        self.frame: Frame | None = None
-        self.command: NDArray[np.float64] | None = None
+        self.latest_frame: Frame | None = None
+        self.latest_command: NDArray[np.float64] | None = None
         self.frames = self.commands = 0
         self.residual_nm = 0.0
         self.grid: SensorGeometry | None = None
-        self.geometries = 0
+        self.geometry_version = 0
         self._full_scale_meta = b""
 
-    @property
-    def top(self) -> float:
-        """Value at which a pixel of the sensor's camera is saturated; 0: unknown."""
-        return float(json.loads(self._full_scale_meta or b'{"top": 0}')["top"])
-
-    @top.setter
-    def top(self, counts: float) -> None:
-        self._full_scale_meta = json.dumps({"top": counts}).encode()
+    def set_full_scale(self, counts: float) -> None:
+        """Set the value at which a pixel of the sensor's camera is saturated; part of every frame's entry."""
+        # "top" is the key of 0.1.0, which recorded files contain.
+        self._full_scale_meta = json.dumps({"full_scale": counts, "top": counts}).encode()
 
     @property
     def callbacks(self) -> Callbacks:
-        """What a bench is to call."""
+        """Callbacks for the bench."""
         return Callbacks(
-            frame=self._frame,
-            science=self._science,
-            slopes=self._slopes,
-            command=self._command,
-            residual=self._residual,
-            geometry=self.set_geometry,
-        )
+            frame=self._frame, science=self._science, slopes=self._slopes, command=self._command,
+            residual=self._residual, geometry=self.set_geometry,
+        )  # fmt: skip
 
     @property
     def entries(self) -> tuple[StreamEntry, ...]:
-        """The streams there are, for clients."""
+        """The streams that have an entry."""
         return tuple(
             StreamEntry(name=name, segment=ring.name, unit=STREAMS[name])
             for name, ring in tuple(self._rings.items())
         )
 
     def set_geometry(self, grid: SensorGeometry) -> None:
-        """Remember the sensor's geometry, for clients that ask."""
+        """Store the sensor's geometry."""
         if grid is not self.grid:
             self.grid = grid
-            self.geometries += 1
+            self.geometry_version += 1
 
-    def arrays(self, arrays: Mapping[str, NDArray[Any]], **meta: float | str) -> None:
-        """Publish what a procedure tells on its way; what is no stream is left out."""
+    def publish_arrays(self, arrays: Mapping[str, NDArray[Any]], **meta: float | str) -> None:
+        """Publish arrays of a procedure under their streams' names; arrays that are no stream are ignored."""
         text = json.dumps(meta).encode()[:256] if meta else b""
         for name in STREAMS.keys() & arrays.keys():
             array = np.ascontiguousarray(arrays[name])
@@ -111,7 +103,7 @@ class StreamPublisher:
         self._rings.clear()
 
     def _ring(self, name: str, data: NDArray[Any]) -> RingWriter | None:
-        """A stream's ring, large enough for this array; ``None`` where there is no memory for one."""
+        """The ring of a stream, large enough for an array; ``None`` when there is no memory for it."""
         ring = self._rings.get(name)
         if ring is not None and data.nbytes <= ring.capacity:
             return ring
@@ -119,19 +111,19 @@ class StreamPublisher:
             return None
         room = max(_MIN_BYTES, data.nbytes if ring is None else 2 * data.nbytes)
         if ring is not None:
-            # Its readers see that it is closed and look for the new one under the same name.
+            # Its readers notice that it is closed and open the new one under the same name.
             del self._rings[name]
             ring.close()
         try:
             self._rings[name] = RingWriter(segment_name(self._system, name), room, _SLOTS.get(name, SLOTS))
         except StorageError as error:
-            log.error("stream '%s' cannot be shown: %s", name, error)
+            log.error("stream '%s' cannot be published: %s", name, error)
             self._failed_streams.add(name)
             return None
         return self._rings[name]
 
     def _frame(self, frame: Frame) -> None:
-        self.frame = frame
+        self.latest_frame = frame
         self.frames += 1
         self._write("frames", frame.data, frame.index, frame.exposed_ns, self._full_scale_meta)
 
@@ -142,12 +134,12 @@ class StreamPublisher:
         self._write("slopes", slopes, index)
 
     def _command(self, command: NDArray[np.float64]) -> None:
-        self.command = command
+        self.latest_command = command
         self.commands += 1
         self._write("commands", command, self.commands)
 
     def reset_residual(self) -> None:
-        """Another loop is about to be closed: the residual of the one before says nothing of it."""
+        """Discard the residual of the previous loop."""
         self.residual_nm = 0.0
 
     def _residual(self, index: int, modes: NDArray[np.float32], rms: float) -> None:
@@ -157,9 +149,6 @@ class StreamPublisher:
     def _write(
         self, name: str, data: NDArray[Any], index: int, exposed_ns: int = 0, meta: bytes = b""
     ) -> None:
-        ring = self._rings.get(name)
-        if ring is None or data.nbytes > ring.capacity:
-            ring = self._ring(name, data)
-            if ring is None:
-                return
-        ring.write(data, index, exposed_ns, time.monotonic_ns(), meta)
+        ring = self._ring(name, data)
+        if ring is not None:
+            ring.write(data, index, exposed_ns, time.monotonic_ns(), meta)

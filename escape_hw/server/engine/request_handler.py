@@ -1,110 +1,109 @@
-"""What is asked of the engine, answered or handed to its main thread, in a thread of its own."""
+"""Answers requests that the front end forwards, or hands them to the main thread."""
 
 from __future__ import annotations
 
 import logging
-import threading
-import time
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 from pydantic import ValidationError
 
-from escape_hw.errors import ConfigError, RequestRefused
+from escape_hw.errors import ConfigError, EscapeError, RequestRefused
 from escape_hw.remote import requests
 from escape_hw.remote.requests import error_to_document
-from escape_hw.server.engine import runner as jobs
+from escape_hw.server.engine.bench_owner import BenchOwner
 from escape_hw.server.engine.bench_status import geometry_of
-from escape_hw.server.engine.procedures import needs_loop
-
-if TYPE_CHECKING:
-    from escape_hw.server.engine.main import Engine
+from escape_hw.server.engine.loop import LoopRunner
+from escape_hw.server.engine.planning import ProcedurePlanner
+from escape_hw.server.engine.procedures import ProcedureRegistry, needs_loop
+from escape_hw.server.engine.product_store import ProductStore
+from escape_hw.server.engine.publisher import StreamPublisher
+from escape_hw.server.engine.recording import TelemetryRecording
+from escape_hw.server.engine.runner import LOOP_IS_RESTORED, ProcedureRunner
+from escape_hw.server.engine.state import EngineState
+from escape_hw.server.engine.state_publisher import StatePublisher
 
 log = logging.getLogger(__name__)
 
+#: Returned by a handler whose reply is sent later.
+DEFERRED = object()
+#: Answer to a safety request when nothing has to be made flat.
+_NO_FAULT = {"fault": None}
 
-class DeferredReply:
-    """An answer that comes when the work is done."""
 
+@dataclass(frozen=True, slots=True)
+class Services:
+    """What the handlers of requests use."""
 
-DEFERRED = DeferredReply()
+    state: EngineState
+    state_publisher: StatePublisher
+    publisher: StreamPublisher
+    product_store: ProductStore
+    procedures: ProcedureRegistry
+    planner: ProcedurePlanner
+    recording: TelemetryRecording
+    owner: BenchOwner
+    loop_runner: LoopRunner
+    procedure_runner: ProcedureRunner
 
 
 class RequestHandler:
-    """Takes the front's messages.
+    """Dispatches the messages of the front end; for one thread."""
 
-    Parameters
-    ----------
-    engine
-        Whose desk it is.
-    messages
-        What arrives; its end means that the front has gone.
-    """
-
-    def __init__(self, engine: Engine, messages: Iterator[dict[str, Any]]) -> None:
-        self._engine, self._messages = engine, messages
-        self._last_message_s = time.monotonic()
+    def __init__(
+        self,
+        services: Services,
+        send: Callable[[Mapping[str, Any]], object],
+        request_stop: Callable[[], object],
+    ) -> None:
+        self._services, self._send, self._request_stop = services, send, request_stop
         self._handlers: dict[type[requests.Request], Callable[[Any, int], object]] = {
             requests.GetGeometry: self._geometry,
             requests.GetProcedures: self._procedures,
-            requests.PlanProcedure: self._check,
+            requests.PlanProcedure: self._plan,
             requests.OpenLoop: self._open_loop,
             requests.Flatten: self._flatten,
             requests.AbortProcedure: self._abort,
             requests.StartProcedure: self._start,
-            requests.PauseProcedure: self._pause,
-            requests.ResumeProcedure: self._resume,
+            requests.PauseProcedure: lambda request, number: services.state.pause(),
+            requests.ResumeProcedure: lambda request, number: services.state.resume(),
             requests.CloseLoop: self._close_loop,
-            requests.SetLoop: self._set_loop,
+            requests.SetLoop: lambda request, number: services.loop_runner.change(request),
             requests.LoadProduct: self._load_product,
-            requests.SetRecording: self._record,
+            requests.SetRecording: self._set_recording,
             requests.ClearFault: self._clear_fault,
-            requests.Shutdown: self._shutdown,
+            requests.Shutdown: lambda request, number: request_stop(),
         }
 
-    def start(self) -> None:
-        """Begin to answer."""
-        threading.Thread(target=self._run, name="desk", daemon=True).start()
-        threading.Thread(target=self._watch_for_silence, name="silence", daemon=True).start()
-
-    def _run(self) -> None:
+    def run(self, messages: Iterable[Mapping[str, Any]]) -> None:
+        """Handle messages until the front end closes the channel; the engine stops then."""
         try:
-            for message in self._messages:
-                self._last_message_s = time.monotonic()
-                self._handle(message)
+            for message in messages:
+                self.handle(message)
         except ValueError as error:
-            log.error("the front sent what is no message: %s", error)
-        log.warning("the front is gone: stopping, mirror flat")
-        self._engine.request_stop()
+            log.error("the front end sent a malformed message: %s", error)
+        log.warning("the connection to the front end ended: stopping, mirror flat")
+        self._request_stop()
 
-    def _watch_for_silence(self) -> None:
-        limit = self._engine.setup.silence_s
-        while True:
-            time.sleep(limit / 5)
-            silent = time.monotonic() - self._last_message_s
-            if silent <= limit or self._engine.engine_state.fault is not None:
-                continue
-            # On a busy machine, or at a long request, it may be this side that has not listened.
-            if not self._engine.channel.has_unread:
-                jobs.make_safe_now(
-                    self._engine, f"the server's front was silent for {silent:.0f} s (limit {limit:g} s)"
-                )
+    def handle(self, message: Mapping[str, Any]) -> None:
+        """Handle one message."""
+        match message:
+            case {"stop": _}:
+                self._request_stop()
+            case {"make_safe": {"reason": reason, "remedy": remedy}}:
+                self._services.owner.request_safe_state(str(reason), str(remedy))
+            case {"id": number, "request": document}:
+                self._handle_request(number, document)
+            case _:
+                pass  # a heartbeat, which the channel has noted
 
-    def _handle(self, message: dict[str, Any]) -> None:
-        if "end" in message:
-            self._engine.request_stop()
-            return
-        if "fault" in message:
-            jobs.make_safe_now(self._engine, str(message["fault"]), str(message.get("way_out", "")))
-            return
-        number = message.get("id")
-        if number is None:
-            return  # a sign of life
+    def _handle_request(self, number: int, document: object) -> None:
         try:
-            request = requests.REQUESTS.validate_python(message["request"])
+            request = requests.REQUESTS.validate_python(document)
             answer = self._handlers[type(request)](request, number)
         except (KeyError, ValidationError) as error:
-            self._reply(number, error=RequestRefused(f"the engine does not know this request: {error}"))
+            self._reply(number, error=RequestRefused(f"the engine has no such request: {error}"))
         except Exception as error:
             if not isinstance(error, (ConfigError, RequestRefused)):
                 log.warning("a request failed: %s: %s", type(error).__name__, error)
@@ -112,128 +111,82 @@ class RequestHandler:
         else:
             if answer is not DEFERRED:
                 if isinstance(request, requests.STATE_CHANGING_REQUESTS):
-                    # What was done is told before it is confirmed.
-                    self._engine.state_publisher.publish()
+                    # The new state is published before the request is confirmed.
+                    self._services.state_publisher.publish()
                 self._reply(number, answer=answer)
 
     def _reply(self, number: int, answer: object = None, error: BaseException | None = None) -> None:
         outcome = {"answer": answer} if error is None else {"error": error_to_document(error)}
-        self._engine.channel.post({"reply": number, **outcome})
+        self._send({"reply": number, **outcome})
 
-    # ------------------------------------------------------------ to look
+    # ------------------------------------------------------------ read only
     def _geometry(self, request: requests.GetGeometry, number: int) -> object:
-        if not self._engine.bench.dm.is_open:
+        bench = self._services.owner.bench
+        if not bench.dm.is_open:
             raise RequestRefused("the devices are not open")
-        return geometry_of(self._engine.bench, self._engine.publisher.grid).model_dump(mode="json")
+        return geometry_of(bench, self._services.publisher.grid).model_dump(mode="json")
 
     def _procedures(self, request: requests.GetProcedures, number: int) -> object:
-        return [entry.model_dump(mode="json") for entry in self._engine.procedures.entries]
+        return [entry.model_dump(mode="json") for entry in self._services.procedures.entries]
 
-    def _check(self, request: requests.PlanProcedure, number: int) -> object:
-        engine = self._engine
-        arguments = engine.procedures.arguments(request.procedure, request.arguments)
-        engine.procedures.task(request.procedure, request.arguments, engine.product_store)
-        if not engine.bench.is_open:
-            raise RequestRefused("the devices are not open; nothing can be planned before they are")
-        plan = engine.planner.plan(request.procedure, arguments)
-        if engine.engine_state.loop_control is not None:
-            loop_note = jobs.LOOP_IS_RESTORED if needs_loop(request.procedure, arguments) else "open the loop first"
-            plan = plan.model_copy(update={"warnings": (*plan.warnings, f"the loop is closed: {loop_note}")})
+    def _plan(self, request: requests.PlanProcedure, number: int) -> object:
+        s = self._services
+        arguments = s.procedures.arguments(request.procedure, request.arguments)
+        s.procedures.task(request.procedure, request.arguments, s.product_store)
+        if not s.owner.bench.is_open:
+            raise RequestRefused("the devices are not open; a plan needs their settings")
+        plan = s.planner.plan(request.procedure, arguments)
+        if s.state.snapshot.loop_control is not None:
+            note = LOOP_IS_RESTORED if needs_loop(request.procedure, arguments) else "open the loop first"
+            plan = plan.model_copy(update={"warnings": (*plan.warnings, f"the loop is closed: {note}")})
         return plan.model_dump(mode="json")
 
     # ------------------------------------------------------------ safety
-    def _open_loop(self, request: requests.OpenLoop, number: int) -> object:
-        engine = self._engine
-        with engine.engine_state.lock:
-            runs = engine.engine_state.running is not None
-            if runs and not engine.engine_state.needs_loop:
-                return {"fault": None}  # nothing is closed, and the procedure moves the mirror
-            engine.engine_state.stop.set()
-        engine.reply_when_flat(number)
-        return DEFERRED
-
     def _flatten(self, request: requests.Flatten, number: int) -> object:
-        with self._engine.engine_state.lock:
-            self._engine.engine_state.stop.set()
-        self._engine.reply_when_flat(number)
-        return DEFERRED
+        self._services.state.request_stop()
+        return self._reply_when_flat(number)
+
+    def _open_loop(self, request: requests.OpenLoop, number: int) -> object:
+        return self._reply_when_flat(number) if self._services.state.request_open_loop() else _NO_FAULT
 
     def _abort(self, request: requests.AbortProcedure, number: int) -> object:
-        engine_state = self._engine.engine_state
-        with engine_state.lock:
-            if engine_state.running is None:
-                return {"fault": None}
-            engine_state.stop.set()
-        self._engine.reply_when_flat(number)
+        return self._reply_when_flat(number) if self._services.state.request_abort() else _NO_FAULT
+
+    def _reply_when_flat(self, number: int) -> object:
+        self._services.owner.reply_when_flat(lambda answer: self._reply(number, answer))
         return DEFERRED
 
-    # ------------------------------------------------------------ to write
+    # ------------------------------------------------------------ control
     def _start(self, request: requests.StartProcedure, number: int) -> object:
-        engine = self._engine
-        with engine.engine_state.lock:
-            arguments = engine.procedures.arguments(request.procedure, request.arguments)
-            loop = needs_loop(request.procedure, arguments)
-            loop_before = jobs.loop_to_restore(engine) if loop else None
-            if loop_before is None:
-                engine.engine_state.require_idle()
-            task = engine.procedures.task(request.procedure, request.arguments, engine.product_store)
-            config = jobs.config_of_task(engine, task)
-            task.load(config, self._engine.bench.simulated)
-            run = engine.next_run
-            engine.next_run += 1
-            jobs.begin_run(engine, run, request.procedure, arguments, loop)
-        engine.post(lambda: jobs.run_task(engine, task, config, loop_before))
-        return run
-
-    def _pause(self, request: requests.PauseProcedure, number: int) -> object:
-        engine_state = self._engine.engine_state
-        if engine_state.running is None:
-            raise RequestRefused("nothing is running")
-        if engine_state.needs_loop:
-            raise RequestRefused(
-                f"'{engine_state.running.name}' works in closed loop and cannot be halted; abort it"
-            )
-        engine_state.paused = True
-        return None
-
-    def _resume(self, request: requests.ResumeProcedure, number: int) -> object:
-        if self._engine.engine_state.running is None:
-            raise RequestRefused("nothing is running")
-        self._engine.engine_state.paused = False
-        return None
+        s = self._services
+        arguments = s.procedures.arguments(request.procedure, request.arguments)
+        loop = needs_loop(request.procedure, arguments)
+        s.state.check_can_start(loop)
+        task = s.procedures.task(request.procedure, request.arguments, s.product_store)
+        return s.procedure_runner.start(task, request.procedure, arguments, loop)
 
     def _close_loop(self, request: requests.CloseLoop, number: int) -> object:
-        engine = self._engine
-        with engine.engine_state.lock:
-            engine.engine_state.require_idle()
-            jobs.close_loop(engine, request, lambda error: self._reply(number, error=error))
+        def on_closed(error: EscapeError | None) -> None:
+            self._reply(number, error=error)
+
+        self._services.loop_runner.close(request, on_closed)
         return DEFERRED
 
-    def _set_loop(self, request: requests.SetLoop, number: int) -> object:
-        engine = self._engine
-        with engine.engine_state.lock:
-            jobs.change_loop_settings(engine, request)
-        return None
-
     def _load_product(self, request: requests.LoadProduct, number: int) -> object:
-        return self._engine.product_store.load(request.path, request.name).model_dump(mode="json")
+        return self._services.product_store.load(request.path, request.name).model_dump(mode="json")
 
-    def _record(self, request: requests.SetRecording, number: int) -> object:
-        return self._engine.telemetry.set_recording(request.on).model_dump(mode="json")
+    def _set_recording(self, request: requests.SetRecording, number: int) -> object:
+        return self._services.recording.set_recording(request.on).model_dump(mode="json")
 
     def _clear_fault(self, request: requests.ClearFault, number: int) -> object:
-        engine = self._engine
-        if engine.engine_state.fault is None:
+        s = self._services
+        if s.state.snapshot.fault is None:
             return None
 
         def clear() -> None:
-            engine.clear_fault()
-            engine.state_publisher.publish()
+            s.owner.clear_fault()
+            s.state_publisher.publish()
             self._reply(number)
 
-        engine.post(clear)
+        s.owner.post(clear)
         return DEFERRED
-
-    def _shutdown(self, request: requests.Shutdown, number: int) -> object:
-        self._engine.request_stop()
-        return None

@@ -1,1 +1,1 @@
-"""The process that clients connect to: ZeroMQ transport, leases, dispatch of requests and supervision of the engine. No numerics and no device access; those are in server.engine."""
+"""The front-end process: clients, lease, transport, supervision of the engine. No numerics, no devices."""

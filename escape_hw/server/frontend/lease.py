@@ -1,4 +1,4 @@
-"""Who may write: one client at a time, for as long as it is heard of."""
+"""Registered clients, and the lease: the right of one client to control the server."""
 
 from __future__ import annotations
 
@@ -14,39 +14,44 @@ from escape_hw.remote.state import Lease
 
 log = logging.getLogger(__name__)
 
-#: Clients that were not heard of for so long are forgotten.
+#: Silence after which a client is no longer registered.
 _CLIENT_TIMEOUT_S = 60.0
-#: More clients than this are not a control room.
+#: Largest number of registered clients.
 MAX_CLIENTS = 200
 
 
 @dataclass(slots=True)
 class RegisteredClient:
-    """Somebody who said hello.
+    """A client.
 
     Parameters
     ----------
+    registration
+        Its first request.
     route
-        The connection, as the socket tells them apart; other clients never learn it.
+        Identity of its connection, unknown to other clients.
+    last_message_s
+        Time of its last message, monotonic seconds.
     """
 
-    hello: RegisterClient
+    registration: RegisterClient
     route: bytes
     last_message_s: float
 
     @property
     def description(self) -> str:
-        """Who it is, for people."""
-        return f"{self.hello.name} on {self.hello.host} (process {self.hello.pid})"
+        """Name, computer and process, for people."""
+        r = self.registration
+        return f"{r.name} on {r.host} (process {r.pid})"
 
 
 class LeaseManager:
-    """The clients that are there, and which of them may write.
+    """Registers clients and grants the lease.
 
     Parameters
     ----------
     expiry_s
-        A holder that was not heard of for so long loses the lease.
+        Silence after which the holder loses the lease.
     clock
         Monotonic seconds.
     """
@@ -56,110 +61,86 @@ class LeaseManager:
         self._clients: dict[str, RegisteredClient] = {}
         self._holder: RegisteredClient | None = None
         self._since = ""
-        #: When the lease was last lost or given back; ``None``: it is held, or never was.
+        #: When the lease was last lost or released; ``None`` while it is held, or when it never was.
         self.released_s: float | None = None
 
     @property
     def lease(self) -> Lease | None:
-        """The lease as the state tells it."""
+        """The lease, for the state document."""
         if self._holder is None:
             return None
-        hello = self._holder.hello
-        return Lease(
-            client=hello.client, name=hello.name, host=hello.host, pid=hello.pid, since_utc=self._since
-        )
+        r = self._holder.registration
+        return Lease(client=r.client, name=r.name, host=r.host, pid=r.pid, since_utc=self._since)
 
     @property
     def count(self) -> int:
-        """Clients heard of lately."""
+        """Number of clients that sent a message lately."""
         return sum(self._clock() - one.last_message_s < self.expiry_s for one in self._clients.values())
 
-    def register_client(self, hello: RegisterClient, route: bytes) -> None:
-        """Take a client in, or take it back after its connection was interrupted.
+    def register_client(self, registration: RegisterClient, route: bytes) -> None:
+        """Register a client, also again after its connection was interrupted.
 
-        Raises
-        ------
-        RequestRefused
-            Too many clients, or somebody else goes by that number.
+        RequestRefused when there are too many, or another connection uses this client number.
         """
-        known = self._clients.get(hello.client)
+        known = self._clients.get(registration.client)
         if known is not None and known.route != route:
-            raise RequestRefused("this client number belongs to another connection; draw another one")
+            raise RequestRefused("this client number belongs to another connection; choose another one")
         if known is None and len(self._clients) >= MAX_CLIENTS:
-            raise RequestRefused(f"{MAX_CLIENTS} clients are here already")
+            raise RequestRefused(f"{MAX_CLIENTS} clients are registered already, which is the limit")
         if known is None:
-            self._clients[hello.client] = RegisteredClient(hello, route, self._clock())
-            log.info("client %d: %s", len(self._clients), self._clients[hello.client].description)
+            client = self._clients[registration.client] = RegisteredClient(registration, route, self._clock())
+            log.info("client %d: %s", len(self._clients), client.description)
         else:
             known.last_message_s = self._clock()
 
     def record_activity(self, client: str, route: bytes) -> RegisteredClient:
-        """Note that a client lives.
-
-        Raises
-        ------
-        ClientUnknown
-            It has not said hello, was forgotten since, or speaks for somebody else.
-        """
+        """Note a message of a client and return the client (ClientUnknown: not registered)."""
         known = self._clients.get(client)
         if known is None or known.route != route:
-            raise ClientUnknown("say hello first: this connection is not known under that client number")
+            raise ClientUnknown("this connection is not registered under that client number; reconnect")
         known.last_message_s = self._clock()
         return known
 
     def acquire(self, client: RegisteredClient, take_over: bool) -> Lease:
-        """Give a client the lease.
-
-        Raises
-        ------
-        LeaseHeld
-            Somebody else has it; says who and since when.
-        """
+        """Grant the lease to a client (LeaseHeld: another client holds it)."""
         holder = self._holder
         if holder is not None and holder is not client:
             if not take_over:
                 raise LeaseHeld(
-                    f"{holder.description} has had the right to write since {self._since} UTC; ask there, or take "
-                    "it over"
+                    f"{holder.description} has had control since {self._since} UTC; ask there, or take over"
                 )
-            log.warning("%s takes the right to write over from %s", client.description, holder.description)
+            log.warning("%s takes control over from %s", client.description, holder.description)
         elif holder is None:
-            log.info("%s has the right to write", client.description)
+            log.info("%s has control", client.description)
         if holder is not client:
             self._holder, self._since = client, format_utc()
         self.released_s = None
         lease = self.lease
         if lease is None:
-            raise RuntimeError("a lease that was just given is gone")
+            raise RuntimeError("the lease that was just granted is missing")
         return lease
 
     def release(self, client: RegisteredClient) -> None:
-        """Take the lease back from a client; does nothing when it has none."""
+        """Release the lease of a client; does nothing when it has none."""
         if self._holder is client:
-            log.info("%s gives the right to write back", client.description)
+            log.info("%s releases control", client.description)
             self._holder, self.released_s = None, self._clock()
 
     def require(self, client: RegisteredClient) -> None:
-        """Let pass who has the lease.
-
-        Raises
-        ------
-        LeaseHeld
-            Somebody else has it, or nobody.
-        """
+        """Check that a client holds the lease (LeaseHeld: it does not)."""
         if self._holder is client:
             return
         if self._holder is None:
-            raise LeaseHeld("nobody has the right to write; acquire it first (connect with control=True)")
-        raise LeaseHeld(f"{self._holder.description} has had the right to write since {self._since} UTC")
+            raise LeaseHeld("no client has control; acquire it first (connect with control=True)")
+        raise LeaseHeld(f"{self._holder.description} has had control since {self._since} UTC")
 
     def expire(self) -> None:
-        """Take the lease from a holder that was not heard of; forget clients that are gone."""
+        """Take the lease from a silent holder, and remove clients that are gone."""
         now = self._clock()
         holder = self._holder
         if holder is not None and now - holder.last_message_s > self.expiry_s:
             log.warning(
-                "%s was not heard of for %.1f s (limit %g s) and loses the right to write",
+                "%s was silent for %.1f s (limit %g s) and loses control",
                 holder.description, now - holder.last_message_s, self.expiry_s,
             )  # fmt: skip
             self._holder, self.released_s = None, now
@@ -169,5 +150,5 @@ class LeaseManager:
             del self._clients[number]
 
     def seconds_without_holder(self) -> float:
-        """Seconds since the lease was last held; 0 while it is, or when it never was."""
+        """Seconds since the lease was last held; 0 while it is held, or when it never was."""
         return 0.0 if self.released_s is None else self._clock() - self.released_s

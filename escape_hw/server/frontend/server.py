@@ -1,12 +1,14 @@
-"""The front end: poll loop, dispatch of client requests, and the life of a listening server."""
+"""The front end: serves the clients, forwards their requests to the engine, and supervises it."""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,6 +19,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from escape_hw.api.procedure import StopSignal
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import ConfigError, EscapeError, RequestRefused
+from escape_hw.io.provenance import format_utc, get_software_version
 from escape_hw.remote import requests
 from escape_hw.remote.address import (
     Endpoint,
@@ -30,17 +33,20 @@ from escape_hw.remote.address import (
 )
 from escape_hw.remote.keys import allowed_keys, server_keys
 from escape_hw.remote.source import STREAMS
-from escape_hw.remote.state import SCHEMA, Phase, State
-from escape_hw.server.frontend.engine_supervisor import SAFETY_REQUESTS, EngineSupervisor, PendingRequest
-from escape_hw.server.frontend.lease import RegisteredClient
+from escape_hw.remote.state import SCHEMA, FinishedRun, LogLine, Phase, State
+from escape_hw.server.frontend.engine_supervisor import EngineSupervisor
+from escape_hw.server.frontend.lease import LeaseManager, RegisteredClient
+from escape_hw.server.frontend.published_state import PublishedState
 from escape_hw.server.frontend.transport import IncomingRequest, ZmqTransport
 from escape_hw.server.ipc.channel import EngineSetup
+from escape_hw.server.ipc.log import ServerLog
+from escape_hw.server.safety.journal import ServerJournal
 from escape_hw.streams.ring import ReaderCache
-from escape_hw.streams.segments import process_start
+from escape_hw.supervision import process_start
 
 
 class StreamSampler:
-    """Reads the engine's rings."""
+    """Reads the newest entries of the engine's streams, for clients on other computers."""
 
     def __init__(self) -> None:
         self._readers = ReaderCache()
@@ -48,17 +54,7 @@ class StreamSampler:
     def latest(
         self, stream: str, segment: str | None, after: int
     ) -> tuple[dict[str, Any] | None, bytes | None]:
-        """Head and bytes of a stream's newest entry; nothing when there is none newer than ``after``.
-
-        Parameters
-        ----------
-        stream
-            Its name.
-        segment
-            Where it lies; ``None``: nowhere yet.
-        after
-            Index of the entry that the client has.
-        """
+        """Header and bytes of a stream's newest entry; ``None`` when there is none newer than ``after``."""
         reader = self._readers.reader(stream, segment)
         sample = None if reader is None else reader.latest(after)
         if sample is None:
@@ -70,7 +66,7 @@ class StreamSampler:
         return head, sample.data.tobytes()
 
     def close(self) -> None:
-        """Let go of the rings."""
+        """Close the streams."""
         self._readers.close()
 
 
@@ -79,176 +75,216 @@ log = logging.getLogger(__name__)
 _POLL_MS = 50
 
 
-class FrontEnd(EngineSupervisor):
-    """Serves one system.
+@dataclass(frozen=True, slots=True)
+class PendingRequest:
+    """A request that the engine has not answered yet, and when it was forwarded (monotonic seconds)."""
 
-    Parameters
-    ----------
-    config
-        The system.
-    door
-        The sockets, bound.
-    runs
-        Folder under which runs go.
-    reads
-        Further folders that products may be loaded from.
-    """
+    incoming: IncomingRequest
+    since_s: float
+
+
+class FrontEnd:
+    """Serves the clients of one system and supervises its engine."""
 
     def __init__(
-        self, config: SystemConfig, transport: ZmqTransport, runs: Path, reads: tuple[Path, ...] = ()
+        self, config: SystemConfig, transport: ZmqTransport, runs: Path, read_folders: tuple[Path, ...] = ()
     ) -> None:
-        super().__init__(config, transport, EngineSetup(config_text=config.to_toml(), runs=runs, reads=reads))
-        self._sampler, self._last_request_id = StreamSampler(), 0
-        self._handlers: dict[
-            type[requests.Request], Callable[[Any, IncomingRequest, RegisteredClient], object]
-        ] = {
-            requests.GetState: lambda request, incoming, client: self._state,
-            requests.GetLog: lambda request, incoming, client: [
+        self._config, self._transport = config, transport
+        self._journal = ServerJournal(config.system.name)
+        self._log = ServerLog(
+            self._journal.folder / f"{config.system.name}.log", lambda line: transport.publish("log", line)
+        )
+        self._leases = LeaseManager(config.server.lease_s)
+        state = State(
+            at_utc=format_utc(), server_pid=os.getpid(), version=get_software_version(),
+            system=config.system.name, simulated=config.simulated, seed=config.system.seed,
+            notes=self._journal.read_previous_end(),
+        )  # fmt: skip
+        self._published = PublishedState(state, self._leases, transport)
+        self._pending: dict[int, PendingRequest] = {}
+        self._numbers = itertools.count(1)
+        self._sampler = StreamSampler()
+        self._journal.write(None)
+        setup = EngineSetup(config_text=config.to_toml(), runs=runs, read_folders=read_folders)
+        self._supervisor = EngineSupervisor(
+            config.server, setup, self._journal, self._published,
+            on_message=self._on_engine_message, on_exit=self._refuse_pending,
+        )  # fmt: skip
+        self._handlers: dict[type[requests.Request], Callable[[Any, RegisteredClient], object]] = {
+            requests.GetState: lambda request, client: self._published.state,
+            requests.GetLog: lambda request, client: [
                 line.model_dump(mode="json") for line in self._log.after(request.after, request.count)
             ],
+            requests.ClientHeartbeat: lambda request, client: None,
             requests.AcquireLease: self._acquire,
-            requests.ClientHeartbeat: lambda request, incoming, client: None,
             requests.ReleaseLease: self._release,
         }
 
     # ------------------------------------------------------------ life
     def run(self, stop: StopSignal) -> None:
-        """Serve until told to stop; the mirror ends flat."""
+        """Serve until ``stop`` is set or a client ends the server; the mirror is flat then."""
         poller = zmq.Poller()
         for socket in self._transport.sockets:
             poller.register(socket, zmq.POLLIN)
+        supervisor = self._supervisor
         try:
-            while not self._stopping:
-                engine = self._engine if self._engine is not None and not self._engine.has_exited() else None
+            while not supervisor.stopping:
+                engine = supervisor.running_engine
                 if engine is not None:
                     poller.register(engine.connection.fileno(), zmq.POLLIN)
                 poller.poll(_POLL_MS)
                 if engine is not None:
                     poller.unregister(engine.connection.fileno())
-                    self._receive_messages(engine)
+                    supervisor.receive_messages(engine)
                 for incoming in self._transport.receive_requests():
                     self._handle_request(incoming)
-                self._check_engine()
-                if stop.is_set() and not self._stop_requested_s:
-                    self._shut_down()
+                self._leases.expire()
+                supervisor.check(self._oldest_safety_request_s())
+                self._check_abandoned_run()
+                if stop.is_set():
+                    supervisor.stop()
         finally:
             self._close()
 
-    def _shut_down(self) -> None:
-        self._stop_requested_s = time.monotonic()
-        log.info("stopping: mirror flat, devices closed")
-        if self._engine is None:
-            self._stopping = True
-        else:
-            self._engine.send({"end": True})
-
     def _close(self) -> None:
-        engine, self._engine = self._engine, None
-        clean = True
-        if engine is not None:
-            engine.close_channel()
-            clean = engine.close()
-        self._state = self._state.model_copy(
-            update={"phase": Phase.STOPPED, "serial": self._state.serial + 1}
+        clean = self._supervisor.close()
+        state = self._published.state
+        self._transport.publish(
+            "state", state.model_copy(update={"phase": Phase.STOPPED, "serial": state.serial + 1})
         )
-        self._transport.publish("state", self._state)
         if clean:
             self._journal.close()
         self._sampler.close()
         self._log.close()
 
-    # ------------------------------------------------------------ clients speak
+    def _oldest_safety_request_s(self) -> float:
+        waiting = [
+            one.since_s for one in self._pending.values()
+            if isinstance(one.incoming.request, requests.SAFETY_REQUESTS)
+        ]  # fmt: skip
+        return time.monotonic() - min(waiting) if waiting else 0.0
+
+    def _check_abandoned_run(self) -> None:
+        """Abort a procedure that no client has controlled for a while."""
+        state, limit = self._published.state, self._config.server.unattended_s
+        abandoned_s, run = self._leases.seconds_without_holder(), state.active_run
+        if run is None or abandoned_s <= limit or state.fault is not None or self._leases.lease is not None:
+            return
+        self._leases.released_s = None
+        self._supervisor.make_safe(
+            f"'{run.name}' (run {run.id}) was without a client in control for {abandoned_s:.1f} s "
+            f"(limit {limit:g} s)",
+            "The measured data are saved. Clear the fault, and resume the run if it should continue.",
+        )
+
+    # ------------------------------------------------------------ messages of the engine
+    def _on_engine_message(self, message: dict[str, Any]) -> None:
+        match message:
+            case {"reply": number}:
+                pending = self._pending.pop(number, None)
+                if pending is None:
+                    return
+                if "error" in message:
+                    self._transport.send_error(pending.incoming.route, message["error"])
+                else:
+                    self._transport.send_reply(pending.incoming.route, message["answer"])
+            case {"log": line}:
+                self._log.add(LogLine.model_validate(line))
+            case {"progress": progress}:
+                self._transport.publish("progress", progress)
+            case {"ended": ended}:
+                self._transport.publish("ended", FinishedRun.model_validate(ended))
+
+    def _refuse_pending(self) -> None:
+        for pending in self._pending.values():
+            self._transport.send_error(pending.incoming.route, RequestRefused("the engine has ended"))
+        self._pending.clear()
+
+    # ------------------------------------------------------------ requests of the clients
     def _handle_request(self, incoming: IncomingRequest) -> None:
         request = incoming.request
         try:
             if isinstance(request, requests.RegisterClient):
-                self._transport.answer(incoming.route, self._register_client(request, incoming.route.sender))
+                self._transport.send_reply(incoming.route, self._register(request, incoming.route.sender))
                 return
             client = self._leases.record_activity(request.client, incoming.route.sender)
             if isinstance(request, requests.LEASE_REQUESTS):
                 self._leases.require(client)
-            if isinstance(request, SAFETY_REQUESTS):
+            if isinstance(request, requests.SAFETY_REQUESTS):
                 log.warning("%s: %s", client.description, request.verb.replace("_", " "))
             if isinstance(request, requests.GetLatestSample):
                 self._send_latest(request, incoming)
             elif type(request) in self._handlers:
-                answer = self._handlers[type(request)](request, incoming, client)
-                self._transport.answer(incoming.route, answer)
+                self._transport.send_reply(incoming.route, self._handlers[type(request)](request, client))
             else:
                 self._forward(incoming)
         except EscapeError as error:
             self._transport.refuse(incoming.route, error)
         except Exception as error:
-            log.exception("unexpected, at '%s'", request.verb)
+            log.exception("unexpected exception at '%s'", request.verb)
             self._transport.send_error(incoming.route, error)
 
-    def _register_client(self, hello: requests.RegisterClient, route: bytes) -> State:
-        if hello.schema_version != SCHEMA:
+    def _register(self, registration: requests.RegisterClient, route: bytes) -> State:
+        if registration.schema_version != SCHEMA:
             raise RequestRefused(
-                f"this server speaks version {SCHEMA}, the client {hello.schema_version}; "
-                "use the same version of escape-hw on both sides"
+                f"this server speaks version {SCHEMA} of the protocol, the client version "
+                f"{registration.schema_version}; use the same version of escape-hw on both sides"
             )
-        self._leases.register_client(hello, route)
-        return self._state
+        self._leases.register_client(registration, route)
+        return self._published.state
 
-    def _acquire(
-        self, request: requests.AcquireLease, incoming: IncomingRequest, client: RegisteredClient
-    ) -> object:
+    def _acquire(self, request: requests.AcquireLease, client: RegisteredClient) -> object:
         lease = self._leases.acquire(client, request.take_over)
-        self._set_state(self._state)
+        self._published.update()
         return lease
 
-    def _release(
-        self, request: requests.ReleaseLease, incoming: IncomingRequest, client: RegisteredClient
-    ) -> None:
+    def _release(self, request: requests.ReleaseLease, client: RegisteredClient) -> None:
         self._leases.release(client)
-        self._set_state(self._state)
+        self._published.update()
 
     def _send_latest(self, request: requests.GetLatestSample, incoming: IncomingRequest) -> None:
         if request.stream not in STREAMS:
-            raise RequestRefused(f"no stream is called '{request.stream}'; there are {', '.join(STREAMS)}")
-        segment = {one.name: one.segment for one in self._state.streams}.get(request.stream)
+            raise RequestRefused(f"there is no stream '{request.stream}'; there are {', '.join(STREAMS)}")
+        segment = {one.name: one.segment for one in self._published.state.streams}.get(request.stream)
         head, data = self._sampler.latest(request.stream, segment, request.after)
-        self._transport.answer(incoming.route, head, data)
+        self._transport.send_reply(incoming.route, head, data)
 
     def _forward(self, incoming: IncomingRequest) -> None:
-        """Hand a request to the engine."""
-        if self._engine is None or self._engine.has_exited():
+        """Forward a request to the engine."""
+        engine = self._supervisor.running_engine
+        if engine is None:
             self._handle_without_engine(incoming)
             return
         if isinstance(incoming.request, requests.Shutdown):
-            self._stop_requested_s = time.monotonic()
-        number = self._next_request_id()
+            self._supervisor.note_stop_request()
+        number = next(self._numbers)
         self._pending[number] = PendingRequest(incoming, time.monotonic())
-        self._engine.send({"id": number, "request": _to_document(incoming.request)})
+        engine.send({"id": number, "request": incoming.request.model_dump(mode="json")})
 
     def _handle_without_engine(self, incoming: IncomingRequest) -> None:
-        """What can be done while there is no engine; the mirror is as the guardian left it."""
-        if isinstance(incoming.request, requests.Shutdown):
-            self._stopping = True
-        elif self._engine is not None:
-            raise RequestRefused("the engine has died, and its guardian makes the mirror safe; wait a moment")
-        elif isinstance(incoming.request, requests.ClearFault):
-            self._state = self._state.model_copy(update={"fault": None, "phase": Phase.STARTING})
-            self._engine = self._start_engine()
-        elif not isinstance(incoming.request, SAFETY_REQUESTS):
+        """Answer a request while there is no engine; the fail-safe process has made the mirror safe."""
+        request, supervisor = incoming.request, self._supervisor
+        if isinstance(request, requests.Shutdown):
+            supervisor.stopping = True
+        elif not supervisor.has_ended:
+            raise RequestRefused(
+                "the engine has died; the fail-safe process makes the mirror safe; try again"
+            )
+        elif isinstance(request, requests.ClearFault):
+            self._published.state = self._published.state.model_copy(
+                update={"fault": None, "phase": Phase.STARTING}
+            )
+            supervisor.start()
+        elif not isinstance(request, requests.SAFETY_REQUESTS):
             raise RequestRefused("the engine has died; clear the fault to start it again")
-        self._transport.answer(incoming.route, None)
-
-    def _next_request_id(self) -> int:
-        self._last_request_id += 1
-        return self._last_request_id
-
-
-def _to_document(request: requests.Request) -> dict[str, Any]:
-    return request.model_dump(mode="json")
+        self._transport.send_reply(incoming.route, None)
 
 
 class ClientKeyCheck:
-    """Says whether a key is allowed; asked at every connection, so that changes count at once."""
+    """Checks client keys at every connection, so that changes are effective at once."""
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Whether the client with this public key is let in."""
+        """Whether the client with this public key may connect."""
         names = [name for name, known in allowed_keys().items() if known == key]
         log.log(
             logging.INFO if names else logging.WARNING, "key %s: %s", key.decode(), names or "not allowed"
@@ -257,19 +293,19 @@ class ClientKeyCheck:
 
 
 class Server:
-    """A server that listens, from its sockets to its entry in the user's list; a context manager.
+    """A listening server with its sockets and its entry in the user's list; a context manager.
 
     Parameters
     ----------
     config
         The system.
     host, port
-        Address to listen on beside the local sockets; no port: none.
+        TCP address to listen on in addition to the local sockets; none without a port.
 
     Raises
     ------
     ConfigError
-        The system is served already, or the address cannot be had.
+        The system is served already, or the address is not available.
     """
 
     def __init__(self, config: SystemConfig, host: str = "127.0.0.1", port: int | None = None) -> None:
@@ -277,7 +313,7 @@ class Server:
         name, pid = config.system.name, os.getpid()
         running = find_server(name)
         if running is not None and running.alive:
-            raise ConfigError(f"'{name}' is served by process {running.pid} already; stop that one first")
+            raise ConfigError(f"'{name}' is already served by process {running.pid}; stop that server first")
         if running is not None:
             unregister_server(running)
         local = local_endpoint(name, pid)
@@ -308,10 +344,10 @@ class Server:
         self._transport.open(local)
         self._transport.open(tcp, keys=keys)
 
-    def run(self, stop: StopSignal, runs: Path, reads: tuple[Path, ...] = ()) -> None:
-        """Serve until told to stop."""
+    def run(self, stop: StopSignal, runs: Path, read_folders: tuple[Path, ...] = ()) -> None:
+        """Serve until ``stop`` is set; parameters as for :class:`FrontEnd`."""
         register_server(self.listing)
-        FrontEnd(self._config, self._transport, runs, reads).run(stop)
+        FrontEnd(self._config, self._transport, runs, read_folders).run(stop)
 
     def __enter__(self) -> Self:
         return self

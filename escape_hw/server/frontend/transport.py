@@ -1,4 +1,4 @@
-"""The front's sockets: what comes in is bounded, checked and counted; nothing here waits for anybody."""
+"""Non-blocking ZeroMQ endpoint of the server; validates and counts incoming messages."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from escape_hw.remote.state import State
 
 log = logging.getLogger(__name__)
 
-#: Longest request, bytes; a message beyond the second number breaks its connection.
+#: Longest request in bytes, and longest message, beyond which ZeroMQ closes the connection.
 MAX_REQUEST_BYTES, _MAX_MESSAGE_BYTES = 64 * 1024, 1024 * 1024
-#: Longest number of a request, bytes.
+#: Longest identifier of a request, bytes.
 _MAX_ID_BYTES = 64
-#: Messages that wait for a slow client before further ones are dropped.
+#: Messages queued for a slow client; further ones are dropped.
 _SEND_QUEUE = 200
-#: Messages taken in one go, so that a flood leaves time for everything else.
+#: Messages read in one call, so that a flood does not stop everything else.
 _MAX_BATCH = 100
 
 
 @dataclass(frozen=True, slots=True)
 class ReplyRoute:
-    """Where an answer goes: through which gate, to which connection, to which of its requests."""
+    """Address of a reply: socket pair, connection, and identifier of the request."""
 
     pair_index: int
     connection: bytes
@@ -41,32 +41,33 @@ class ReplyRoute:
 
     @property
     def sender(self) -> bytes:
-        """The connection, told apart from those at other gates."""
+        """Identity of the connection among those of all socket pairs."""
         return bytes([self.pair_index]) + self.connection
 
 
 @dataclass(frozen=True, slots=True)
 class IncomingRequest:
-    """A request and where its answer goes."""
+    """A request and the address of its reply."""
 
     route: ReplyRoute
     request: AnyRequest
 
 
 class ZmqTransport:
-    """Requests in, answers and events out, through one gate for this machine and one for others.
+    """Receives requests, sends replies and publishes events, on one socket pair per call of :meth:`open`.
 
     Parameters
     ----------
     context
-        ZeroMQ's.
+        ZeroMQ context.
 
     Attributes
     ----------
     refused
-        Messages that were no requests.
+        Number of messages that were refused.
     serial
-        Of the newest state that was told; stands in every answer, for clients that look at the state next.
+        Serial number of the newest published state. Every reply contains it, so that a client can wait for
+        the state that shows the effect of its request.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
@@ -75,23 +76,23 @@ class ZmqTransport:
 
     @property
     def sockets(self) -> tuple[zmq.Socket[bytes], ...]:
-        """What to poll for requests."""
+        """Sockets to poll for requests."""
         return tuple(router for router, _ in self._socket_pairs)
 
     def open(self, *endpoints: Endpoint, keys: KeyPair | None = None) -> None:
-        """Open a gate and listen.
+        """Listen on addresses.
 
         Parameters
         ----------
         endpoints
-            Where.
+            Addresses.
         keys
-            The server's own: clients without a key that is allowed get no answer and no event there.
+            Key pair of the server; with it, only clients with an allowed key get replies and events there.
 
         Raises
         ------
         ConfigError
-            An address is in use, or not this machine's.
+            An address is in use, or does not belong to this computer.
         """
         pair = (self._context.socket(zmq.ROUTER), self._context.socket(zmq.PUB))
         self._socket_pairs.append(pair)
@@ -110,7 +111,7 @@ class ZmqTransport:
                 _bind(socket, address)
 
     def receive_requests(self) -> Iterator[IncomingRequest]:
-        """What has arrived; what is no request is refused and counted."""
+        """Yield the requests that have arrived; other messages are refused and counted."""
         for pair_index, (router, _) in enumerate(self._socket_pairs):
             for _ in range(_MAX_BATCH):
                 try:
@@ -126,25 +127,29 @@ class ZmqTransport:
         route = ReplyRoute(pair_index, parts[0], number[:_MAX_ID_BYTES])
         try:
             if len(parts) != 3 or len(number) > _MAX_ID_BYTES:
-                raise RequestRefused(f"{len(parts) - 1} parts; a request has two: its number and its text")
+                raise RequestRefused(
+                    f"a message of {len(parts) - 1} parts; a request has two: identifier and JSON text"
+                )
             if len(parts[2]) > MAX_REQUEST_BYTES:
-                raise RequestRefused(f"{len(parts[2])} bytes; a request has at most {MAX_REQUEST_BYTES}")
+                raise RequestRefused(
+                    f"a message of {len(parts[2])} bytes; a request has at most {MAX_REQUEST_BYTES}"
+                )
             return IncomingRequest(route, REQUESTS.validate_json(parts[2]))
         except ValidationError as error:
-            self.refuse(route, RequestRefused(f"no request: {first_error(error)}"))
+            self.refuse(route, RequestRefused(f"not a valid request: {first_error(error)}"))
         except RequestRefused as error:
             self.refuse(route, error)
         return None
 
     def refuse(self, route: ReplyRoute, error: Exception) -> None:
-        """Refuse a request, and count it."""
+        """Refuse a message, and count it."""
         self.refused += 1
-        if self.refused & (self.refused - 1) == 0:  # 1, 2, 4, 8 ...: a flood does not fill the log
+        if self.refused & (self.refused - 1) == 0:  # log the 1st, 2nd, 4th, 8th ... only
             log.warning("request refused (%d so far): %s", self.refused, error)
         self.send_error(route, error)
 
-    def answer(self, route: ReplyRoute, answer: object, data: bytes | None = None) -> None:
-        """Answer a request."""
+    def send_reply(self, route: ReplyRoute, answer: object, data: bytes | None = None) -> None:
+        """Answer a request, optionally with bytes as a third part."""
         content = answer.model_dump(mode="json") if isinstance(answer, BaseModel) else to_plain_values(answer)
         self._send(route, {"ok": True, "answer": content}, data)
 
@@ -160,10 +165,10 @@ class ZmqTransport:
             router = self._socket_pairs[route.pair_index][0]
             router.send_multipart(parts if data is None else [*parts, data], zmq.NOBLOCK)
         except zmq.ZMQError as error:
-            log.info("an answer could not be sent: %s", error)
+            log.info("a reply could not be sent: %s", error)
 
     def publish(self, topic: str, document: BaseModel | Mapping[str, Any]) -> None:
-        """Tell everybody who listens."""
+        """Publish an event."""
         if isinstance(document, State):
             self.serial = document.serial
         text = (
@@ -178,7 +183,7 @@ class ZmqTransport:
                 log.debug("event %s dropped", topic)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the sockets."""
         for pair in self._socket_pairs:
             for socket in pair:
                 socket.close()

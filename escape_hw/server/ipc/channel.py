@@ -1,4 +1,10 @@
-"""JSON messages between the front end and the engine over a socket pair, and the engine's start-up settings. No pickle."""
+"""JSON messages between the front end and the engine over a socket pair, and the engine's start-up settings.
+
+Front end to engine: the settings, then ``{"heartbeat": true}``, ``{"id": N, "request": {...}}``,
+``{"make_safe": {"reason": ..., "remedy": ...}}``, ``{"stop": true}``. Engine to front end: ``{"reply": N,
+"answer": ...}`` or ``{"reply": N, "error": ...}``, and objects with the key ``state``, ``log``, ``progress``,
+``run``, ``ended`` or ``clean_exit``.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +13,7 @@ import json
 import logging
 import queue
 import socket
-import threading
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,61 +21,55 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from escape_hw.io.documents import to_plain_values
+from escape_hw.supervision import BackgroundThread
+
+log = logging.getLogger(__name__)
+
+#: Messages that may wait for a slow reader; further ones are dropped.
+_MAX_QUEUED = 1000
+#: Longest message.
+_MAX_LINE_BYTES = 16 << 20
 
 
 class EngineSetup(BaseModel):
-    """An engine's orders, sent by the front as the first message.
+    """Start-up settings of an engine, the first message from the front end.
 
     Parameters
     ----------
     config_text
-        The system's whole configuration, TOML.
+        The system's configuration, TOML.
     runs
-        Folder under which runs go.
-    reads
-        Folders that products may be loaded from.
-    first_run
+        Parent of the run folders.
+    read_folders
+        Further folders that products may be loaded from.
+    first_run_id
         Number of the first run.
-    silence_s
-        When the front was silent for so long, the mirror is made safe.
+    front_end_timeout_s
+        Silence of the front end after which the mirror is made safe.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     config_text: str
     runs: Path
-    reads: tuple[Path, ...]
-    first_run: int = 1
-    silence_s: float = 15.0
-
-
-log = logging.getLogger(__name__)
-
-#: The most that may wait for a reader that is slow; older messages give way.
-_MAX_QUEUED = 1000
-#: A line longer than this is no message.
-_MAX_LINE_BYTES = 16 << 20
+    read_folders: tuple[Path, ...]
+    first_run_id: int = 1
+    front_end_timeout_s: float = 15.0
 
 
 def encode(message: Mapping[str, Any]) -> bytes:
-    """A message as a line."""
+    """Encode a message as one line of JSON."""
     return json.dumps(to_plain_values(message), separators=(",", ":"), allow_nan=False).encode() + b"\n"
 
 
 class MessageDecoder:
-    """Cuts a stream of bytes into messages.
-
-    Raises
-    ------
-    ValueError
-        What came is no message.
-    """
+    """Splits a stream of bytes into messages."""
 
     def __init__(self) -> None:
         self._incomplete = b""
 
     def feed(self, data: bytes) -> Iterator[dict[str, Any]]:
-        """The messages that are complete with these bytes."""
+        """Yield the messages that these bytes complete (ValueError: A line is too long or no JSON)."""
         *lines, self._incomplete = (self._incomplete + data).split(b"\n")
         if len(self._incomplete) > _MAX_LINE_BYTES:
             raise ValueError(f"a message of more than {_MAX_LINE_BYTES} bytes")
@@ -78,7 +78,7 @@ class MessageDecoder:
 
 
 class Channel:
-    """The engine's end: messages are handed over at once and sent by a thread, so that no loop waits.
+    """The engine's end of the connection. A thread sends the messages, so that no caller waits.
 
     Parameters
     ----------
@@ -89,20 +89,18 @@ class Channel:
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
         self._queue: queue.Queue[bytes | None] = queue.Queue(_MAX_QUEUED)
-        self.dropped = 0
-        self._sender = threading.Thread(target=self._send, name="sender", daemon=True)
+        self._last_message_s = time.monotonic()
+        self._sender = BackgroundThread("sender", self._send)
         self._sender.start()
 
     def post(self, message: Mapping[str, Any]) -> None:
-        """Hand a message over; it is dropped, and counted, when the reader is too slow."""
-        try:
+        """Queue a message; it is dropped when the front end reads too slowly."""
+        with contextlib.suppress(queue.Full):
             self._queue.put_nowait(encode(message))
-        except queue.Full:
-            self.dropped += 1
 
     def messages(self) -> Iterator[dict[str, Any]]:
-        """What arrives, until the other side hangs up."""
-        lines = MessageDecoder()
+        """Yield the messages that arrive, until the other side closes the connection."""
+        decoder = MessageDecoder()
         while True:
             try:
                 data = self._connection.recv(65536)
@@ -111,23 +109,29 @@ class Channel:
                 return
             if not data:
                 return
-            yield from lines.feed(data)
+            self._last_message_s = time.monotonic()
+            yield from decoder.feed(data)
 
     @property
     def has_unread(self) -> bool:
-        """Whether something has arrived that nobody took yet; the end of it does not count."""
+        """Whether a message has arrived that was not read yet; the end of the connection is none."""
         try:
             return bool(self._connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
         except OSError:
             return False
 
+    @property
+    def silence_s(self) -> float:
+        """Seconds since the last message; 0 while one is unread, since the reader is late then."""
+        return 0.0 if self.has_unread else time.monotonic() - self._last_message_s
+
     def close(self) -> None:
-        """Send what waits, and hang up."""
+        """Send the queued messages and close the connection."""
         with contextlib.suppress(queue.Full):
             self._queue.put(None, timeout=1)
-        self._sender.join(timeout=2)
+        self._sender.stop(timeout_s=2)
         with contextlib.suppress(OSError):
-            # A reader of the same socket waits in recv, which closing alone does not end.
+            # A thread that waits in recv is not woken by close() alone.
             self._connection.shutdown(socket.SHUT_RDWR)
         self._connection.close()
 
@@ -136,5 +140,5 @@ class Channel:
             try:
                 self._connection.sendall(line)
             except OSError:
-                # The reader has gone; the engine learns it from the end of what it reads.
+                # The front end is gone; messages() ends as well.
                 return

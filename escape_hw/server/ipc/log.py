@@ -1,4 +1,4 @@
-"""Log records of the front end and the engine: conversion to documents for clients, numbering, memory and rotating file."""
+"""Log records of the front end and the engine: documents for clients, numbers, memory and a rotating file."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from pathlib import Path
 from escape_hw.io.provenance import format_utc
 from escape_hw.remote.state import LogLine
 
-#: A traceback is for the log file; a line for clients ends here.
+#: Longest text of a line, characters.
 _MAX_TEXT = 4000
+#: Lines kept in memory, bytes of a file, and number of older files.
+_LINES, _BYTES, _FILES = 5000, 5_000_000, 4
+_PACKAGES = ("escape_hw", "escape_sim", "escape_drivers")
 
 
 class LogForwarder(logging.Handler):
-    """Hands every record on as a line, from INFO upwards; the front numbers them."""
+    """Passes every record from INFO upwards to a function, as a line with number 0."""
 
     def __init__(self, forward: Callable[[LogLine], object]) -> None:
         super().__init__(logging.INFO)
@@ -25,36 +28,28 @@ class LogForwarder(logging.Handler):
         self.setFormatter(logging.Formatter("%(message)s"))
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hand one record on."""
+        """Forward one record."""
         try:
+            at_utc = format_utc(datetime.fromtimestamp(record.created, UTC))
+            text = self.format(record)[:_MAX_TEXT]
             self._forward(
-                LogLine(
-                    number=0,
-                    at_utc=format_utc(datetime.fromtimestamp(record.created, UTC)),
-                    level=record.levelname,
-                    logger=record.name,
-                    text=self.format(record)[:_MAX_TEXT],
-                )
+                LogLine(number=0, at_utc=at_utc, level=record.levelname, logger=record.name, text=text)
             )
         except Exception:
             self.handleError(record)
 
 
-#: Lines that are kept in memory, bytes of a file, and files.
-_LINES, _BYTES, _FILES = 5000, 5_000_000, 4
-_PACKAGES = ("escape_hw", "escape_sim", "escape_drivers")
+def forward_log(forward: Callable[[LogLine], object]) -> LogForwarder:
+    """Forward the records of ESCAPE's packages; returns the handler."""
+    handler = LogForwarder(forward)
+    for name in _PACKAGES:
+        logging.getLogger(name).addHandler(handler)
+    logging.getLogger("escape_hw").setLevel(logging.INFO)
+    return handler
 
 
 class ServerLog:
-    """Numbers the lines of front and engine alike.
-
-    Parameters
-    ----------
-    path
-        The file; older ones get numbers.
-    tell
-        Gets every line.
-    """
+    """Numbers, stores and publishes the lines of front end and engine."""
 
     def __init__(self, path: Path, publish: Callable[[LogLine], object]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -63,36 +58,24 @@ class ServerLog:
         self._file = logging.handlers.RotatingFileHandler(
             path, maxBytes=_BYTES, backupCount=_FILES, encoding="utf-8"
         )
-        self._handler = LogForwarder(self.add)
-        package = logging.getLogger("escape_hw")
-        self._level = package.level
-        package.setLevel(logging.INFO)
-        for name in _PACKAGES:
-            logging.getLogger(name).addHandler(self._handler)
+        self._level = logging.getLogger("escape_hw").level
+        self._handler = forward_log(self.add)
 
     def add(self, line: LogLine) -> None:
-        """Take a line in, from this process or another."""
+        """Add a line of this process or the engine."""
         line = line.model_copy(update={"number": self._next})
         self._next += 1
         self._lines.append(line)
-        record = logging.LogRecord(
-            line.logger,
-            logging.INFO,
-            "",
-            0,
-            f"{line.at_utc} {line.level} {line.logger}: {line.text}",
-            None,
-            None,
-        )
-        self._file.emit(record)
+        text = f"{line.at_utc} {line.level} {line.logger}: {line.text}"
+        self._file.emit(logging.LogRecord(line.logger, logging.INFO, "", 0, text, None, None))
         self._publish(line)
 
     def after(self, number: int, count: int) -> list[LogLine]:
-        """The newest lines after a number, at most so many."""
+        """The newest ``count`` lines with a larger number."""
         return [line for line in self._lines if line.number > number][-count:]
 
     def close(self) -> None:
-        """Hear no more."""
+        """Stop logging."""
         for name in _PACKAGES:
             logging.getLogger(name).removeHandler(self._handler)
         logging.getLogger("escape_hw").setLevel(self._level)

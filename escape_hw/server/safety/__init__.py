@@ -1,1 +1,4 @@
-"""What makes the mirror safe when something fails: limits on the engine's state, the fail-safe process, and the journal of how the previous server ended. Limits on single commands are in escape_hw.safety."""
+"""Safety of a server: limits on the engine's state, the fail-safe process, the journal.
+
+Limits on single commands are in :mod:`escape_hw.safety`.
+"""

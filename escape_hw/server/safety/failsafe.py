@@ -1,4 +1,4 @@
-"""The guardian: a small process that makes the mirror safe when the engine died without a goodbye."""
+"""The fail-safe process: flattens the mirror when the engine died without a clean exit."""
 
 from __future__ import annotations
 
@@ -12,27 +12,29 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
-from escape_hw.streams.segments import process_start
+from escape_hw.supervision import is_alive
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
-#: A mirror that cannot be opened (its old connection may still stand) is tried again for so long.
+#: Message on the pipe before an engine ends with a flat mirror.
+CLEAN_EXIT = b"clean"
+#: Time for which opening the mirror is tried again; the engine's connection may still exist.
 RETRY_S = 20.0
 _RETRY_PERIOD_S = 0.2
 
 
 class FailsafeSettings(BaseModel):
-    """Whom a guardian watches, on its standard input.
+    """Settings of the fail-safe process, read from its standard input.
 
     Parameters
     ----------
     config_text
-        The system's whole configuration, TOML.
+        The system's configuration, TOML.
     incidents
-        Folder to write down in what happened.
+        Folder of the reports.
     pid, started
-        The engine's process, and when that began in clock ticks after boot.
+        The engine's process, and its start time in clock ticks after boot.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -44,16 +46,18 @@ class FailsafeSettings(BaseModel):
 
 
 class IncidentReport(BaseModel):
-    """What a guardian found and did.
+    """Report of the fail-safe process after the death of an engine.
 
     Parameters
     ----------
     mirror
-        What became of the mirror, for people.
+        State of the mirror, for people.
     flat
-        Whether it is flat; ``None``: it was a twin, which ended with its engine.
+        Whether it is flat; ``None`` for a simulated mirror, which ended with its engine.
+    seconds
+        Time from the death of the engine to the report.
     segments
-        Segments of shared memory that were cleared away.
+        Segments of shared memory that were removed.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -68,28 +72,28 @@ class IncidentReport(BaseModel):
 
 
 def wait_for_end(descriptor: int) -> bool:
-    """Wait until the pipe's other end is closed; true when a goodbye came first."""
+    """Wait until the engine's end of the pipe is closed; true when the engine ended cleanly."""
     received = b""
     while data := os.read(descriptor, 16):
         received += data
-    return received.startswith(b"bye")
+    return received.startswith(CLEAN_EXIT)
 
 
 def make_safe(settings: FailsafeSettings) -> IncidentReport:
-    """Flatten the mirror of an engine that is gone, and clear up after it."""
+    """Flatten the mirror of a dead engine and remove its shared memory."""
     from escape_hw.config.loader import load_text
     from escape_hw.streams.segments import remove_orphaned
 
     began = time.monotonic()
     config = load_text(settings.config_text)
-    while process_start(settings.pid) == settings.started:
-        # Only one process may hold the mirror.
+    while is_alive(settings.pid, settings.started):
+        # Only one process can open the mirror.
         time.sleep(0.01)
-    flat, words = _flatten(config)
-    reaped = tuple(one.name for one in remove_orphaned(settings.pid))
+    flat, outcome = _flatten(config)
+    removed = tuple(one.name for one in remove_orphaned(settings.pid))
     return IncidentReport(
         at_utc=datetime.now(UTC).isoformat(timespec="seconds"), system=config.system.name, pid=settings.pid,
-        mirror=words, flat=flat, seconds=time.monotonic() - began, segments=reaped,
+        mirror=outcome, flat=flat, seconds=time.monotonic() - began, segments=removed,
     )  # fmt: skip
 
 
@@ -100,13 +104,13 @@ def _flatten(config: SystemConfig) -> tuple[bool | None, str]:
     from escape_hw.errors import EscapeError
 
     if resolve_mode(config.devices.dm, config) == "sim":
-        return None, "the mirror is a twin and ended with its engine"
+        return None, "the mirror is simulated and ended with its engine"
     deadline = time.monotonic() + RETRY_S
     while True:
         try:
             mirror = build_device("dm", config, DeformableMirror)  # type: ignore[type-abstract]
             if isinstance(mirror, AdaptiveSecondary):
-                # A shell that has gone to rest meanwhile is safe; closing flattens and rests one that floats.
+                # A rested shell is safe and is not lifted; closing rests one that floats.
                 mirror.lift = False
             with mirror:
                 mirror.flatten()
@@ -118,7 +122,7 @@ def _flatten(config: SystemConfig) -> tuple[bool | None, str]:
 
 
 def write_report(report: IncidentReport, folder: Path) -> Path:
-    """Write down what happened, for the next start to tell."""
+    """Write the report; the next start of the server shows it."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{report.system}-{report.pid}.incident.json"
     temporary = path.with_suffix(".tmp")
@@ -128,7 +132,7 @@ def write_report(report: IncidentReport, folder: Path) -> Path:
 
 
 def main() -> None:
-    """Watch the engine behind the pipe whose descriptor is the only argument."""
+    """Run the fail-safe process; ``argv`` holds the descriptor of the engine's pipe."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     settings = FailsafeSettings.model_validate_json(sys.stdin.buffer.read())

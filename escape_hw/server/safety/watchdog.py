@@ -1,4 +1,4 @@
-"""Verdicts on the engine's state: when the mirror has to be made safe."""
+"""Limits on the engine's state in closed loop; the mirror is made safe when one is exceeded."""
 
 from __future__ import annotations
 
@@ -11,51 +11,43 @@ from dataclasses import dataclass
 from escape_hw.config.system import ServerSection
 from escape_hw.remote.state import State
 
-#: Seconds over which the present and the usual residual are taken, and those without which none is judged.
+#: Seconds of the present residual, of its baseline, and of the shortest history that is checked.
 _RECENT_S, _BASELINE_S, _MIN_HISTORY_S = 1.0, 30.0, 4.0
-#: A residual that follows the one before sooner is left out: states told out of turn weigh no more.
+#: Least interval of residuals; states that are published in between are ignored.
 _MIN_SPACING_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class LimitViolation:
-    """Why the mirror has to be made safe, and what the operator can do then."""
+    """A limit that is exceeded, and what the operator can do."""
 
     reason: str
-    way_out: str
+    remedy: str
 
 
 class Watchdog:
-    """Looks at every state of an engine.
-
-    Parameters
-    ----------
-    limits
-        The configured limits.
-    clock
-        Monotonic seconds.
-    """
+    """Checks every state of the engine against the configured limits."""
 
     def __init__(self, limits: ServerSection, clock: Callable[[], float] = time.monotonic) -> None:
         self._limits, self._clock = limits, clock
         self._frames = -1
-        #: Since when something was seen to be so, state after state. What was not told is held against
-        #: nobody: this process itself may have been held up.
+        #: Start times of conditions that hold in every state since. Gaps between states do not count
+        #: towards the limits, since this process itself may have been delayed.
         self._no_frames_since: float | None = None
         self._clipped_since: float | None = None
         self._diverging_since: float | None = None
-        #: Residuals and when they were told.
+        #: Times and residuals in nm.
         self._residuals: deque[tuple[float, float]] = deque()
-        #: Whether a loop is closed, by which run, and after how many flattenings of the mirror: a run may
-        #: close its own, or close it again, before anybody sees one open.
+        #: Identity of the closed loop: closed, run, and count of flattenings. A run may open and close the
+        #: loop between two states.
         self._loop: tuple[bool, int | None, int] = (False, None, 0)
 
     def check(self, state: State) -> LimitViolation | None:
-        """The verdict on a state; ``None``: all is well."""
+        """Check a state; returns the limit that it exceeds, or ``None``."""
         if state.fault is not None:
             return None
-        run = None if state.procedure is None else state.procedure.id
-        loop = state.loop.closed, run, state.mirror.flattened
+        run = None if state.active_run is None else state.active_run.id
+        loop = state.loop.closed, run, state.mirror.flatten_count
         if loop != self._loop:
             self._loop = loop
             self._residuals.clear()
@@ -74,12 +66,12 @@ class Watchdog:
             return None
         return LimitViolation(
             f"no frame for {silent:.1f} s in closed loop (limit {limit:g} s)",
-            "look at the sensor's camera and its cable, then clear the fault",
+            "Check the sensor's camera and its cable, then clear the fault.",
         )
 
     def _check_saturation(self, state: State) -> LimitViolation | None:
-        now, limit, max_share = self._clock(), self._limits.saturated_s, self._limits.saturated_share
-        if not state.loop.closed or state.mirror.clipped <= max_share:
+        now, limit, max_share = self._clock(), self._limits.saturated_s, self._limits.saturated_fraction
+        if not state.loop.closed or state.mirror.saturated_share <= max_share:
             self._clipped_since = None
             return None
         if self._clipped_since is None:
@@ -87,9 +79,9 @@ class Watchdog:
         if now - self._clipped_since <= limit:
             return None
         return LimitViolation(
-            f"{100 * state.mirror.clipped:.0f} % of the actuators at their limits for "
+            f"{100 * state.mirror.saturated_share:.0f} % of the actuators at their limits for "
             f"{now - self._clipped_since:.1f} s (limit {100 * max_share:.0f} % for {limit:g} s)",
-            "lower the gain, take another matrix, or wait for better seeing; then clear the fault",
+            "Lower the gain, use another matrix, or wait for better seeing; then clear the fault.",
         )
 
     def _check_divergence(self, state: State) -> LimitViolation | None:
@@ -97,7 +89,7 @@ class Watchdog:
             return None
         now, samples = self._clock(), self._residuals
         if samples and (state.loop.residual_nm == samples[-1][1] or now - samples[-1][0] < _MIN_SPACING_S):
-            # No frame since the last state: a procedure that closes a loop of its own has not begun with it.
+            # No new residual: a procedure that closes the loop itself has not started to.
             return None
         samples.append((now, state.loop.residual_nm))
         while now - samples[0][0] > _BASELINE_S:
@@ -116,7 +108,7 @@ class Watchdog:
         if now - self._diverging_since < limit:
             return None
         return LimitViolation(
-            f"the residual grew to {present:.0f} nm, {present / baseline:.1f} times the usual {baseline:.0f} nm "
-            f"(limit {factor:g} times for {limit:g} s)",
-            "lower the gain or take another matrix, then clear the fault",
+            f"the residual grew to {present:.0f} nm, {present / baseline:.1f} times its median of "
+            f"{baseline:.0f} nm (limit {factor:g} times for {limit:g} s)",
+            "Lower the gain or use another matrix, then clear the fault.",
         )

@@ -1,1 +1,4 @@
-"""Recording of streams to disk and reading the files back."""
+"""Recording of streams to disk, and reading of the files.
+
+The rings themselves are in ``escape_hw.streams``.
+"""

@@ -1,8 +1,7 @@
-"""Files of recorded streams: written in blocks, read back whole.
+"""Files of recorded streams, written in blocks.
 
-A stream's file is a sequence of blocks, each a number of entries of one shape: a NumPy array of
-:data:`HEADER` fields and one of the data, both in NumPy's own file format, one after the other. A file
-that was cut off is legible up to its last whole block.
+A file is a sequence of blocks. A block has entries of one shape: a NumPy array of :data:`HEADER` fields and
+one of the data, both in NumPy's file format. A truncated file is readable up to its last complete block.
 """
 
 from __future__ import annotations
@@ -19,27 +18,27 @@ from numpy.typing import NDArray
 from escape_hw.api.representation import short_repr
 from escape_hw.errors import ProductError
 
-#: What stands before the data of a block, one for each entry.
+#: Fields of each entry, before the data of a block.
 HEADER = np.dtype([("index", "i8"), ("exposed_ns", "i8"), ("arrived_ns", "i8")])
 SUFFIX = ".blocks"
 
 
 def write_block(file: IO[bytes], head: NDArray[Any], data: NDArray[Any]) -> int:
-    """Append a block to an unbuffered file; half a block is taken back. Returns its bytes.
+    """Append a block to an unbuffered file and return its size in bytes; a partial block is removed.
 
     Raises
     ------
     OSError
-        The disk is full, or gone.
+        The disk is full or not available.
     """
     at = file.tell()
     try:
         for array in (head, data):
-            complete = np.ascontiguousarray(array)
+            contiguous = np.ascontiguousarray(array)
             front = io.BytesIO()
-            np.lib.format.write_array_header_1_0(front, np.lib.format.header_data_from_array_1_0(complete))
+            np.lib.format.write_array_header_1_0(front, np.lib.format.header_data_from_array_1_0(contiguous))
             _write_all(file, front.getvalue())
-            _write_all(file, complete.reshape(-1).view(np.uint8).data)
+            _write_all(file, contiguous.reshape(-1).view(np.uint8).data)
     except OSError:
         file.seek(at)
         file.truncate(at)
@@ -55,9 +54,9 @@ def _write_all(file: IO[bytes], content: bytes | memoryview) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """A stream read back: ``index``, ``exposed_ns`` and ``arrived_ns`` ``(n,)``, and ``data`` ``(n, ...)``.
+    """A recorded stream: ``index``, ``exposed_ns`` and ``arrived_ns`` ``(n,)``, and ``data`` ``(n, ...)``.
 
-    ``complete`` is false when the file ends in the middle of a block, which is left out.
+    ``complete`` is false when the file ends within a block, which is not read.
     """
 
     index: NDArray[np.int64]
@@ -69,7 +68,7 @@ class Recording:
 
 
 def read_recording(path: Path) -> list[Recording]:
-    """A recorded stream, one part for each stretch of entries of one shape.
+    """Read a recorded stream, one part per sequence of entries of one shape.
 
     Parameters
     ----------
@@ -79,7 +78,7 @@ def read_recording(path: Path) -> list[Recording]:
     Raises
     ------
     ProductError
-        There is no such file, or it is none of a recorder.
+        The file does not exist or is not a recording.
     """
     blocks: list[tuple[NDArray[Any], NDArray[Any]]] = []
     complete = True
@@ -93,12 +92,12 @@ def read_recording(path: Path) -> list[Recording]:
                 except (ValueError, EOFError) as error:
                     if not blocks:
                         raise ProductError(
-                            f"{path}: no whole block of a recording in it ({error})"
+                            f"{path}: contains no complete block of a recording ({error})"
                         ) from error
                     complete = False
                     break
                 if head.dtype != HEADER or len(head) != len(data):
-                    raise ProductError(f"{path}: no recording of ESCAPE, or damaged at byte {file.tell()}")
+                    raise ProductError(f"{path}: not a recording of ESCAPE, or damaged at byte {file.tell()}")
                 blocks.append((head, data))
     except OSError as error:
         raise ProductError(f"{path}: cannot be read ({error.strerror or error})") from error
@@ -108,7 +107,7 @@ def read_recording(path: Path) -> list[Recording]:
 def _group_by_shape(
     blocks: list[tuple[NDArray[Any], NDArray[Any]]],
 ) -> list[list[tuple[NDArray[Any], NDArray[Any]]]]:
-    """Blocks that follow each other with entries of one shape, together."""
+    """Group consecutive blocks with entries of one shape."""
     parts: list[list[tuple[NDArray[Any], NDArray[Any]]]] = []
     for head, data in blocks:
         last = parts[-1][-1][1] if parts else None

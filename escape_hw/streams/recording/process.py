@@ -1,7 +1,4 @@
-"""A recorder in a process of its own: started, asked how far it is, and stopped.
-
-It ends by itself when whoever started it is gone: its standard input ends then.
-"""
+"""A recorder in a process of its own, which ends with its parent."""
 
 from __future__ import annotations
 
@@ -10,19 +7,19 @@ import logging
 import os
 import subprocess
 import sys
-import threading
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
 from escape_hw.errors import StorageError
-from escape_hw.streams.recording.recorder import MIN_FREE_BYTES, RecordingState, StreamRecorder
+from escape_hw.streams.recording.recorder import MIN_FREE_BYTES, RecordingProgress, StreamRecorder
+from escape_hw.supervision import BackgroundThread, ChildProcess, watch_standard_input
 
 log = logging.getLogger(__name__)
 
-#: Seconds that a recorder may take to write what it has.
+#: Seconds that a recorder may take to write its queue.
 _STOP_TIMEOUT_S = 10.0
-#: Behind a loop, before screens: what it misses for a tenth of a second is not recorded.
+#: Lower priority than a loop, higher than displays.
 _NICE = 5
 
 
@@ -31,60 +28,57 @@ class RecorderProcess:
 
     Parameters
     ----------
-    folder, streams, least_free
+    folder, streams, min_free_bytes
         As for :class:`~escape_hw.streams.recording.recorder.StreamRecorder`.
+
+    Raises
+    ------
+    StorageError
+        The process cannot be started.
     """
 
-    def __init__(self, folder: Path, streams: Mapping[str, str], *, least_free: int = MIN_FREE_BYTES) -> None:
+    def __init__(
+        self, folder: Path, streams: Mapping[str, str], *, min_free_bytes: int = MIN_FREE_BYTES
+    ) -> None:
         self.folder = folder
-        self._state = RecordingState()
-        request = json.dumps({"folder": str(folder), "streams": dict(streams), "least_free": least_free})
+        self._state = RecordingProgress()
+        request = {"folder": str(folder), "streams": dict(streams), "min_free_bytes": min_free_bytes}
         try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", __name__, request],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
-            )  # fmt: skip
+            self._process = ChildProcess(
+                __name__, json.dumps(request), stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            )
         except OSError as error:
-            raise StorageError(f"{folder}: no recorder can be started ({error})") from error
-        self._listener = threading.Thread(target=self._listen, name="recorder's word", daemon=True)
+            raise StorageError(f"{folder}: the recorder cannot be started ({error})") from error
+        self._listener = BackgroundThread("recorder state", self._listen)
         self._listener.start()
 
     @property
-    def state(self) -> RecordingState:
-        """How far it was about a second ago."""
+    def state(self) -> RecordingProgress:
+        """Progress about a second ago."""
         return self._state
 
     @property
     def running(self) -> bool:
-        """Whether it still records."""
-        return self._process.poll() is None
+        """Whether the process has not ended."""
+        return self._process.running
 
-    def stop(self) -> RecordingState:
-        """Let it write what it has, and end it. Returns how far it came; may be repeated."""
-        process = self._process
-        if process.stdin is not None:
-            process.stdin.close()
-        try:
-            process.wait(_STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+    def stop(self) -> RecordingProgress:
+        """Let the process write its queue and end; returns the final state. May be repeated."""
+        self._process.stdin.close()
+        if not self._process.wait_or_kill(_STOP_TIMEOUT_S):
             self._state.fault = (
-                f"{self.folder}: the recorder did not end within {_STOP_TIMEOUT_S:g} s; was the disk stuck?"
+                f"{self.folder}: the recorder did not end within {_STOP_TIMEOUT_S:g} s; check the disk"
             )
         self._listener.join(_STOP_TIMEOUT_S)
         return self._state
 
     def _listen(self) -> None:
-        """Take its word, line by line; in a thread."""
-        out = self._process.stdout
-        if out is None:
-            return
-        with out:
+        """Read the states that the process prints, until it ends."""
+        with self._process.stdout as out:
             for line in out:
-                self._state = RecordingState(**json.loads(line))
-        if self._process.wait() and not self._state.fault:
-            self._state.fault = f"{self.folder}: the recorder ended with code {self._process.returncode}"
+                self._state = RecordingProgress(**json.loads(line))
+        if (code := self._process.wait()) and not self._state.fault:
+            self._state.fault = f"{self.folder}: the recorder ended with code {code}"
             log.error(self._state.fault)
 
 
@@ -92,22 +86,18 @@ def main() -> None:
     """Record what the command line says until standard input ends."""
     os.nice(_NICE)
     request = json.loads(sys.argv[1])
-    stop_event = threading.Event()
+    stop = watch_standard_input()
 
-    def wait_for_eof() -> None:
-        sys.stdin.read()
-        stop_event.set()
-
-    def print_state(state: RecordingState) -> None:
+    def print_state(state: RecordingProgress) -> None:
         try:
             print(json.dumps(asdict(state)), flush=True)
         except BrokenPipeError:
-            # Nobody listens any more.
-            stop_event.set()
+            stop.set()
 
-    threading.Thread(target=wait_for_eof, daemon=True).start()
-    recorder = StreamRecorder(Path(request["folder"]), request["streams"], least_free=request["least_free"])
-    recorder.run(stop_event.is_set, print_state)
+    recorder = StreamRecorder(
+        Path(request["folder"]), request["streams"], min_free_bytes=request["min_free_bytes"]
+    )
+    recorder.run(stop.is_set, print_state)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Telemetry at full rate to disk: every entry of some streams, by a process that nobody waits for.
+"""Recording of streams at full rate.
 
-The recorder reads rings as any other reader does, so that a slow or full disk cannot hold up the loop:
-what it did not get in time, or had no room for, is counted as dropped.
+The recorder is an ordinary reader of the rings, so that a slow or full disk does not delay the loop. Entries
+that it read too late, or had no room for, are counted as dropped.
 """
 
 from __future__ import annotations
@@ -22,31 +22,32 @@ from numpy.typing import NDArray
 
 from escape_hw.streams.recording.block_file import HEADER, SUFFIX, write_block
 from escape_hw.streams.ring import RingReader, Sample
+from escape_hw.supervision import BackgroundThread
 
 log = logging.getLogger(__name__)
 
-#: Bytes gathered before they are written, and seconds after which they are in any case.
+#: Size of a block in bytes, and the time after which a smaller one is written.
 _BLOCK_BYTES, _BLOCK_S = 4 << 20, 1.0
-#: Bytes that may wait for the disk.
+#: Largest number of bytes that wait for the disk.
 MAX_QUEUED_BYTES = 128 << 20
-#: Seconds between two looks at rings that had nothing new.
+#: Polling period of rings without new entries, seconds.
 _POLL_S = 0.0005
-#: Bytes to leave on the disk for everybody else.
+#: Free bytes on the disk below which a recording ends.
 MIN_FREE_BYTES = 256 << 20
 
 
 @dataclass(slots=True)
-class RecordingState:
-    """How far a recording is.
+class RecordingProgress:
+    """Progress of a recording.
 
     Parameters
     ----------
     written, dropped
-        Entries on disk, and those that were not written because reader or disk were behind.
+        Entries on disk, and entries lost because the reader or the disk was too slow.
     size
         Bytes on disk.
     fault
-        Why it ended by itself; empty while it runs.
+        Why it ended without a request; empty while it runs.
     """
 
     written: int = 0
@@ -57,7 +58,7 @@ class RecordingState:
 
 @dataclass(slots=True, eq=False)
 class _StreamBuffer:
-    """One stream on its way to its file."""
+    """Entries of one stream that are not in a block yet."""
 
     reader: RingReader
     file: IO[bytes]
@@ -67,19 +68,19 @@ class _StreamBuffer:
     since: float = 0.0
 
     def has_shape_of(self, sample: Sample) -> bool:
-        """Whether an entry is like those gathered."""
+        """Whether an entry has the shape and type of the others."""
         first = self.arrays[0] if self.arrays else sample.data
         return first.shape == sample.data.shape and first.dtype == sample.data.dtype
 
     def add(self, sample: Sample) -> None:
-        """Gather an entry."""
+        """Add an entry."""
         self.since = self.since if self.arrays else time.monotonic()
         self.heads.append((sample.index, sample.exposed_ns, sample.arrived_ns))
         self.arrays.append(sample.data)
         self.size += sample.data.nbytes
 
     def is_due(self) -> bool:
-        """Whether what was gathered is enough, or has waited long enough, for a block."""
+        """Whether the entries are large or old enough for a block."""
         return bool(self.arrays) and (self.size >= _BLOCK_BYTES or time.monotonic() - self.since > _BLOCK_S)
 
 
@@ -87,28 +88,31 @@ _Block = tuple[IO[bytes], list[tuple[int, int, int]], list[NDArray[Any]], int]
 
 
 class StreamRecorder:
-    """Writes streams to a folder until told to stop; best in a process of its own.
+    """Writes streams to a folder until stopped; best in a process of its own.
 
     Parameters
     ----------
     folder
-        Gets ``NAME.blocks`` for each stream; see :func:`~escape_hw.streams.recording.block_file.read_recording`.
+        Destination of ``NAME.blocks`` of each stream; read with
+        :func:`~escape_hw.streams.recording.block_file.read_recording`.
     streams
-        Segment by stream's name.
-    least_free
-        Bytes that stay free on the disk; the recording ends before.
+        Segment by name of the stream.
+    min_free_bytes
+        Free bytes on the disk below which the recording ends.
 
     Raises
     ------
     StreamGone
-        A segment is not there.
+        A segment does not exist.
     OSError
         The folder cannot be written to.
     """
 
-    def __init__(self, folder: Path, streams: Mapping[str, str], *, least_free: int = MIN_FREE_BYTES) -> None:
-        self.folder, self._min_free_bytes = folder, least_free
-        self.state = RecordingState()
+    def __init__(
+        self, folder: Path, streams: Mapping[str, str], *, min_free_bytes: int = MIN_FREE_BYTES
+    ) -> None:
+        self.folder, self._min_free_bytes = folder, min_free_bytes
+        self.state = RecordingProgress()
         self._queue: queue.SimpleQueue[_Block | None] = queue.SimpleQueue()
         self._queued_bytes, self._lock = 0, threading.Lock()
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,10 +128,10 @@ class StreamRecorder:
     def run(
         self,
         is_stopped: Callable[[], bool],
-        on_state: Callable[[RecordingState], object] = lambda state: None,
-    ) -> RecordingState:
-        """Record until ``is_stopped``, a full disk, or the end of all streams; ``on_state`` hears once a second."""
-        writer = threading.Thread(target=self._write, name="recorder", daemon=True)
+        on_state: Callable[[RecordingProgress], object] = lambda state: None,
+    ) -> RecordingProgress:
+        """Record until ``is_stopped``, a full disk or the end of all streams; ``on_state`` gets the state."""
+        writer = BackgroundThread("recorder", self._write)
         writer.start()
         next_report = 0.0
         with self._opened:
@@ -152,11 +156,11 @@ class StreamRecorder:
         return self.state
 
     def _read_new(self) -> bool:
-        """Read what is new; whether anything was."""
+        """Read new entries; whether there were any."""
         new = False
         for buffer in self._buffers:
             missed = buffer.reader.missed
-            # At most a ring full, so that every stream gets its turn.
+            # At most one ring, so that all streams are read in turn.
             for _ in range(buffer.reader.slots):
                 sample = buffer.reader.next()
                 if sample is None:
@@ -171,7 +175,7 @@ class StreamRecorder:
         return new
 
     def _enqueue_block(self, buffer: _StreamBuffer) -> None:
-        """Give a block to the writer, unless too much waits there already."""
+        """Queue a block for the writer, or drop it when the queue is full."""
         if not buffer.arrays:
             return
         if self._queued_bytes + buffer.size > MAX_QUEUED_BYTES:
@@ -183,7 +187,7 @@ class StreamRecorder:
         buffer.heads, buffer.arrays, buffer.size = [], [], 0
 
     def _write(self) -> None:
-        """Write blocks; in a thread of its own. After a failure the rest is dropped, and counted."""
+        """Write blocks, in a thread; after a failure the rest is dropped and counted."""
         while (block := self._queue.get()) is not None:
             file, heads, arrays, size = block
             try:
@@ -208,7 +212,7 @@ class StreamRecorder:
         free = disk.f_bavail * disk.f_frsize
         if free < self._min_free_bytes:
             self._stop_with_fault(
-                f"{free / 1e6:.0f} MB free, and {self._min_free_bytes / 1e6:.0f} MB are left to others; "
+                f"{free / 1e6:.0f} MB free, below the limit of {self._min_free_bytes / 1e6:.0f} MB; "
                 "free some space"
             )
 

@@ -1,1 +1,1 @@
-"""Simulated turbulence: von Karman statistics and screens, drifting and boiling layers, seeing that changes with time, rotating phase plates. The wavefront that a mirror makes is in mirror/."""
+"""Simulated turbulence: statistics, drifting and boiling layers, changing seeing, rotating phase plates."""

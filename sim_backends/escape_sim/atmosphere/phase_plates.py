@@ -1,4 +1,4 @@
-"""Von Karman phase screens on rotating plates, and the changer of a bench that puts one of them into the beam."""
+"""Von Karman phase screens on rotating plates, and the changer that puts one of them into the beam."""
 
 from __future__ import annotations
 
@@ -10,31 +10,27 @@ from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.errors import ConfigError
-from escape_sim.optics.pupil import PupilGeometry
+from escape_sim.atmosphere.von_karman import lit_columns, power_spectrum
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
+    from escape_sim.optics.pupil import PupilGeometry
 
 
 def von_karman_screen(
     size: int, pixel_m: float, r0_m: float, outer_scale_m: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """A periodic screen of von Karman turbulence.
-
-    The power spectrum of the phase is ``0.0229 r0^(-5/3) (f^2 + 1/L0^2)^(-11/6)`` in rad^2 m^2
-    (Roddier 1981; f in cycles per metre).
+    """Draw a periodic screen of von Karman turbulence.
 
     Parameters
     ----------
-    size
-        Pixels across; make ``size * pixel_m`` several outer scales, for the screen holds no
-        structure larger than itself.
-    pixel_m
-        Pixel size in metres.
-    r0_m
-        Fried parameter in metres at the wavelength that the phase refers to.
-    outer_scale_m
-        Outer scale in metres.
+    size, pixel_m
+        Pixels across and pixel size in metres. The screen contains no structure larger than itself, so
+        ``size * pixel_m`` should be several outer scales.
+    r0_m, outer_scale_m
+        Fried parameter, at the wavelength of the phase, and outer scale in metres.
+    rng
+        Source of randomness.
 
     Returns
     -------
@@ -43,7 +39,7 @@ def von_karman_screen(
     """
     f = np.fft.fftfreq(size, pixel_m)
     f2 = f[:, None] ** 2 + f[None, : size // 2 + 1] ** 2
-    psd = 0.0229 * r0_m ** (-5 / 3) * (f2 + outer_scale_m**-2) ** (-11 / 6)
+    psd = power_spectrum(f2, r0_m, outer_scale_m)
     psd[0, 0] = 0.0
     white = np.fft.rfft2(rng.standard_normal((size, size)))
     # White noise has |FFT|^2 = size^2 on average; the screen needs psd / area per frequency cell.
@@ -53,10 +49,10 @@ def von_karman_screen(
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _add_screen(screen, scale, x0, y0, ux, uy, first, last, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add ``scale`` times the bilinear reading of a periodic screen (power-of-two size) to ``out``.
+    """Add ``scale`` times a bilinearly interpolated periodic screen (power-of-two size) to ``out``.
 
-    Row ``i``, column ``j`` reads at ``(x0, y0) + j u + i (-uy, ux)``; only columns
-    ``first[i]..last[i]`` are touched.
+    Row ``i``, column ``j`` is at ``(x0, y0) + j u + i (-uy, ux)`` on the screen; only columns
+    ``first[i]..last[i]`` are written.
     """
     mask = screen.shape[0] - 1
     for i in range(out.shape[0]):
@@ -77,10 +73,10 @@ def _add_screen(screen, scale, x0, y0, ux, uy, first, last, out):  # type: ignor
 
 
 class RotatingScreen:
-    """A plate with a phase screen that turns in front of the pupil.
+    """A phase screen on a plate that rotates in front of the pupil.
 
-    The pupil sits ``radius_m`` from the axis, so the pattern crosses it at the asked speed, turns
-    as it goes, and repeats after one revolution, as on the bench.
+    The pupil is ``radius_m`` from the axis: the pattern crosses it, rotates on the way and repeats
+    after one revolution.
 
     Parameters
     ----------
@@ -91,7 +87,12 @@ class RotatingScreen:
     radius_m
         Distance of the pupil's centre from the axis in metres.
     lit
-        Where the pupil needs values ``(n, n)``; other pixels are left alone.
+        Samples ``(n, n)`` of the pupil that need values; others are not written.
+
+    Raises
+    ------
+    ValueError
+        The plate is not square with a power-of-two side.
     """
 
     def __init__(
@@ -99,30 +100,24 @@ class RotatingScreen:
     ) -> None:
         size = opd_m.shape[0]
         if opd_m.shape != (size, size) or size & (size - 1):
-            raise ValueError(f"a plate of {opd_m.shape} pixels is not a square with a power-of-two side")
+            raise ValueError(f"a plate has {opd_m.shape} pixels; it must be square with a power-of-two side")
         self._opd, self._pixel, self._radius = np.ascontiguousarray(opd_m, np.float32), pixel_m, radius_m
         self._n = lit.shape[0]
-        self._first = np.where(lit.any(axis=1), lit.argmax(axis=1), 0)
-        self._last = np.where(lit.any(axis=1), lit.shape[1] - lit[:, ::-1].argmax(axis=1), 0)
+        self._first, self._last = lit_columns(lit)
 
     def add(self, path_m: float, out: NDArray[np.float32], strength: float = 1.0) -> None:
-        """Add the plate's optical path in metres to ``out (n, n)``.
+        """Add ``strength`` times the plate's optical path in metres to ``out (n, n)``.
 
-        Parameters
-        ----------
-        path_m
-            Length of the arc travelled at the pupil's centre in metres.
-        strength
-            Factor on it.
+        ``path_m`` is the length of the arc travelled at the pupil's centre in metres.
         """
         angle = path_m / self._radius
         c, s = float(np.cos(angle)), float(np.sin(angle))
         half = (self._n - 1) / 2
         # Plate coordinates of the pupil's first pixel: axis + R(angle) (radius - half, -half).
         px, py = self._radius / self._pixel - half, -half
-        middle = self._opd.shape[0] / 2
+        centre = self._opd.shape[0] / 2
         _add_screen(
-            self._opd, np.float32(strength), middle + c * px - s * py, middle + s * px + c * py, c, s,
+            self._opd, np.float32(strength), centre + c * px - s * py, centre + s * px + c * py, c, s,
             self._first, self._last, out,
         )  # fmt: skip
 
@@ -130,26 +125,26 @@ class RotatingScreen:
 #: Side of the phase plates in pixels and distance of the pupil from their axis.
 _PLATE_PIXELS = 2048
 _PLATE_RADIUS_M = 28e-3
-#: Plates kept by a process, 16 MB each.
+#: Plates cached by a process, 16 MB each.
 _MAX_CACHED_PLATES = 3
 
 
 class PhasePlates:
-    """A changer of rotating phase plates; a system without one has still air.
+    """Changer of rotating phase plates; adds nothing in a system without plates.
 
     Parameters
     ----------
     config
-        Gives the plates (``devices.screen``).
+        Plates of the system (``devices.screen``).
     pupil
         The sampled pupil.
     seed
-        Each plate has a key of its own, so that the order of use does not matter.
+        Seed; each plate has its own stream, so the order of use does not matter.
 
     Attributes
     ----------
     number, inserted
-        Which plate, and whether it is in the beam.
+        Selected plate, and whether it is in the beam.
     """
 
     def __init__(self, config: SystemConfig, pupil: PupilGeometry, seed: np.random.SeedSequence) -> None:
@@ -167,11 +162,11 @@ class PhasePlates:
         return self._speed
 
     def set_speed(self, speed_m_s: float, now_s: float) -> None:
-        """Turn at another speed from now on."""
+        """Change the speed at time ``now_s``; the plate's position is continuous."""
         self._path, self._speed_set_s, self._speed = self._path_at(now_s), now_s, speed_m_s
 
     def add(self, time_s: float, opd_m: NDArray[np.float32], strength: float = 1.0) -> None:
-        """Add the optical path of a moment, times ``strength``, to ``opd_m (n, n)`` in metres."""
+        """Add ``strength`` times the optical path at ``time_s`` to ``opd_m (n, n)``, in metres."""
         if self.inserted:
             self._plate().add(self._path_at(time_s), opd_m, strength)
 
@@ -196,7 +191,7 @@ class PhasePlates:
 def _plate_opd(
     entropy: Any, key: tuple[int, ...], pixel_m: float, r0_m: float, outer_scale_m: float, wavelength_m: float
 ) -> NDArray[np.float32]:
-    """The optical path of a plate in metres; who opens the same bench again need not draw it again."""
+    """Optical path of a plate in metres; cached for benches that are opened again."""
     rng = np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=key))
     phase = von_karman_screen(_PLATE_PIXELS, pixel_m, r0_m, outer_scale_m, rng)
     phase *= np.float32(wavelength_m / (2 * np.pi))

@@ -1,1 +1,1 @@
-"""The simulated bench (one clock, one beam, the true state) and the simulated devices on it. Optics and mirror physics are in optics/ and mirror/."""
+"""The simulated bench (one clock, one beam, the true state) and the simulated devices on it."""

@@ -1,8 +1,7 @@
-"""The simulated bench: one clock, one beam, and the hidden truth that no estimator sees."""
+"""The simulated bench: one clock, one beam and the true state that no estimator reads."""
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -17,33 +16,42 @@ from escape_sim.mirror.dynamics import MirrorDynamics
 from escape_sim.mirror.influence_functions import (
     InfluenceFunctions,
     MeasuredInfluenceFunctions,
+    actuator_positions,
+    pitch_on_pupil,
     read_influence_functions,
 )
 from escape_sim.mirror.surface import DriftingSurface, Flexure, InfluenceModel
 from escape_sim.optics.detector import Detector
 from escape_sim.optics.focal_plane import FocalPlane
 from escape_sim.optics.modulation import BeamPath
-from escape_sim.optics.pupil import actuator_positions, contaminated_pupil, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import contaminated_pupil, pupil_geometry
 from escape_sim.optics.sensor import ModulatedOptics, SensorOptics, make_sensor_optics
 
 if TYPE_CHECKING:
+    from escape_hw.config.devices import ScienceConfig
     from escape_hw.config.system import SystemConfig
 
-log = logging.getLogger(__name__)
-
-#: Keeps the streams of a run apart from those of the bench of the same number.
+#: Spawn key that separates the streams of a run from those of a bench with the same seed.
 _RUN_KEY = 0x52554E
-#: How far a paced bench may lag behind the wall clock and still hurry to catch up, in seconds.
+#: Largest lag in seconds behind the wall clock that a paced bench catches up.
 _MAX_LAG_S = 0.05
 
 
 class SimBench:
-    """Optics, mirror and clock behind the twins of one system.
+    """Optics, mirror and clock shared by the simulated devices of a system.
 
     Parameters
     ----------
     config
-        The system; its ``twin`` section is the hidden truth.
+        The system; its ``twin`` section is the true state.
+
+    Attributes
+    ----------
+    flexure, seeing
+        True registration and turbulence strength as functions of time; never for an estimator.
+    path_callbacks
+        Functions called with the optical path ``(n, n)`` in metres, and the time in seconds, of every
+        frame of the wavefront sensor.
     """
 
     def __init__(self, config: SystemConfig) -> None:
@@ -52,29 +60,27 @@ class SimBench:
         plates, truth_seed, latency, frames, wfs_noise, science_noise, sky, contamination_seed = seeds
         self._run: np.random.SeedSequence | None = None
         if config.twin.run_seed is not None:
-            # The detectors' pixels belong to the bench; only what they draw afterwards is the run's.
+            # Pixel gains and offsets belong to the bench; the run's seed fixes what is drawn later.
             self._run = np.random.SeedSequence(config.twin.run_seed, spawn_key=(_RUN_KEY,))
             plates, latency, frames, sky = self._run.spawn(4)
         self.latency_rng, self.frame_rng = np.random.default_rng(latency), np.random.default_rng(frames)
         truth = np.random.default_rng(truth_seed)
         self.pupil = contaminated_pupil(config, np.random.default_rng(contamination_seed))
         design_light = np.square(pupil_geometry(config).amplitude, dtype=float).sum()
-        #: Share of the light that the soiled pupil lets through.
+        # Share of the light that the contaminated pupil transmits.
         self._throughput = float(np.square(self.pupil.amplitude, dtype=float).sum() / design_light)
         self._clock_ns = 0
         self._wall_start = time.monotonic()
         dm, twin = config.devices.dm, config.twin
         self.influence = self._make_true_influence(truth)
-        #: Where the mirror sits at a time: for tests and reports of a twin, never for an estimator.
         self.flexure = Flexure(twin.registration.to_registration(), twin.drift)
-        #: How strong the turbulence is at a time; hidden likewise.
         self.seeing = Seeing(twin.seeing)
         x = self.pupil.coordinates_m
         self._surface = DriftingSurface(self.influence, self.flexure, self.pupil.sub_aperture_m, x, x)
         self.dynamics = MirrorDynamics(
             self.influence.n_act, twin.mirror.settling_s, twin.mirror.creep_fraction, twin.mirror.creep_time_s
         )
-        # Reflection doubles the surface.
+        # A reflection changes the path by twice the surface.
         self._opd_per_command_m = np.float32(2 * dm.stroke_m)
         self._ncpa = self._make_aberration(truth, twin.ncpa.rms_m, twin.ncpa.n_modes)
         self._vibration_phase = truth.uniform(0, 2 * np.pi, (2, len(twin.vibration.frequency_hz)))
@@ -94,11 +100,10 @@ class SimBench:
         self._science_rng = np.random.default_rng(science_noise)
         self._exposures: _Exposures | None = None
         self.plates = PhasePlates(config, self.pupil, plates)
-        self.air: Atmosphere | None = None
+        self.atmosphere: Atmosphere | None = None
         if twin.atmosphere is not None:
-            self.air = Atmosphere(twin.atmosphere, self.pupil.pixel_m, self.pupil.lit, sky)
+            self.atmosphere = Atmosphere(twin.atmosphere, self.pupil.pixel_m, self.pupil.lit, sky)
         self.beam_blocked = False
-        #: Told the optical path ``(n, n)`` in metres, and the time, of every frame of the sensor.
         self.path_callbacks: list[Callable[[NDArray[np.float32], float], None]] = []
 
     # ------------------------------------------------------------------ clock
@@ -113,29 +118,29 @@ class SimBench:
         return self._clock_ns * 1e-9
 
     def advance_to(self, time_s: float) -> None:
-        """Move the clock forward; wait for the wall clock when paced to real time."""
+        """Advance the clock; if paced, wait for the wall clock."""
         self._clock_ns = max(self._clock_ns, round(time_s * 1e9))
         if self.config.twin.paced:
             wait = self._wall_start + self.now_s - time.monotonic()
             if wait > 0:
                 time.sleep(wait)
             elif wait < -_MAX_LAG_S:
-                # The wall clock went on while nobody looked (set-up, a long sum): that is not made up for.
+                # A long lag (set-up, a long computation) is not caught up.
                 self._wall_start -= wait
 
     # ------------------------------------------------------------------ mirror
     def drive(self, shape: NDArray[np.float64]) -> None:
-        """Send the actuators a shape ``(n_act,)``, which arrives after the twin's latency and jitter."""
+        """Command a shape ``(n_act,)``, which arrives after the twin's latency and jitter."""
         twin = self.config.twin
         jitter = twin.latency_jitter_s * abs(self.latency_rng.standard_normal())
         self.dynamics.command(self.now_s + twin.latency_s + jitter, shape)
 
     def set_positions(self, shape: NDArray[np.float64]) -> None:
-        """Have the actuators take a shape ``(n_act,)`` from now on."""
+        """Command a shape ``(n_act,)`` without latency."""
         self.dynamics.command(self.now_s, shape)
 
     def positions(self) -> NDArray[np.float64]:
-        """Where the actuators are now ``(n_act,)``, fractions of full stroke."""
+        """Present displacements of the actuators ``(n_act,)``, fractions of full stroke."""
         return self.dynamics.at(self.now_s)
 
     # ------------------------------------------------------------------ beam
@@ -145,8 +150,8 @@ class SimBench:
         opd = self.mirror_opd(self.dynamics.mean(start_s, end_s), middle)
         strength = self.seeing.strength(middle)
         self.plates.add(middle, opd, strength)
-        if self.air is not None:
-            self.air.add(middle, opd, strength)
+        if self.atmosphere is not None:
+            self.atmosphere.add(middle, opd, strength)
         tip, tilt = self._vibration_tilt(middle)
         if tip or tilt:
             x = self.pupil.coordinates_m.astype(np.float32)
@@ -154,23 +159,23 @@ class SimBench:
         return opd
 
     def mirror_opd(self, command: NDArray[np.float64], time_s: float | None = None) -> NDArray[np.float32]:
-        """Optical path ``(n, n)`` in metres that the settled mirror makes of a command ``(n_act,)``.
+        """Optical path ``(n, n)`` in metres of the settled mirror for a command ``(n_act,)``.
 
-        Where the mirror sits at a time, in seconds; now by default.
+        ``time_s`` selects the registration, by default that of now.
         """
         opd = self._surface(command, self.now_s if time_s is None else time_s)
         opd *= self._opd_per_command_m
         return opd
 
     def sensor_opd(self, opd: NDArray[np.float32], time_s: float) -> NDArray[np.float32]:
-        """Optical path ``(n, n)`` in metres in front of the sensor, what only it sees included."""
+        """Optical path ``(n, n)`` in metres at the sensor, with its non-common-path terms."""
         opd_at_sensor = opd + self._ncpa
         if self._has_centre_drift:
             opd_at_sensor += self._centre_drift_opd(time_s)
         return opd_at_sensor
 
     def wfs_image(self, start_s: float, end_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Intensity on the wavefront sensor over an exposure, and the last optical path."""
+        """Mean intensity on the wavefront sensor over an exposure, and the last optical path."""
         sensor = self.sensor()
         steps = self.config.twin.substeps
         image = np.zeros((self.config.devices.wfs.region[3], self.config.devices.wfs.region[2]), np.float32)
@@ -183,7 +188,7 @@ class SimBench:
         return (image / np.float32(steps) if steps > 1 else image), opd
 
     def wfs_light(self, exposure_s: float) -> tuple[float, float]:
-        """Electrons of an exposure: from the source over the whole sensor, from the sky on each pixel."""
+        """Electrons of an exposure: from the source on the whole sensor, and from the sky per pixel."""
         twin, camera = self.config.twin, self.config.devices.wfs
         if self.beam_blocked:
             return 0.0, 0.0
@@ -193,7 +198,7 @@ class SimBench:
         return self._throughput * twin.star.electrons(exposure_s), self._throughput * sky
 
     def sensor(self) -> SensorOptics:
-        """The sensor's optics, built when first used."""
+        """Optics of the sensor with the present modulation, built on first use."""
         if self._sensor is None:
             self._sensor = make_sensor_optics(self.config, self.pupil)
         change_key = self.beam_path.change_key
@@ -204,50 +209,48 @@ class SimBench:
         return self._sensor
 
     def _centre_drift_opd(self, time_s: float) -> NDArray[np.float32]:
-        """Tilt ``(n, n)`` in metres of the beam on a pyramid, whose modulation's centre wanders."""
+        """Tilt ``(n, n)`` in metres by the drift of the modulation centre."""
         x, y = self.beam_path.drift(time_s) * self.config.system.wavelength_m / self.config.system.pupil_m
         at = self.pupil.coordinates_m
         return np.asarray(x * at[None, :] + y * at[:, None], np.float32)
 
-    def focal_plane(self, shape: tuple[int, int]) -> FocalPlane:
-        """The science camera's optics for a region."""
-        science = self.config.devices.science
-        if science is None:
+    @property
+    def science_section(self) -> ScienceConfig:
+        """Configuration of the science camera; raises ConfigError if there is none."""
+        section = self.config.devices.science
+        if section is None:
             raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
-        return FocalPlane(
-            self.pupil.amplitude,
-            self.pupil.n_sub * self.pupil.n_pix,
-            self.config.system.wavelength_m,
-            science.psf_px,
-            shape,
-        )
+        return section
+
+    def focal_plane(self, shape: tuple[int, int]) -> FocalPlane:
+        """Optics of the science camera for a region."""
+        diameter_px = self.pupil.n_sub * self.pupil.n_pix
+        wavelength_m, psf_px = self.config.system.wavelength_m, self.science_section.psf_px
+        return FocalPlane(self.pupil.amplitude, diameter_px, wavelength_m, psf_px, shape)
 
     def science_detector(self, shape: tuple[int, int]) -> Detector:
-        """The science camera's detector for a region."""
-        science, twin = self.config.devices.science, self.config.twin.science
-        if science is None:
-            raise ConfigError(f"system {self.config.system.name!r} has no [devices.science] section")
+        """Detector of the science camera for a region."""
+        twin = self.config.twin.science
         detector = Detector(
-            shape, science.bit_depth, twin.full_well_e, twin.read_noise_e, twin.dark_e,
+            shape, self.science_section.bit_depth, twin.full_well_e, twin.read_noise_e, twin.dark_e,
             twin.background, twin.fixed_pattern, self._science_rng, twin.excess_noise,
         )  # fmt: skip
         self._seed_detector_noise(detector, 1)
         return detector
 
     def _run_stream(self, key: int) -> np.random.SeedSequence:
-        """A stream of this run."""
         if self._run is None:
             raise RuntimeError("this run has no seed of its own")
         return np.random.SeedSequence(self._run.entropy, spawn_key=(*self._run.spawn_key, 100 + key))
 
     def _seed_detector_noise(self, detector: Detector, key: int) -> None:
-        """Give a detector noise of the run's own, where the run has a seed."""
+        """Give a detector its own noise stream of the run, if the run has a seed."""
         if self._run is not None:
             detector.set_rng(np.random.default_rng(self._run_stream(key)))
 
     # ------------------------------------------------------------------ science camera
     def start_integration(self, plane: FocalPlane, exposure_s: float, period_s: float) -> None:
-        """Start integrating the focal plane, frame after frame, from now on."""
+        """Start integrating the focal plane, frame after frame."""
         self._exposures = _Exposures(plane, self.now_s, exposure_s, period_s)
 
     def stop_integration(self) -> None:
@@ -255,7 +258,7 @@ class SimBench:
         self._exposures = None
 
     def record_optical_path(self, opd: NDArray[np.float32], time_s: float) -> None:
-        """Offer the science camera, and whoever else looks on, the optical path of a moment."""
+        """Pass the optical path of a time to the callbacks and the science camera."""
         for callback in self.path_callbacks:
             callback(opd, time_s)
         if self._exposures is not None:
@@ -267,7 +270,7 @@ class SimBench:
         if exposures is None:
             raise RuntimeError("the science camera is not running")
         if not exposures.contains(number):
-            # Nobody read the wavefront sensor meanwhile: look at a few moments of our own.
+            # The wavefront sensor was not read meanwhile: sample the exposure at four times.
             for start in end_s - exposures.exposure_s * np.arange(4, 0, -1) / 4:
                 exposures.add(
                     number, self.optical_path(float(start), float(start + exposures.exposure_s / 4))
@@ -294,13 +297,13 @@ class SimBench:
         )
 
     def _make_aberration(self, truth: np.random.Generator, rms_m: float, n_modes: int) -> NDArray[np.float32]:
-        """A smooth random aberration: low-order polynomials made orthonormal over the pupil."""
+        """Random low-order polynomials, orthonormal over the pupil, of ``rms_m`` over it."""
         lit = self.pupil.lit
         unit = self.pupil.coordinates_m / (self.config.system.pupil_m / 2)
         x, y = np.meshgrid(unit, unit)
         powers = [(i, k - i) for k in range(32) for i in range(k + 1)][: n_modes + 3]
         basis = np.stack([(x**i * y**j)[lit] for i, j in powers], axis=1)
-        # Piston, tip and tilt come first and are dropped: they are alignment, not aberration.
+        # Piston, tip and tilt are omitted: they are alignment, not aberration.
         modes = np.linalg.qr(basis)[0][:, 3:]
         aberration = np.zeros(lit.shape, np.float32)
         if rms_m and modes.shape[1]:
@@ -321,7 +324,7 @@ class SimBench:
 class _Exposures:
     """Sums of focal-plane images, one per science frame."""
 
-    #: Every how many wavefront-sensor frames the focal plane is looked at.
+    #: Wavefront-sensor frames per sample of the focal plane.
     STRIDE = 4
 
     def __init__(self, plane: FocalPlane, start_s: float, exposure_s: float, period_s: float) -> None:

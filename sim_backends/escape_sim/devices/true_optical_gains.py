@@ -1,7 +1,4 @@
-"""The twin's own response around frozen wavefronts: the truth that optical gains are judged by.
-
-For tests and benchmarks alone; nothing that calibrates may read it.
-"""
+"""True optical gains of the simulated sensor around recorded wavefronts; for tests and benchmarks only."""
 
 from __future__ import annotations
 
@@ -15,33 +12,22 @@ from escape_hw.bench import Bench
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 from escape_sim.devices.bench import SimBench
 
-#: Poke of the push-pull in metres of optical path, rms: far below what bends the response.
+#: Poke of the push-pull in metres of optical path, rms; small enough for a linear response.
 _POKE_M = 2e-9
 
 
 def get_simulated_bench(bench: Bench) -> SimBench:
-    """The simulated bench behind a system's twins.
-
-    Raises
-    ------
-    TypeError
-        Its mirror is no twin.
-    """
+    """The simulated bench of a system; raises TypeError if its mirror is not simulated."""
     twin = getattr(bench.dm, "twin", None)
     if not isinstance(twin, SimBench):
-        raise TypeError(f"{bench.dm.name} is no twin; only a twin's truth can be looked at")
+        raise TypeError(f"{bench.dm.name} is not a simulated mirror; use a system in mode 'sim'")
     return twin
 
 
 class WavefrontRecorder:
-    """Keeps the wavefront in front of the sensor now and then while something runs.
+    """Records the wavefront at the sensor every ``every`` frames while something runs.
 
-    Parameters
-    ----------
-    twin
-        The simulated bench; this object adds itself to its onlookers.
-    every
-        Frames from one wavefront kept to the next.
+    ``recording`` may be set to False to pause; :meth:`close` ends the recording.
     """
 
     def __init__(self, twin: SimBench, every: int) -> None:
@@ -50,13 +36,13 @@ class WavefrontRecorder:
         twin.path_callbacks.append(self)
 
     def __call__(self, opd: NDArray[np.float32], time_s: float) -> None:
-        """Take the optical path ``(n, n)`` in metres of a frame."""
+        """Callback for the optical path ``(n, n)`` in metres of a frame."""
         self._n_frames += 1
         if self.recording and self._n_frames % self._every == 0:
             self.wavefronts.append(self._twin.sensor_opd(opd, time_s))
 
     def close(self) -> None:
-        """Look no longer."""
+        """Stop recording."""
         self._twin.path_callbacks.remove(self)
 
 
@@ -68,28 +54,28 @@ def true_optical_gains(
     wavefronts: Sequence[NDArray[np.float32]],
     modes: Sequence[int] | None = None,
 ) -> NDArray[np.float64]:
-    """Optical gains by push-pull around frozen wavefronts, without noise.
+    """Optical gains by noiseless push-pull around fixed wavefronts.
 
     Parameters
     ----------
     twin
-        Its optics and its true mirror answer.
+        The simulated bench.
     pupils
-        Where the pipeline takes the slopes.
+        Pupil images from which slopes are computed.
     m2c
         Modes ``(n_act, n_modes)``.
     rows
-        Take slopes to gains ``(n_modes, n_slopes)``
+        Projection from slopes to gains ``(n_modes, n_slopes)``
         (:func:`~escape_hw.calibration.optical_gain.matrix_comparison.projector`).
     wavefronts
-        Optical paths ``(n, n)`` in metres in front of the sensor.
+        Optical paths ``(n, n)`` in metres at the sensor.
     modes
-        Which modes; all by default.
+        Selected modes; all by default.
 
     Returns
     -------
     ndarray, ``(n_wavefronts, n_modes)``
-        NaN for modes not asked for.
+        NaN for modes not selected.
     """
     selected = range(m2c.shape[1]) if modes is None else modes
     stroke = twin.config.devices.dm.stroke_m

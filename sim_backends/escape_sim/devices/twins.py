@@ -1,9 +1,10 @@
-"""Simulated devices of a bench: mirror, wavefront-sensor camera, science camera, phase screens, modulator, adaptive secondary; their entry points."""
+"""Simulated devices of a bench: mirrors, cameras, phase screens, modulator; their entry points."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +22,18 @@ from escape_sim.optics.detector import Detector
 from escape_sim.optics.focal_plane import FocalPlane
 
 if TYPE_CHECKING:
+    from escape_hw.config.devices import CameraConfig
     from escape_hw.config.system import SystemConfig
 
-
 _BENCH_KEY = "simulated bench"
+#: Resolution of the cameras' exposure times in seconds.
+_EXPOSURE_STEP_S = 1e-6
+Info = TypeVar("Info")
+Device = TypeVar("Device")
 
 
 def shared_bench(config: SystemConfig, shared: dict[str, object]) -> SimBench:
-    """The one simulated bench behind all twins of an opened system."""
+    """The simulated bench shared by all simulated devices of an opened system."""
     bench = shared.setdefault(_BENCH_KEY, None) or SimBench(config)
     if not isinstance(bench, SimBench):
         raise TypeError(f"shared[{_BENCH_KEY!r}] holds a {type(bench).__name__}, not a SimBench")
@@ -37,82 +42,21 @@ def shared_bench(config: SystemConfig, shared: dict[str, object]) -> SimBench:
 
 
 def existing_bench(shared: dict[str, object]) -> SimBench | None:
-    """The simulated bench of an opened system, if any of its devices is a twin that has been made."""
+    """The simulated bench of an opened system, or None if no simulated device was made yet."""
     bench = shared.get(_BENCH_KEY)
     return bench if isinstance(bench, SimBench) else None
 
 
-def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> SimMirror:
-    """Entry point ``sim-alpao``."""
-    return SimMirror(name, shared_bench(config, shared))
+class _Simulated(Generic[Info]):
+    """Identity, clock and connection of a simulated device, a mix-in placed before its interface."""
 
-
-def make_wfs_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> SimWavefrontSensorCamera:
-    """Entry point ``sim-ximea``."""
-    return SimWavefrontSensorCamera(name, shared_bench(config, shared))
-
-
-def make_science_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> SimScienceCamera:
-    """Entry point ``sim-science``."""
-    return SimScienceCamera(name, shared_bench(config, shared))
-
-
-def make_screen(name: str, config: SystemConfig, shared: dict[str, object]) -> SimPhaseScreen:
-    """Entry point ``sim-screen``."""
-    return SimPhaseScreen(name, shared_bench(config, shared))
-
-
-class SimMirror(DeformableMirror):
-    """Twin of the ALPAO DM97: latency, settling, creep, gain scatter, saturation."""
-
-    def __init__(self, name: str, bench: SimBench) -> None:
-        super().__init__(name, bench.config.devices.dm.limits.to_limits())
-        self._bench = bench
-        self._info = bench.config.devices.dm.info("simulated ALPAO DM97-15", simulated=True)
+    _bench: SimBench
+    _info: Info
 
     @property
-    def info(self) -> DMInfo:
-        """Identity and geometry."""
-        return self._info
-
-    @property
-    def twin(self) -> SimBench:
-        """The simulated bench, hidden truth and all; for tests and benchmarks alone."""
-        return self._bench
-
-    def now_ns(self) -> int:
-        """Simulated time in nanoseconds."""
-        return self._bench.now_ns
-
-    def _open(self) -> None:
-        self._bench.set_positions(np.zeros(self._info.n_act))
-
-    def _close(self) -> None:
-        """Nothing to release."""
-
-    def _send(self, command: NDArray[np.float64]) -> None:
-        self._bench.drive(command)
-
-
-class _SimCamera(Camera):
-    """What both simulated cameras share: settings and limits of the sensor."""
-
-    def __init__(
-        self, name: str, bench: SimBench, info: CameraInfo, settings: CameraSettings, step_s: float
-    ) -> None:
-        super().__init__(name)
-        self._bench, self._info, self._settings, self._step_s = bench, info, settings, step_s
-        self._start_s, self._next_index = 0.0, 0
-
-    @property
-    def info(self) -> CameraInfo:
+    def info(self) -> Info:
         """Identity and fixed properties."""
         return self._info
-
-    @property
-    def settings(self) -> CameraSettings:
-        """The settings in force."""
-        return self._settings
 
     def now_ns(self) -> int:
         """Simulated time in nanoseconds."""
@@ -122,16 +66,51 @@ class _SimCamera(Camera):
         """Nothing to connect."""
 
     def _close(self) -> None:
-        """Nothing to release."""
+        """Nothing to release; the device keeps its state."""
+
+
+class SimMirror(_Simulated[DMInfo], DeformableMirror):
+    """Simulated ALPAO DM97: latency, settling, creep, gain scatter, saturation."""
+
+    def __init__(self, name: str, bench: SimBench) -> None:
+        super().__init__(name, bench.config.devices.dm.limits.to_limits())
+        self._bench = bench
+        self._info = bench.config.devices.dm.info("simulated ALPAO DM97-15", simulated=True)
+
+    @property
+    def twin(self) -> SimBench:
+        """The simulated bench with its true state; for tests and benchmarks only."""
+        return self._bench
+
+    def _open(self) -> None:
+        self._bench.set_positions(np.zeros(self._info.n_act))
+
+    def _send(self, command: NDArray[np.float64]) -> None:
+        self._bench.drive(command)
+
+
+class _SimCamera(_Simulated[CameraInfo], Camera):
+    """Settings, limits and frame times common to both simulated cameras."""
+
+    def __init__(self, name: str, bench: SimBench, section: CameraConfig, model: str) -> None:
+        super().__init__(name)
+        self._bench, self._settings = bench, section.settings()
+        self._info = CameraInfo(model, section.serial, section.sensor_px[::-1], section.bit_depth, True)
+        self._start_s, self._next_index = 0.0, 0
+
+    @property
+    def settings(self) -> CameraSettings:
+        """Settings in force."""
+        return self._settings
 
     def _start(self) -> None:
         self._start_s, self._next_index = self._bench.now_s, 0
 
     def _stop(self) -> None:
-        """The clock simply runs on."""
+        """Nothing to stop."""
 
     def _fastest_hz(self, region: Region) -> float:
-        """Highest frame rate for a region; rows cost time, columns do not."""
+        """Highest frame rate for a region: readout time per row."""
         return 1.0 / (20e-6 + 4.65e-6 * region.height)
 
     def _check(self, want: CameraSettings) -> CameraSettings:
@@ -144,15 +123,15 @@ class _SimCamera(Camera):
             )
         if not 0 <= want.gain_db <= 12:
             raise SettingRejected(self.name, f"gain_db is {want.gain_db:g}; it must lie in 0..12")
-        longest = 1 / want.frame_rate_hz
-        exposure = min(max(round(want.exposure_s / self._step_s) * self._step_s, self._step_s), longest)
+        step = _EXPOSURE_STEP_S
+        exposure = min(max(round(want.exposure_s / step) * step, step), 1 / want.frame_rate_hz)
         return CameraSettings(want.region, exposure, want.frame_rate_hz, want.gain_db)
 
     def _configure(self, settings: CameraSettings) -> None:
         self._settings = settings
 
     def _next_frame_index(self, arrival_delay_s: float) -> int:
-        """Number of the frame to deliver next: a late reader gets the newest complete one."""
+        """Index of the next frame to deliver: for a late reader the newest complete one."""
         period = 1 / self.settings.frame_rate_hz
         n_complete = int((self._bench.now_s - self._start_s - arrival_delay_s) / period + 1e-9)
         return max(self._next_index, n_complete)
@@ -170,31 +149,25 @@ class _SimCamera(Camera):
 
 
 class SimWavefrontSensorCamera(_SimCamera):
-    """Twin of the XIMEA camera behind lenslets or pyramid: rate limits, noise, lost frames.
+    """Simulated XIMEA camera behind lenslets or pyramid: rate limits, noise, lost frames.
 
-    A modulator triggers it once per turn, or once in so many turns as its own rate comes nearest to;
-    then it exposes whole turns.
+    While a modulator runs, it triggers the camera once per cycle or once per several cycles, whichever
+    is nearest to the configured rate; an exposure lasts whole cycles.
     """
 
     def __init__(self, name: str, bench: SimBench) -> None:
-        c = bench.config.devices.wfs
-        super().__init__(
-            name,
-            bench,
-            CameraInfo("simulated XIMEA MQ013MG-ON", c.serial, c.sensor_px[::-1], c.bit_depth, True),
-            c.settings(),
-            1e-6,
-        )
-        self._nominal = Region(*c.region)
+        section = bench.config.devices.wfs
+        super().__init__(name, bench, section, "simulated XIMEA MQ013MG-ON")
+        self._nominal = Region(*section.region)
         self._period, self._first = 0.0, 0
 
     @property
     def settings(self) -> CameraSettings:
-        """The settings in force."""
+        """Settings in force, with the modulator's trigger."""
         return self._with_trigger_period(self._settings)
 
     def _with_trigger_period(self, settings: CameraSettings) -> CameraSettings:
-        """The settings as the modulator's trigger changes them."""
+        """Settings as changed by the modulator's trigger."""
         cycle_s = self._bench.beam_path.cycle_period_s
         if cycle_s is None:
             return settings
@@ -209,7 +182,7 @@ class SimWavefrontSensorCamera(_SimCamera):
             or want.region.y + want.region.height > self._nominal.y + self._nominal.height
         ):
             raise SettingRejected(
-                self.name, f"region {want.region} leaves the lit part of the sensor, {self._nominal}"
+                self.name, f"region {want.region} is not inside the configured region {self._nominal}"
             )
         return self._with_trigger_period(super()._check(want))
 
@@ -218,7 +191,7 @@ class SimWavefrontSensorCamera(_SimCamera):
         self._period, self._first = 1 / self.settings.frame_rate_hz, 0
 
     def _update_trigger_period(self) -> None:
-        """Count on from here when the modulator has started, stopped or changed its pace."""
+        """Restart the frame times if the modulator has started, stopped or changed its frequency."""
         period = 1 / self.settings.frame_rate_hz
         if period != self._period:
             self._first, self._period = self._first + self._next_index, period
@@ -249,19 +222,10 @@ class SimWavefrontSensorCamera(_SimCamera):
 
 
 class SimScienceCamera(_SimCamera):
-    """Twin of the science camera: integrates the focal plane beside the running loop."""
+    """Simulated science camera, which integrates the focal plane while the loop runs."""
 
     def __init__(self, name: str, bench: SimBench) -> None:
-        c = bench.config.devices.science
-        if c is None:
-            raise ConfigError(f"system {bench.config.system.name!r} has no [devices.science] section")
-        super().__init__(
-            name,
-            bench,
-            CameraInfo("simulated FLIR Grasshopper3", c.serial, c.sensor_px[::-1], c.bit_depth, True),
-            c.settings(),
-            1e-6,
-        )
+        super().__init__(name, bench, bench.science_section, "simulated FLIR Grasshopper3")
         self._plane: FocalPlane | None = None
         self._detector: Detector | None = None
 
@@ -270,9 +234,8 @@ class SimScienceCamera(_SimCamera):
         shape = (self._settings.region.height, self._settings.region.width)
         if self._plane is None or self._detector is None or self._detector.shape != shape:
             self._plane, self._detector = self._bench.focal_plane(shape), self._bench.science_detector(shape)
-        self._bench.start_integration(
-            self._plane, self._settings.exposure_s, 1 / self._settings.frame_rate_hz
-        )
+        s = self._settings
+        self._bench.start_integration(self._plane, s.exposure_s, 1 / s.frame_rate_hz)
 
     def _stop(self) -> None:
         self._bench.stop_integration()
@@ -286,45 +249,32 @@ class SimScienceCamera(_SimCamera):
         image = bench.mean_image(k, end)
         if self._detector is None:
             raise RuntimeError("the science camera is not running")
-        scale = s.exposure_s / (
-            bench.config.devices.science.exposure_s if bench.config.devices.science else 1
-        )
+        scale = s.exposure_s / bench.science_section.exposure_s
         electrons = 0.0 if bench.beam_blocked else bench.config.twin.science.photons_per_frame * scale
         data, saturated = self._detector.expose(image, electrons)
         data.flags.writeable = False
         return Frame(data, k, round(end * 1e9), bench.now_ns, saturated)
 
 
-class SimPhaseScreen(PhaseScreen):
-    """Twin of the changer with rotating phase screens."""
+class SimPhaseScreen(_Simulated[ScreenInfo], PhaseScreen):
+    """Simulated changer with rotating phase screens."""
 
     def __init__(self, name: str, bench: SimBench) -> None:
         super().__init__(name)
-        self._bench = bench
-
-    @property
-    def info(self) -> ScreenInfo:
-        """Identity."""
-        screen = self._bench.config.devices.screen
-        return ScreenInfo("simulated phase screens", screen.serial if screen else "", simulated=True)
+        screen = bench.config.devices.screen
+        self._bench, self._n_screens = bench, len(screen.screens_r0_m) if screen else 0
+        self._info = ScreenInfo("simulated phase screens", screen.serial if screen else "", simulated=True)
 
     @property
     def state(self) -> ScreenState:
-        """The present state."""
+        """Present state."""
         b = self._bench
         return ScreenState(b.plates.number, b.plates.inserted, b.plates.speed_m_s, b.beam_blocked)
 
     @property
     def n_screens(self) -> int:
-        """How many screens the changer holds."""
-        screen = self._bench.config.devices.screen
-        return len(screen.screens_r0_m) if screen else 0
-
-    def _open(self) -> None:
-        """Nothing to connect."""
-
-    def _close(self) -> None:
-        """The plate keeps turning."""
+        """Number of screens in the changer."""
+        return self._n_screens
 
     def _set(self, want: ScreenState) -> None:
         b = self._bench
@@ -332,22 +282,17 @@ class SimPhaseScreen(PhaseScreen):
         b.plates.set_speed(want.speed_m_s, b.now_s)
 
 
-#: Servo clock of the controller; a turn is a whole number of its steps.
+#: Servo period of the controller in seconds; a modulation cycle is a whole number of them.
 SERVO_S = 50e-6
-#: Fewest and most steps of a turn: a kilohertz is all that a loaded stage does, and its memory ends.
+#: Fewest and most servo periods of a cycle: limits of a loaded stage and of the wave tables.
 _CYCLE_STEPS = (20, 262_144)
 
 
-def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> SimModulator:
-    """Entry point ``sim-e727``."""
-    return SimModulator(name, shared_bench(config, shared))
+class SimModulator(_Simulated[ModulatorInfo], TipTiltModulator):
+    """Simulated PI S-330 with E-727: the frequency is rounded to the servo clock, starting takes time.
 
-
-class SimModulator(TipTiltModulator):
-    """Twin of the PI S-330 with its E-727: a frequency that the servo clock rounds, a slow start.
-
-    It says what it was told to do, as the real one does: the ellipse, the lag between its axes and
-    the drift of its centre are seen by the beam only (``twin.pyramid``).
+    It reports the commanded modulation. Ellipticity, phase lag and centre drift (``twin.pyramid``) affect
+    only the beam.
     """
 
     def __init__(self, name: str, bench: SimBench) -> None:
@@ -362,33 +307,18 @@ class SimModulator(TipTiltModulator):
         )
 
     @property
-    def info(self) -> ModulatorInfo:
-        """Identity and reach."""
-        return self._info
-
-    @property
     def modulation(self) -> Modulation | None:
-        """The modulation in force."""
+        """Modulation in force."""
         return self._bench.beam_path.modulation
-
-    def now_ns(self) -> int:
-        """Simulated time in nanoseconds."""
-        return self._bench.now_ns
-
-    def _open(self) -> None:
-        """Nothing to connect; the stage is parked."""
-
-    def _close(self) -> None:
-        """Nothing to release."""
 
     def _check(self, want: Modulation) -> Modulation:
         steps = round(1 / (want.frequency_hz * SERVO_S))
-        least, most = _CYCLE_STEPS
-        if not least <= steps <= most:
+        fewest, most = _CYCLE_STEPS
+        if not fewest <= steps <= most:
             raise SettingRejected(
                 self.name,
-                f"frequency_hz is {want.frequency_hz:g}; it does {1 / (most * SERVO_S):.2g} to "
-                f"{1 / (least * SERVO_S):g} Hz",
+                f"frequency_hz is {want.frequency_hz:g}; it must lie in {1 / (most * SERVO_S):.2g}.."
+                f"{1 / (fewest * SERVO_S):g} Hz",
             )
         return replace(want, frequency_hz=1 / (steps * SERVO_S))
 
@@ -401,16 +331,10 @@ class SimModulator(TipTiltModulator):
         self._bench.beam_path.modulation = None
 
 
-def make_secondary(name: str, config: SystemConfig, shared: dict[str, object]) -> SimAdaptiveSecondary:
-    """Entry point ``sim-asm``."""
-    return SimAdaptiveSecondary(name, shared_bench(config, shared))
+class SimAdaptiveSecondary(_Simulated[DMInfo], AdaptiveSecondary):
+    """Simulated 336-actuator secondary of the MMT: mirror dynamics, latency, and a floating shell.
 
-
-class SimAdaptiveSecondary(AdaptiveSecondary):
-    """Twin of the MMT's 336-actuator mirror: dynamics and latency as any twin, and a shell that floats.
-
-    The option ``lift`` of its device section, true by default, says whether opening it leads to
-    ``RUNNING``. :meth:`trip` plays a fault.
+    ``lift`` in the options of its device section (default true): opening it leads to ``RUNNING``.
     """
 
     def __init__(self, name: str, bench: SimBench) -> None:
@@ -421,24 +345,9 @@ class SimAdaptiveSecondary(AdaptiveSecondary):
         noise = np.random.SeedSequence(bench.config.system.seed, spawn_key=(0xA5,))
         self._shell = Shell(bench, dm.n_act, dm.stroke_m, np.random.default_rng(noise))
 
-    @property
-    def info(self) -> DMInfo:
-        """Identity and geometry."""
-        return self._info
-
-    def now_ns(self) -> int:
-        """Simulated time in nanoseconds."""
-        return self._bench.now_ns
-
     def trip(self, reason: str) -> None:
-        """Play a fault: coils off, the shell falls back on its reference body, latched."""
+        """Simulate a latched fault: coils off, the shell on its reference body."""
         self._shell.trip(reason)
-
-    def _open(self) -> None:
-        """Nothing to connect."""
-
-    def _close(self) -> None:
-        """The mirror stays as it is."""
 
     def _send_to_shell(self, command: NDArray[np.float64]) -> None:
         self._bench.drive(command)
@@ -466,3 +375,18 @@ class SimAdaptiveSecondary(AdaptiveSecondary):
             self._bench.now_ns, shell.state, shell.gap_m(), current, AMBIENT_C + RISE_C_PER_A * current, 0,
             shell.fault,
         )  # fmt: skip
+
+
+def _factory(
+    device: Callable[[str, SimBench], Device],
+) -> Callable[[str, SystemConfig, dict[str, object]], Device]:
+    """Entry point that creates a device on the shared bench of a system."""
+    return lambda name, config, shared: device(name, shared_bench(config, shared))
+
+
+make_mirror = _factory(SimMirror)
+make_wfs_camera = _factory(SimWavefrontSensorCamera)
+make_science_camera = _factory(SimScienceCamera)
+make_screen = _factory(SimPhaseScreen)
+make_modulator = _factory(SimModulator)
+make_secondary = _factory(SimAdaptiveSecondary)

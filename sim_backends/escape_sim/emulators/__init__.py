@@ -1,1 +1,4 @@
-"""Emulated devices that answer on their own wire (TCP, serial line, USB), with faults by script; `escape emulate`. C libraries of vendors are replaced in stand_ins/."""
+"""Emulated devices on their own transports (TCP, serial line, USB) with scripted faults.
+
+``escape emulate`` runs them. Vendors' C libraries are simulated in ``stand_ins``.
+"""

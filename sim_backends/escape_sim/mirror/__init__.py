@@ -1,1 +1,1 @@
-"""Simulated deformable mirrors: influence functions, surfaces under a registration, flexure, actuator dynamics, the shell of an adaptive secondary. Device classes are in devices/."""
+"""Simulated deformable mirrors: influence functions, surfaces, flexure, dynamics, the shell."""

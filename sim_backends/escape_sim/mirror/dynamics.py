@@ -1,4 +1,4 @@
-"""How a simulated mirror moves: latency, settling, creep and saturation."""
+"""Temporal response of the simulated actuators: command latency, settling, creep, saturation."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _SETTLING_TIME_CONSTANTS = 4.744
 
 
 class MirrorDynamics:
-    """Critically damped actuators with a slow creep, driven by time-stamped commands.
+    """Critically damped actuators with slow creep, driven by time-stamped commands.
 
-    Commands may come from another thread than the one that lets time pass.
+    Thread-safe: commands may come from another thread than the one that reads positions.
 
     Parameters
     ----------
@@ -24,10 +24,8 @@ class MirrorDynamics:
         Number of actuators.
     settling_s
         Time to settle within 5 % of a step, in seconds.
-    creep_fraction
-        Share of a step that appears slowly on top of it.
-    creep_time_s
-        Time constant of the creep in seconds.
+    creep_fraction, creep_time_s
+        Share of a step that creep adds to it, and time constant of the creep in seconds.
     """
 
     def __init__(self, n_act: int, settling_s: float, creep_fraction: float, creep_time_s: float) -> None:
@@ -42,14 +40,14 @@ class MirrorDynamics:
         self._lock = threading.RLock()
 
     def command(self, time_s: float, target: NDArray[np.float64]) -> None:
-        """Take a command that reaches the actuators at ``time_s``; it saturates at full stroke."""
+        """Queue a command that reaches the actuators at ``time_s``; clipped to full stroke."""
         with self._lock:
             self._pending.append((time_s, np.clip(target, -1.0, 1.0)))
 
     def mean(self, start_s: float, end_s: float) -> NDArray[np.float64]:
         """Mean displacement ``(n_act,)`` over an interval, in fractions of full stroke.
 
-        Intervals must come in order of time; what lies before the last one is cut off.
+        Advances the time. The part of the interval before the present time is ignored.
         """
         with self._lock:
             start = max(start_s, self._time)
@@ -60,15 +58,15 @@ class MirrorDynamics:
             return total / (end_s - start) + self._creep_share * self._creep
 
     def at(self, time_s: float) -> NDArray[np.float64]:
-        """Displacement ``(n_act,)`` at a moment to come, fractions of full stroke; time does not pass."""
+        """Displacement ``(n_act,)`` at a future time, fractions of full stroke; does not advance the time."""
         with self._lock:
-            # No array is ever written into, so the copy may share them.
+            # Arrays are replaced and never modified, so the copy may share them.
             future = copy.copy(self)
-            future._pending = self._pending.copy()
+            future._pending = self._pending.copy()  # noqa: SLF001
             return future.mean(time_s, time_s)
 
     def _advance(self, until_s: float) -> NDArray[np.float64]:
-        """Move on and return the integral of the position over the way."""
+        """Advance to ``until_s`` and return the integral of the position."""
         total = np.zeros_like(self._position)
         while self._pending and self._pending[0][0] <= until_s:
             at, target = self._pending.popleft()

@@ -1,12 +1,12 @@
-"""Influence functions of a deformable mirror under any registration: Gaussian (separable factors) or measured on a grid (cubic splines)."""
+"""Influence functions of a deformable mirror under any registration, Gaussian or measured on a grid."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from astropy.io import fits
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import factorial
@@ -14,12 +14,25 @@ from scipy.special import factorial
 from escape_hw.api.registration import Registration
 from escape_hw.errors import ConfigError
 
-#: Share of an influence function's peak below which a term of a series is left out.
+if TYPE_CHECKING:
+    from escape_hw.config.system import SystemConfig
+
+#: Terms of a series below this share of an influence function's peak are omitted.
 _NEGLIGIBLE = 1e-13
 
 
+def actuator_positions(config: SystemConfig) -> NDArray[np.float64]:
+    """Nominal actuator positions ``(n_act, 2)`` as (x, y) in metres on the pupil."""
+    return config.devices.dm.positions() * pitch_on_pupil(config)
+
+
+def pitch_on_pupil(config: SystemConfig) -> float:
+    """Actuator pitch in metres, as relayed onto the pupil."""
+    return config.system.pupil_m / config.devices.dm.pitches_across_pupil
+
+
 def layout_positions(layout: NDArray[np.bool_], pitch_m: float) -> NDArray[np.float64]:
-    """Actuator positions ``(n_act, 2)`` as (x, y) in metres, in row-major order."""
+    """Actuator positions ``(n_act, 2)`` as (x, y) in metres, in row-major order of the layout."""
     rows, columns = np.nonzero(layout)
     centre = (np.array(layout.shape[::-1]) - 1) / 2
     return (np.stack([columns, rows], axis=1) - centre) * pitch_m
@@ -29,10 +42,10 @@ def layout_positions(layout: NDArray[np.bool_], pitch_m: float) -> NDArray[np.fl
 class InfluenceFunctions:
     """Gaussian influence functions, optionally with per-actuator widths and a broad wing.
 
-    The surface per unit command is ``(1 - w) G(s_i) + w G(wing_scale s_i)`` times the actuator's
-    gain, where ``G`` is a Gaussian of peak 1 that falls to ``coupling`` at one pitch. As in
-    OOPAO (``DeformableMirror.modesComputation``), scalings stretch the shapes as they do the
-    positions, and rotation moves the actuators without turning their shapes.
+    The surface per unit command is ``(1 - w) G(s_i) + w G(wing_scale s_i)`` times the actuator's gain,
+    where ``G`` is a Gaussian of peak 1 that falls to ``coupling`` at one pitch. As in OOPAO
+    (``DeformableMirror.modesComputation``), scalings stretch the shapes and the positions; rotation
+    moves the actuators without rotating their shapes.
 
     Parameters
     ----------
@@ -42,14 +55,10 @@ class InfluenceFunctions:
         Actuator pitch on the pupil in metres.
     coupling
         Mechanical coupling: relative surface one pitch away.
-    width
-        Scale of the Gaussian width, one number or ``(n_act,)``.
-    gain
-        Gain of each actuator, one number or ``(n_act,)``.
-    wing
-        Share ``w`` of the broad Gaussian.
-    wing_scale
-        Its width relative to the narrow one.
+    width, gain
+        Factor on the width of the Gaussian, and gain: one number or one per actuator ``(n_act,)``.
+    wing, wing_scale
+        Share ``w`` of the broad Gaussian, and its width relative to the narrow one.
     """
 
     positions_m: NDArray[np.float64]
@@ -77,7 +86,7 @@ class InfluenceFunctions:
         x_m: NDArray[np.float64],
         y_m: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Separable factors of the surfaces.
+        """Separable factors of the surfaces on a grid.
 
         Parameters
         ----------
@@ -88,17 +97,16 @@ class InfluenceFunctions:
 
         Returns
         -------
-        along_x : ndarray, ``(n_x, n_act, n_terms)``
-        along_y : ndarray, ``(n_y, n_act, n_terms)``
-            The surface of actuator ``a`` is ``sum_t along_y[:, a, t] x along_x[:, a, t]``: one term,
-            two with wings, and a dozen times as many under an anamorphosis angle, which makes an
-            ellipse that no product of functions of x and y is.
+        along_x, along_y : ndarray, ``(n_x, n_act, n_terms)`` and ``(n_y, n_act, n_terms)``
+            The surface of actuator ``a`` is ``sum_t along_y[:, a, t] x along_x[:, a, t]``. One term, two
+            with wings, and about a dozen times as many with an anamorphosis angle, whose ellipse is
+            not a product of functions of x and y.
         """
         at = self.registered_positions(registration, sub_aperture_m)
         sigma = np.broadcast_to(
             np.asarray(self.width) * self.pitch_m / np.sqrt(2 * np.log(1 / self.coupling)), (self.n_act,)
         )
-        # exp(-(d, Q d) / (2 sigma^2)) with Q = S^-2, so that shapes are stretched as positions are.
+        # exp(-(d, Q d) / (2 sigma^2)) with Q = S^-2: the shapes are stretched as the positions.
         inverse = np.linalg.inv(registration.scaling_matrix)
         q = inverse @ inverse
         dx = (x_m[:, None] - at[:, 0]) / sigma
@@ -125,11 +133,16 @@ class InfluenceFunctions:
         return np.asarray(np.einsum("yat,xat->ayx", along_y, along_x))
 
 
+def nominal_influence_functions(config: SystemConfig) -> InfluenceFunctions:
+    """Influence functions of the design's mirror."""
+    return InfluenceFunctions(actuator_positions(config), pitch_on_pupil(config), config.devices.dm.coupling)
+
+
 def _cross_term_weights(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weights ``(n,)`` of the powers of ``u v`` in ``exp(-q_xy u v)``.
 
-    Beside ``exp(-q_xx u^2 / 2 - q_yy v^2 / 2)`` the k-th term is at most ``r^k / sqrt(2 pi k)`` with
-    ``r = |q_xy| / sqrt(q_xx q_yy)``, which a mirror that is nearly square keeps far below one.
+    Relative to ``exp(-q_xx u^2 / 2 - q_yy v^2 / 2)`` the k-th term is at most ``r^k / sqrt(2 pi k)`` with
+    ``r = |q_xy| / sqrt(q_xx q_yy)``, which is far below one for nearly equal scalings.
     """
     ratio = abs(q[0, 1]) / np.sqrt(q[0, 0] * q[1, 1])
     if ratio < _NEGLIGIBLE:
@@ -139,10 +152,10 @@ def _cross_term_weights(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class MeasuredInfluenceFunctions:
-    """Influence functions as measured on a grid, read between its points by cubic splines.
+    """Influence functions measured on a grid, interpolated by cubic splines.
 
-    A registration moves, turns and stretches the whole surface, the shapes with the positions.
-    Beyond the measured square a surface is zero.
+    A registration shifts, rotates and stretches the whole surface, the shapes with the positions.
+    The surface is zero outside the measured square.
 
     Parameters
     ----------
@@ -150,14 +163,14 @@ class MeasuredInfluenceFunctions:
         Surfaces per unit command ``(n_act, n, n)`` in fractions of full stroke; x along columns, y
         along rows, the mirror's centre in the middle of the array.
     pixel_m
-        Distance between its points on the pupil in metres.
+        Distance between grid points on the pupil in metres.
     gain
         Gain of each actuator, one number or ``(n_act,)``.
 
     Raises
     ------
     ValueError
-        Not a stack of squares of finite numbers.
+        The surfaces are not ``(n_act, n, n)`` or not finite, or the pixel is not positive.
     """
 
     def __init__(
@@ -165,13 +178,13 @@ class MeasuredInfluenceFunctions:
     ) -> None:
         cube = np.asarray(surfaces, dtype=float)
         if cube.ndim != 3 or cube.shape[1] != cube.shape[2] or min(cube.shape) < 1:
-            raise ValueError(f"influence functions of shape {cube.shape}; they must be (n_act, n, n)")
+            raise ValueError(f"the influence functions have shape {cube.shape}; it must be (n_act, n, n)")
         if not np.isfinite(cube).all() or not pixel_m > 0:
             raise ValueError(
-                f"influence functions are not all finite, or their pixel of {pixel_m} m is not positive"
+                f"influence functions must be finite, and their pixel of {pixel_m} m must be positive"
             )
         scaled = cube * np.broadcast_to(np.asarray(gain, dtype=float), (len(cube),))[:, None, None]
-        # A margin of zeros, so that a spline does not ring at the edge of what was measured.
+        # A margin of zeros prevents ringing of the spline at the edge of the measured square.
         self._margin = 4
         padded = np.pad(scaled, ((0, 0), (self._margin,) * 2, (self._margin,) * 2))
         self._splines = np.stack([ndimage.spline_filter(s, order=3, mode="mirror") for s in padded])
@@ -189,15 +202,7 @@ class MeasuredInfluenceFunctions:
         x_m: NDArray[np.float64],
         y_m: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke.
-
-        Parameters
-        ----------
-        registration, sub_aperture_m
-            Registration and the size of a sub-aperture in metres that its shifts refer to.
-        x_m, y_m
-            Columns' and rows' coordinates ``(n_x,)`` and ``(n_y,)`` in metres.
-        """
+        """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
         matrix, offset = registration.affine(sub_aperture_m)
         x, y = np.meshgrid(x_m, y_m)
         nominal_xy = np.linalg.solve(matrix, np.stack([x.ravel() - offset[0], y.ravel() - offset[1]]))
@@ -212,13 +217,15 @@ class MeasuredInfluenceFunctions:
 
 
 def read_influence_functions(file: str, n_act: int) -> NDArray[np.float64]:
-    """Influence functions ``(n_act, n, n)`` from the first image of a FITS file.
+    """Read influence functions ``(n_act, n, n)`` from the first image of a FITS file.
 
     Raises
     ------
     ConfigError
-        The file cannot be read, or holds something else.
+        The file cannot be read, or its data have another shape or are not finite.
     """
+    from astropy.io import fits  # here, so that the synthetic models do not load it
+
     path = Path(file).expanduser()
     try:
         cube = np.asarray(fits.getdata(path), dtype=float)

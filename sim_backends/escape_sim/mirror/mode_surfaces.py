@@ -1,4 +1,4 @@
-"""Surfaces of modes under a registration and their derivatives, as products of separable factors; interpolation nodes that carry such a surface."""
+"""Surfaces of modes under a registration and their derivatives; interpolation nodes for such surfaces."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from numpy.typing import DTypeLike, NDArray
 from escape_hw.api.registration import Registration
 from escape_sim.mirror.influence_functions import InfluenceFunctions
 
-#: Derivatives are by the five parameters of the registration, in their order, and by the width.
+#: Derivatives by the five parameters of the registration, in their order, and by the width.
 N_DERIVATIVES = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianFactors:
-    """Factors of all influence functions on a grid, with what their derivatives are made of.
+    """Separable factors of all influence functions on a grid, and of their derivatives.
 
-    With ``X_0 = exp(-u^2 / 2)``, ``u = (x - x_a) / s_x``, the derivative of a factor by the
-    actuator's place is ``X_1 = X_0 u / s_x`` and by the logarithm of its width ``X_2 = X_0 u^2``.
+    With ``X_0 = exp(-u^2 / 2)``, ``u = (x - x_a) / s_x``, the derivative of a factor by the actuator's
+    position is ``X_1 = X_0 u / s_x`` and by the logarithm of its width ``X_2 = X_0 u^2``.
 
     Parameters
     ----------
     along_x, along_y
         ``(3, n_x, n_act)`` and ``(3, n_y, n_act)``: ``X_0, X_1, X_2`` and the same along y.
-    place
-        Derivatives of the actuators' places ``(6, 2, n_act)`` as (x, y), in metres per unit of the
+    position
+        Derivatives of the actuator positions ``(6, 2, n_act)`` as (x, y), in metres per unit of the
         parameter.
-    spread
+    log_width
         Derivatives of the logarithm of the widths along x and y ``(6, 2)``.
     """
 
@@ -46,7 +46,7 @@ def gaussian_factors(
     y_m: NDArray[np.float64],
     dtype: DTypeLike = np.float32,
 ) -> GaussianFactors:
-    """Factors and derivatives of influence functions without a wing.
+    """Factors of influence functions without a wing, and of their derivatives.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def gaussian_factors(
     x_m, y_m
         Columns' and rows' coordinates ``(n_x,)`` and ``(n_y,)`` in metres.
     dtype
-        Precision of the factors; single precision is worth 1e-6 of a surface.
+        Precision of the factors; single precision gives 1e-6 of a surface.
 
     Raises
     ------
@@ -66,9 +66,11 @@ def gaussian_factors(
         has an anamorphosis angle.
     """
     if influence.wing or np.ndim(influence.width) or np.ndim(influence.gain):
-        raise ValueError("derivatives are known for equal Gaussian influence functions without a wing only")
+        raise ValueError("derivatives need influence functions of equal width and gain, without a wing")
     if registration.anamorphosis_angle:
-        raise ValueError("derivatives are known without an anamorphosis angle only; no solver asks for one")
+        raise ValueError(
+            f"the anamorphosis angle is {registration.anamorphosis_angle}; derivatives need an angle of 0"
+        )
     at = influence.registered_positions(registration, sub_aperture_m)
     sigma = float(influence.width) * influence.pitch_m / np.sqrt(2 * np.log(1 / influence.coupling))
     stretch = 1 + np.array([registration.radial_scaling, registration.tangential_scaling]) / 100
@@ -93,7 +95,7 @@ def _parameter_derivatives(
     sub_aperture_m: float,
     stretch: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How places and widths follow the parameters, from ``Registration.affine``."""
+    """Derivatives of positions and log widths by the parameters, from ``Registration.affine``."""
     matrix, _ = registration.affine(sub_aperture_m)
     rotation = matrix / stretch
     nominal = influence.positions_m.T
@@ -110,28 +112,12 @@ def _parameter_derivatives(
 
 
 def mode_surfaces(factors: GaussianFactors, m2c: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Surfaces of modes ``(n_y, n_x, n_modes)`` in fractions of full stroke.
-
-    Parameters
-    ----------
-    factors
-        From :func:`gaussian_factors`.
-    m2c
-        Mode-to-command matrix ``(n_act, n_modes)``.
-    """
+    """Surfaces of modes ``(n_y, n_x, n_modes)`` in fractions of full stroke, for ``m2c (n_act, n_modes)``."""
     return _product(factors.along_y[0], factors.along_x[0], m2c.astype(factors.along_x.dtype))
 
 
 def mode_derivatives(factors: GaussianFactors, m2c: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Surfaces of modes and their derivatives ``(n_y, n_x, 1 + 6, n_modes)``, the surfaces first.
-
-    Parameters
-    ----------
-    factors
-        From :func:`gaussian_factors`.
-    m2c
-        Mode-to-command matrix ``(n_act, n_modes)``.
-    """
+    """Surfaces of modes and their derivatives ``(n_y, n_x, 1 + 6, n_modes)``, the surfaces first."""
     x, y = factors.along_x, factors.along_y
     c = m2c.astype(x.dtype)
     out = np.empty((y.shape[1], x.shape[1], 1 + N_DERIVATIVES, c.shape[1]), x.dtype)
@@ -156,19 +142,19 @@ def _product(
     return (along_y @ right).reshape(along_y.shape[0], along_x.shape[0], n_modes)
 
 
-#: Nodes for each standard deviation of an influence function across half the pupil. The Chebyshev
-#: coefficients of a Gaussian fall as ``exp(-(k sigma)^2 / 2)``: 6 leave 2e-7 at nominal width, 1e-5
-#: at 0.8 of it.
+#: Nodes per standard deviation of an influence function across half the pupil. The Chebyshev
+#: coefficients of a Gaussian fall as ``exp(-(k sigma)^2 / 2)``: with 6 the error is 2e-7 at nominal
+#: width and 1e-5 at 0.8 of it.
 _NODES_PER_SIGMA = 6.0
 
 
 def surface_nodes(
     samples_m: NDArray[np.float64], sigma_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
-    """Nodes along an axis, and the matrix from values there to values at the samples.
+    """Interpolation nodes along an axis, and the matrix from their values to values at the samples.
 
-    Chebyshev nodes and barycentric interpolation (Berrut and Trefethen 2004), or the samples
-    themselves where these are fewer.
+    Chebyshev nodes with barycentric interpolation (Berrut and Trefethen 2004), or the samples
+    themselves if these are fewer.
 
     Parameters
     ----------
@@ -180,15 +166,15 @@ def surface_nodes(
     Returns
     -------
     nodes_m : ndarray, ``(m,)``
-    carry : ndarray, ``(n, m)``
-        None where the nodes are the samples.
+    interpolation : ndarray, ``(n, m)``
+        None if the nodes are the samples.
     """
-    middle, half = (samples_m[0] + samples_m[-1]) / 2, (samples_m[-1] - samples_m[0]) / 2
+    centre, half = (samples_m[0] + samples_m[-1]) / 2, (samples_m[-1] - samples_m[0]) / 2
     m = int(np.ceil(_NODES_PER_SIGMA * half / sigma_m)) + 1
     if m >= samples_m.size:
         return samples_m, None
     angle = (2 * np.arange(m) + 1) * np.pi / (2 * m)
-    nodes = middle - half * np.cos(angle)
+    nodes = centre - half * np.cos(angle)
     weights = np.sin(angle) * (-1.0) ** np.arange(m)
     distance = samples_m[:, None] - nodes
     on_node = distance == 0

@@ -1,4 +1,4 @@
-"""The thin shell of an adaptive secondary as it behaves: states, gap, currents, sensors, faults."""
+"""Thin shell of an adaptive secondary: states, gap, coil currents, position sensors, faults."""
 
 from __future__ import annotations
 
@@ -15,41 +15,33 @@ from escape_sim.mirror.dynamics import MirrorDynamics
 FLOATING_GAP_M, RESTED_GAP_M = 50e-6, 2e-6
 #: Noise of a capacitive position sensor in metres.
 SENSOR_NOISE_M = 3e-9
-#: Time in seconds that each step of the ladder takes.
+#: Duration in seconds of the transition into each state.
 TRANSITION_S = {ShellState.OFF: 0.5, ShellState.RESTED: 1.0, ShellState.SET: 2.0, ShellState.RUNNING: 0.1}
-#: Coil current in amperes that holds the shell, and what full stroke against the stiff shell adds.
+#: Coil current in amperes that holds the shell, and what full stroke adds.
 HOLDING_CURRENT_A, FULL_STROKE_CURRENT_A = 0.05, 0.5
 #: Temperature in degrees Celsius of coils without current, and its rise per ampere.
 AMBIENT_C, RISE_C_PER_A = 15.0, 10.0
 
 
 class MovingActuators(Protocol):
-    """What moves: actuators that follow shapes ``(n_act,)``, fractions of full stroke, in their time."""
+    """Actuators that follow shapes ``(n_act,)``, fractions of full stroke, in time."""
 
     @property
     def now_s(self) -> float:
         """Monotonic seconds."""
 
     def drive(self, shape: NDArray[np.float64]) -> None:
-        """A command on its usual way, with whatever latency that has."""
+        """Command a shape, with the latency of commands."""
 
     def set_positions(self, shape: NDArray[np.float64]) -> None:
-        """A shape that is taken at once, without a command."""
+        """Set a shape immediately."""
 
     def positions(self) -> NDArray[np.float64]:
-        """Where the actuators are now."""
+        """Present positions."""
 
 
 class RealTimeActuators:
-    """Actuators that move in real time.
-
-    Parameters
-    ----------
-    n_act
-        Number of actuators.
-    settling_s
-        Time to settle within 5 % of a step, in seconds.
-    """
+    """Actuators that move in real time and settle within 5 % of a step in ``settling_s`` seconds."""
 
     def __init__(self, n_act: int, settling_s: float) -> None:
         self._start = time.monotonic()
@@ -57,34 +49,41 @@ class RealTimeActuators:
 
     @property
     def now_s(self) -> float:
-        """Seconds since it was made."""
+        """Seconds since construction."""
         return time.monotonic() - self._start
 
     def drive(self, shape: NDArray[np.float64]) -> None:
-        """Take a command now."""
+        """Command a shape now."""
         self._dynamics.command(self.now_s, shape)
 
     set_positions = drive
 
     def positions(self) -> NDArray[np.float64]:
-        """Where the actuators are now."""
+        """Present positions."""
         now = self.now_s
         return self._dynamics.mean(now, now)
 
 
 class Shell:
-    """State, fault and sensors of a shell over actuators that move.
+    """State, fault and sensors of a shell on moving actuators.
 
     Parameters
     ----------
-    plant
+    actuators
         The actuators.
     n_act
-        How many.
+        Their number.
     stroke_m
         Metres of surface for a command of 1.
     noise
         Random generator of the position sensors.
+
+    Attributes
+    ----------
+    unreadable
+        Actuators whose position sensor fails.
+    excess_a
+        Coil current in amperes of actuators that draw too much.
     """
 
     def __init__(
@@ -92,7 +91,6 @@ class Shell:
     ) -> None:
         self._actuators, self.n_act, self.stroke_m, self._noise = actuators, n_act, stroke_m, noise
         self.state, self.fault = ShellState.OFF, ""
-        #: Actuators whose sensor delivers nothing, and those whose coil carries too much: (number, A).
         self.unreadable: set[int] = set()
         self.excess_a: dict[int, float] = {}
 
@@ -102,29 +100,28 @@ class Shell:
         return self.state in (ShellState.SET, ShellState.RUNNING)
 
     def finish_transition(self, state: ShellState, flat: NDArray[np.float64]) -> None:
-        """End a step of the ladder: afloat the shell is flat, at rest it has its body's shape."""
+        """End a transition: a floating shell takes the shape ``flat``, a rested one lies on its body."""
         self.state = state
         self._actuators.set_positions(flat if self.is_floating else np.zeros(self.n_act))
 
     def drive(self, shape: NDArray[np.float64]) -> None:
-        """A command ``(n_act,)``, fractions of full stroke, on its usual way."""
+        """Command a shape ``(n_act,)`` in fractions of full stroke."""
         self._actuators.drive(shape)
 
     def trip(self, reason: str) -> None:
-        """Coils off: the shell falls back on its reference body, latched."""
+        """Latch a fault: the coils are off and the shell lies on its reference body."""
         self.state, self.fault = ShellState.FAULT, reason
         self._actuators.set_positions(np.zeros(self.n_act))
 
     def recover(self) -> None:
-        """End a fault; the shell lies at rest."""
+        """End a fault; the shell is rested."""
         self.state, self.fault = ShellState.RESTED, ""
 
     def measure_positions(self) -> NDArray[np.float64]:
-        """Noisy positions ``(n_act,)``, fractions of full stroke; NaN where a sensor is blind."""
-        measured_positions = self._actuators.positions()
-        measured_positions = measured_positions + self._noise.standard_normal(measured_positions.size) * (
-            SENSOR_NOISE_M / self.stroke_m
-        )
+        """Noisy positions ``(n_act,)``, fractions of full stroke; NaN for unreadable sensors."""
+        positions = self._actuators.positions()
+        noise = self._noise.standard_normal(positions.size) * (SENSOR_NOISE_M / self.stroke_m)
+        measured_positions = positions + noise
         if self.unreadable:
             measured_positions[sorted(self.unreadable)] = np.nan
         return measured_positions

@@ -1,54 +1,34 @@
-"""Mirror surface of all actuators for a command, in single precision, and its slow change when the registration drifts (flexure)."""
+"""Mirror surface of all actuators for a command, in single precision, and its drift with the registration."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, MeasuredInfluenceFunctions
 
 if TYPE_CHECKING:
     from escape_hw.config.twin import TwinDrift
 
 
-#: Height, relative to the peak, below which a sample belongs to no actuator. All that is left out of
-#: a surface stays below this times the command, summed over actuators that are far away.
+#: Height, relative to the peak, below which an influence function is omitted. The error of a surface is
+#: below this times the command, summed over distant actuators.
 NEGLIGIBLE_HEIGHT = 1e-6
-#: Products of one GEMM that take as long as one of the loop over windows (measured: 4 to 7).
+#: Speed of a matrix product relative to the loop over windows, per multiplication (measured: 4 to 7).
 _GEMM_SPEEDUP = 6.0
 
 
-class InfluenceModel(Protocol):
-    """Influence functions of a mirror under any registration."""
-
-    @property
-    def n_act(self) -> int:
-        """Number of actuators."""
-        ...
-
-    def surfaces(
-        self,
-        registration: Registration,
-        sub_aperture_m: float,
-        x_m: NDArray[np.float64],
-        y_m: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
-        ...
-
-
-class SurfaceFunction(Protocol):
-    """Commands to surfaces on a fixed grid."""
-
-    def __call__(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``."""
-        ...
+#: Influence functions of a mirror under any registration.
+InfluenceModel = InfluenceFunctions | MeasuredInfluenceFunctions
+#: Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``, on a fixed grid.
+SurfaceFunction = Callable[[NDArray[np.float64]], NDArray[np.float32]]
 
 
 def make_mirror_surface(
@@ -58,10 +38,10 @@ def make_mirror_surface(
     x_m: NDArray[np.float64],
     y_m: NDArray[np.float64],
 ) -> SurfaceFunction:
-    """The faster of the ways to compute a surface.
+    """Build the fastest surface function for these influence functions.
 
-    One matrix product over all actuators is best while each of them reaches across much of the
-    pupil; for many actuators it is better to add each to the samples that it reaches.
+    One matrix product over all actuators is fastest if each reaches across much of the pupil; with
+    many actuators it is faster to add each on the samples that it reaches.
 
     Parameters
     ----------
@@ -81,13 +61,10 @@ def make_mirror_surface(
 
 
 class DenseSurface:
-    """Separable influence functions, all in one matrix product.
+    """Separable influence functions, added by one matrix product.
 
-    Parameters
-    ----------
-    along_x, along_y
-        Factors ``(n_x, n_act, n_terms)`` and ``(n_y, n_act, n_terms)``, see
-        ``InfluenceFunctions.factors``.
+    ``along_x (n_x, n_act, n_terms)`` and ``along_y (n_y, n_act, n_terms)`` are the factors of
+    :meth:`InfluenceFunctions.factors`.
     """
 
     def __init__(self, along_x: NDArray[np.float64], along_y: NDArray[np.float64]) -> None:
@@ -104,7 +81,7 @@ class DenseSurface:
 def _windows(
     profile: NDArray[np.float64], threshold: NDArray[np.float64] | float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First sample and the one after the last ``(k,)`` at which each profile ``(n, k)`` exceeds a level."""
+    """First sample and the one after the last ``(k,)`` where each profile ``(n, k)`` exceeds a threshold."""
     above = np.abs(profile) > threshold
     reached = above.any(axis=0)
     first = np.where(reached, above.argmax(axis=0), 0)
@@ -112,25 +89,17 @@ def _windows(
 
 
 class WindowedSurface:
-    """Separable influence functions, each added where it reaches.
+    """Separable influence functions, each added on the samples that it reaches.
 
-    Parameters
-    ----------
-    along_x, along_y
-        As for :class:`DenseSurface`.
-
-    Attributes
-    ----------
-    products
-        Multiplications per surface.
+    Factors as for :class:`DenseSurface`. ``products`` is the number of multiplications per surface.
     """
 
     def __init__(self, along_x: NDArray[np.float64], along_y: NDArray[np.float64]) -> None:
         n_x, _, terms = along_x.shape
         x, y = along_x.reshape(n_x, -1), along_y.reshape(len(along_y), -1)
-        # What counts is the product with the other factor at its highest, against a peak of one.
+        # The threshold applies to the product with the largest value of the other factor.
         highest_x, highest_y = (np.maximum(np.abs(f).max(axis=0), 1e-30) for f in (x, y))
-        # Columns of the factors next to each other in memory, in an order that stays close on the surface.
+        # Factors of one actuator contiguous in memory, in the order of the actuators.
         self._x, self._y = (np.ascontiguousarray(f.T, dtype=np.float32) for f in (x, y))
         self._left, self._right = _windows(x, NEGLIGIBLE_HEIGHT / highest_y)
         self._top, self._bottom = _windows(y, NEGLIGIBLE_HEIGHT / highest_x)
@@ -162,13 +131,7 @@ def _add_windows(command, terms, along_x, along_y, left, right, top, bottom, out
 
 
 class GriddedSurface:
-    """Influence functions of any shape, each added where it reaches.
-
-    Parameters
-    ----------
-    surfaces
-        Surfaces per unit command ``(n_act, n_y, n_x)``.
-    """
+    """Influence functions of any shape ``(n_act, n_y, n_x)``, each added on the samples that it reaches."""
 
     def __init__(self, surfaces: NDArray[np.float64]) -> None:
         size = np.abs(surfaces)
@@ -181,7 +144,7 @@ class GriddedSurface:
                 surfaces, self._top, self._bottom, self._left, self._right, strict=True
             )
         ]
-        self._start = np.concatenate([[0], np.cumsum([stamp.size for stamp in patches])])
+        self._start = np.concatenate([[0], np.cumsum([patch.size for patch in patches])])
         self._patches = np.concatenate(patches)
         self._shape = surfaces.shape[1:]
 
@@ -210,25 +173,15 @@ def _add_patches(command, patches, start, left, right, top, bottom, out):  # typ
                 target[j] += weight * line[j]
 
 
-#: Largest way of each parameter between two derivations of the surface, in its units. A hundredth of
-#: a percent of a sub-aperture is a fifth of what the best registration errs by.
+#: Largest change of each parameter, in its unit, before the surface is computed anew. The shifts'
+#: 0.01 % of a sub-aperture is a fifth of the smallest uncertainty of a registration.
 _MAX_PARAMETER_CHANGE = np.array([0.01, 0.01, 3e-4, 0.003, 0.003])
 
 
 class Flexure:
-    """Where the mirror sits at a moment: hidden truth.
+    """True registration of the mirror as a function of time, from ``start`` at time zero.
 
-    Parameters
-    ----------
-    start
-        Registration at time zero.
-    drift
-        Rates, sinusoid and period.
-
-    Attributes
-    ----------
-    step_s
-        Seconds in which no parameter moves by more than the surface is derived anew for.
+    ``update_interval_s`` is the time after which a parameter may have changed enough for a new surface.
     """
 
     def __init__(self, start: Registration, drift: TwinDrift) -> None:
@@ -242,22 +195,16 @@ class Flexure:
         self.update_interval_s = 1 / max_rate if max_rate else math.inf
 
     def at(self, time_s: float) -> Registration:
-        """The registration at a time of the twin's clock, in seconds."""
+        """Registration at a time of the twin's clock in seconds."""
         registration = Registration.from_array(self._start.to_array() + self._drift.offsets_at(time_s))
         return replace(registration, anamorphosis_angle=self._start.anamorphosis_angle)
 
 
 class DriftingSurface:
-    """Commands to surfaces under a registration that moves; derived anew as seldom as it may be.
+    """Function from commands to surfaces under a drifting registration.
 
-    The surface of a moment depends on that moment alone, whatever was asked before.
-
-    Parameters
-    ----------
-    influence, sub_aperture_m, x_m, y_m
-        As for :func:`~escape_sim.mirror.surface.make_mirror_surface`.
-    flexure
-        Where the mirror sits.
+    The surface is recomputed once per ``flexure.update_interval_s`` and depends on the time only.
+    Parameters as for :func:`make_mirror_surface`.
     """
 
     def __init__(
@@ -281,7 +228,7 @@ class DriftingSurface:
         return self._surface(command)
 
     def _surface_of_step(self, number: int) -> SurfaceFunction:
-        """The surface in the middle of step ``number``."""
+        """Surface function for the middle of interval ``number``."""
         interval_s = self._flexure.update_interval_s
         registration = self._flexure.at(0.0 if math.isinf(interval_s) else (number + 0.5) * interval_s)
         return make_mirror_surface(self._influence, registration, self._sub_aperture_m, self._x, self._y)

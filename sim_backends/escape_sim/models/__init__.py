@@ -1,1 +1,4 @@
-"""Fast synthetic models of the sensors' response to the mirror, as inverted by SPRINT: analytic derivatives for Shack-Hartmann and pyramid, averaged over turbulence. Nothing here reads the twin's true state."""
+"""Fast synthetic models of the sensors' response to the mirror, as inverted by SPRINT.
+
+They read the configuration and what a sensor measures, never the twin's true state.
+"""

@@ -1,4 +1,4 @@
-"""SPRINT's nominal synthetic model of a pyramid system, fast and analytic."""
+"""Fast analytic model of a modulated pyramid system, averaged over turbulence and pokes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.config.sensor import PyramidSection
 from escape_sim.atmosphere.von_karman import structure_function
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, nominal_influence_functions
 from escape_sim.mirror.mode_surfaces import (
     N_DERIVATIVES,
     GaussianFactors,
@@ -33,43 +33,40 @@ from escape_sim.models.pyramid_turbulence import (
 )
 from escape_sim.optics.fourier_filter import next_fast_length
 from escape_sim.optics.modulation import ModulationPath
-from escape_sim.optics.pupil import actuator_positions, pitch_on_pupil, pupil_from_images, pupil_geometry
+from escape_sim.optics.pupil import nominal_flux, pupil_from_images
 from escape_sim.optics.pyramid import GridRegion, Prism, PyramidOptics
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
-#: Outer scale of the turbulence in pupil diameters: a few pupils, as the modal basis has it.
+#: Outer scale of the turbulence in pupil diameters, as in the modal basis.
 _OUTER_SCALE = 4.0
-#: Turbulence weaker than this many r0 across the pupil leaves the response what it is at rest.
+#: Pupil diameters over r0 below which turbulence does not change the response.
 _NEGLIGIBLE_STRENGTH = 0.5
-#: What scalings may err by in common on a pyramid under turbulence and pokes, in % of the diameter: what the
-#: mean over some twenty twins can hide (docs/decisions/0018-pyramid-registration-uncertainties.md, "Scalings that leaned").
+#: Systematic error of the scalings under turbulence and pokes, in % of the diameter: the limit that a mean
+#: over some twenty realisations gives (docs/decisions/0018-pyramid-registration-uncertainties.md).
 _SCALING_SYSTEMATIC = 0.05
-#: Slopes at the rim may answer so much more or less than the model's (found: 0.2 to 0.3): pixels saturate
-#: when pokes gather the light, and what the pokes do at the rim is only nearly known.
+#: Relative gain error of slopes at the rim (measured: 0.2 to 0.3): pixels saturate where pokes
+#: concentrate the light, and the pokes' effect at the rim is only approximately known.
 _GAIN_TREND = 0.3
-#: On a telescope pixels that get less of a bright one's light are dirt's, or the shadow's or the rim's ...
+#: Pixels with less relative flux are vignetted or contaminated on a telescope; their squares are weighted
+#: by ``_MIN_SLOPE_WEIGHT`` unless they are the majority.
 _MIN_RELATIVE_FLUX = 0.85
-#: ... and their squares count by so much, unless more than half would.
 _MIN_SLOPE_WEIGHT = 1e-3
-#: Shapes of the mirror that are looked at under each state of the air.
+#: Mirror shapes whose response is computed for each turbulence state.
 _N_SHAPES = 10
-#: Relative doubt about the turbulence's strength, and about the roundness of the modulation.
+#: Relative uncertainty of the turbulence strength, and ellipticity of the modulation.
 _STRENGTH_UNCERTAINTY, _ELLIPSE = 0.4, 0.05
-#: Doubt in pixels about the images' place relative to each other, and the pattern of it that matters: one
-#: diagonal pair against the other makes the x slopes hold some of the y slopes' derivative, as a shift does.
-#: The other patterns displace images whose sum is in a slope or whose difference answers to no phase.
+#: Uncertainty in pixels of the images' relative positions, and its relevant pattern: opposite shifts of the
+#: diagonal pairs mix derivatives of the y slopes into the x slopes, as a registration shift does. Other
+#: patterns displace images whose sum is used or whose difference does not depend on the phase.
 _IMAGE_POSITION_ERROR_PX, _DIAGONALS = 0.1, np.array([1.0, -1.0, -1.0, 1.0])
 
 
 def nominal_pupils(config: SystemConfig) -> PyramidPupils:
-    """The design's pupil images, valid where the design beam is bright enough."""
-    sensor, pupil = config.sensor_as(PyramidSection), pupil_geometry(config)
-    n, p = pupil.n_sub, pupil.n_pix
-    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
-    flux /= np.percentile(flux[flux > 0], 95)
-    valid = flux >= sensor.min_flux
+    """The design's pupil images; valid where the design flux is sufficient."""
+    sensor, flux = config.sensor_as(PyramidSection), nominal_flux(config)
+    n, valid = sensor.n_sub, flux >= sensor.min_flux
     centres = np.array(sensor.pupils_px)
     return PyramidPupils(
         centres, float(n), pupil_boxes(centres, n), valid,
@@ -79,24 +76,24 @@ def nominal_pupils(config: SystemConfig) -> PyramidPupils:
 
 
 class PyramidModel:
-    """Small-signal slopes of a modulated pyramid behind a Gaussian-actuator mirror.
+    """Small-signal slopes of a modulated pyramid with a mirror of Gaussian actuators.
 
-    The slopes' derivatives by the phase at every sample of the pupil are worked out once, at a flat
-    wavefront or in the mean over turbulence as strong as the slopes' motion tells. They are kept on
-    the few nodes that carry a mirror surface; a matrix under any registration is then one product.
-    The mean matters: open-loop turbulence of 22 r0 across the pupil lowers the response to modes of
-    low order to 0.38, of middle order to 0.31 and of high order to 0.53 of what it is at rest.
+    The derivatives of the slopes by the phase are computed once, at a flat wavefront or averaged over
+    turbulence whose strength is estimated from the motion of the slopes. They are stored at the few
+    nodes that interpolate a mirror surface, so a matrix under any registration is one product. The
+    average matters: open-loop turbulence of 22 r0 across the pupil lowers the response to 0.38 (low
+    order modes), 0.31 (middle) and 0.53 (high) of its value without turbulence.
 
     Parameters
     ----------
     config
         The design: sensor, mirror and beam. Its ``twin`` section is not read.
     pupils
-        The pupil images found on the camera.
+        The pupil images measured on the camera.
     modulation
-        Path of the image over the pyramid; by default a circle of the pupils' radius.
+        Path of the image over the pyramid; by default a circle of the pupils' modulation radius.
     turbulence
-        Pupil diameters over r0 to average over; by default what the pupils' motion tells.
+        Pupil diameters over r0 to average over; by default estimated from the motion of the slopes.
     basis
         Modes ``(n_act, n_modes)`` that were poked; by default those of the configuration.
 
@@ -119,18 +116,16 @@ class PyramidModel:
     ) -> None:
         pupil = pupil_from_images(config, pupils)
         self._config, self._pupils, self._pupil = config, pupils, pupil
-        self._positions = actuator_positions(config)
-        self._pitch = pitch_on_pupil(config)
-        self._coupling = config.devices.dm.coupling
+        self._nominal = nominal_influence_functions(config)
         self._modes = basis
         self._modulation = modulation or ModulationPath.circle(pupils.modulation)
-        # A surface changes the path by twice as much.
+        # The optical path changes by twice the surface.
         scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
         self._pokes = self._measured_pokes(scale) if pupils.pokes else None
         if turbulence is None:
             turbulence = estimate_strength(self.optics(), pupils, _OUTER_SCALE, self._pokes)
         self.turbulence = turbulence if turbulence >= _NEGLIGIBLE_STRENGTH else 0.0
-        sigma = self._pitch / np.sqrt(2 * np.log(1 / self._coupling))
+        sigma = self._nominal.pitch_m / np.sqrt(2 * np.log(1 / self._nominal.coupling))
         self._nodes, self._interpolation = surface_nodes(pupil.coordinates_m, sigma)
         self._response = self._compute_phase_derivatives()
         self._response *= np.float32(scale)
@@ -142,7 +137,7 @@ class PyramidModel:
     @property
     def n_act(self) -> int:
         """Number of actuators."""
-        return len(self._positions)
+        return self._nominal.n_act
 
     @property
     def sub_aperture_m(self) -> float:
@@ -151,22 +146,22 @@ class PyramidModel:
 
     @property
     def registration_systematic_error(self) -> NDArray[np.float64]:
-        """Errors of the pupil images' place and of the air's own, see :class:`HasSystematicError`."""
+        """Errors by the images' positions and by the turbulence, see :class:`HasSystematicError`."""
         shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
         scaling = _SCALING_SYSTEMATIC if self.turbulence or self._pokes else 0.0
         return np.asarray(np.hypot([shift, shift, 0.0, scaling, scaling], self._turbulence_uncertainty()))
 
     @property
     def gain_trend(self) -> float:
-        """Scatter of trends of the slopes' gains, see :class:`HasGainTrend`; a pyramid at rest has none."""
+        """Scatter of trends of the slopes' gains, see :class:`HasGainTrend`; 0 for a static pyramid."""
         return _GAIN_TREND if self.turbulence or self._pokes else 0.0
 
     @property
     def slope_weights(self) -> NDArray[np.float64]:
-        """What pixels count, see :class:`HasSlopeWeights`: on a telescope those that are well lit.
+        """Weight of each slope, see :class:`HasSlopeWeights`: low for dim pixels on a telescope.
 
-        Dirt stops a part of the light within a pixel, and its edges scatter; slopes there answer in
-        ways that random gains take for a scaling. A bench's beam is dim at the rim by design.
+        Contamination covers part of a pixel and scatters light at its edges. Gain errors there would be
+        mistaken for a scaling. On a bench the rim is dim by design.
         """
         lit = self._pupils.flux[self._pupils.valid] >= _MIN_RELATIVE_FLUX
         if not self._config.telescope.obscuration or 2 * lit.sum() < lit.size:
@@ -182,7 +177,7 @@ class PyramidModel:
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`; single precision."""
         if registration.anamorphosis_angle:
-            # A slanted Gaussian has no factors along x and y.
+            # An inclined elliptic Gaussian is not separable in x and y.
             at = self._nodes
             surfaces = self._influence(width).surfaces(registration, self.sub_aperture_m, at, at)
             return self._slopes(np.moveaxis(surfaces, 0, 2))
@@ -212,23 +207,23 @@ class PyramidModel:
         x, y = factors.along_x, factors.along_y
         pairs = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
         parts = [self._slopes(np.einsum("ya,xa->yxa", y[j], x[i])) for i, j in pairs]
-        # By the place along x and y, and by the logarithm of the width along either.
+        # By the positions along x and y, and by the logarithms of the widths along x and y.
         derivatives = np.concatenate(
             [factors.position, np.repeat(factors.log_width[:, :, None], self.n_act, 2)], axis=1
         )
         return parts[0], np.einsum("pka,ksa->psa", derivatives, np.stack(parts[1:]), optimize=True)
 
     def with_pupil_shift(self, shift_x: float, shift_y: float) -> PyramidModel:
-        """The same air and the same mirror behind shifted images, see :class:`HasPupilShift`."""
+        """The model with shifted images under the same turbulence, see :class:`HasPupilShift`."""
         position = shift_x, shift_y
         if position not in self._shifted_models:
-            derivatives = np.array(position) / 100 * self._pupils.diameter_px / self._pupil.n_sub
-            pupils = replace(self._pupils, centres_px=self._pupils.centres_px + derivatives)
+            shift_px = np.array(position) / 100 * self._pupils.diameter_px / self._pupil.n_sub
+            pupils = replace(self._pupils, centres_px=self._pupils.centres_px + shift_px)
             self._shifted_models[position] = self._variant_with(self._modulation, self.turbulence, pupils)
         return self._shifted_models[position]
 
     def variants(self) -> list[PyramidModel]:
-        """The sensor under stronger turbulence, with an oval modulation, and with misplaced images."""
+        """Models with stronger turbulence, elliptic modulation, or displaced images."""
         if self._variants is None:
             radius = self._pupils.modulation
             self._variants = []
@@ -241,8 +236,8 @@ class PyramidModel:
             for axis in range(2):
                 centres = self._pupils.centres_px.copy()
                 centres[:, axis] += _IMAGE_POSITION_ERROR_PX * _DIAGONALS
-                apart = replace(self._pupils, centres_px=centres)
-                self._variants.append(self._variant_with(self._modulation, self.turbulence, apart))
+                displaced = replace(self._pupils, centres_px=centres)
+                self._variants.append(self._variant_with(self._modulation, self.turbulence, displaced))
         return list(self._variants)
 
     # ------------------------------------------------------------------ construction
@@ -255,7 +250,7 @@ class PyramidModel:
         )  # fmt: skip
 
     def _turbulence_uncertainty(self) -> NDArray[np.float64]:
-        """What the states of the air and of the mirror that were seen leave of :func:`turbulence_registration_scatter`."""
+        """Registration error ``(5,)`` by the finite number of turbulence and poke states averaged."""
         if not self._pupils.n_effective or not (self.turbulence or self._pokes):
             return np.zeros(5)
         if self._turbulence_scatter is None:
@@ -273,7 +268,7 @@ class PyramidModel:
         return np.asarray(self._turbulence_scatter / np.sqrt(self._pupils.n_effective))
 
     def _basis(self) -> NDArray[np.float64]:
-        """The modes of a calibration ``(n_act, n_modes)``."""
+        """Modes of the calibration ``(n_act, n_modes)``."""
         if self._modes is None:
             self._modes = build_basis(
                 self._config, *self.influence_functions(), self._config.devices.dm.limits.disabled
@@ -281,42 +276,42 @@ class PyramidModel:
         return self._modes
 
     def _measured_pokes(self, scale: float) -> RandomPokes:
-        """The pokes that were measured; ``scale`` is the phase of a surface of full stroke in radians."""
+        """Pokes of the measured rms; ``scale`` converts full stroke of surface to radians of phase."""
         m2c = self._basis()
         surfaces, lit, _ = self.influence_functions()
-        # Random pokes are uniform: an rms of so much less than their largest.
+        # Pokes are uniformly distributed, with an rms of 1 / sqrt(3) of their maximum.
         max_amplitude = self._config.calibration.poke_command / np.abs(m2c).max(axis=0) / np.sqrt(3)
         return RandomPokes.from_rms(
             self._pupils.pokes, max_amplitude, scale * np.tensordot(m2c.T, surfaces, 1), lit
         )
 
     def _draw_commands(self, count: int) -> NDArray[np.float64]:
-        """Commands ``(count, n_act, k)`` of all modes of a basis at once, as a calibration's pokes are."""
+        """Commands ``(count, n_act, k)`` of all modes with random amplitudes."""
         m2c = self._basis()
         return m2c @ np.random.default_rng(2).standard_normal((count, m2c.shape[1], _N_SHAPES))
 
     def _compute_phase_derivatives(self) -> NDArray[np.float32]:
-        """The slopes' derivatives by the phase at the nodes ``(n_slopes, m * m)``."""
+        """Derivatives of the slopes by the phase at the nodes ``(n_slopes, m * m)``."""
         pupils, pupil = self._pupils, self._pupil
         n, samples = len(pupil.coordinates_m), pupil.n_pix
         shape = self._config.devices.wfs.region[:1:-1]
         grid = next_fast_length(max(shape), samples)
-        window = GridRegion(pupils.centres_px, shape, grid, samples)
+        region = GridRegion(pupils.centres_px, shape, grid, samples)
         structure = None
         if self.turbulence or self._pokes:
-            apart = sample_distances(n, pupil.pixel_m) / self._config.system.pupil_m
-            structure = np.zeros_like(apart)
+            distances = sample_distances(n, pupil.pixel_m) / self._config.system.pupil_m
+            structure = np.zeros_like(distances)
             if self.turbulence:
-                structure += structure_function(apart, 1 / self.turbulence, _OUTER_SCALE)
+                structure += structure_function(distances, 1 / self.turbulence, _OUTER_SCALE)
         return slope_response(
-            pupil.amplitude, Prism(window.shifts(n), pupil.n_sub * samples), grid * samples,
-            pupils.corners_px - window.first, pupils.valid, self._modulation, structure,
+            pupil.amplitude, Prism(region.shifts(n), pupil.n_sub * samples), grid * samples,
+            pupils.corners_px - region.first, pupils.valid, self._modulation, structure,
             nonuniform=None if self._pokes is None else self._pokes.nonuniform(),
             interpolation=self._interpolation, samples=samples, local=pupils.normalisation == "local",
         ).phase_derivatives  # fmt: skip
 
     def optics(self) -> PyramidOptics:
-        """The sensor of the design, with the images where they were found."""
+        """Optics of the design's sensor, with the images at their measured positions."""
         return PyramidOptics(
             self._pupil.amplitude, float(self._pupil.n_sub), self._config.system.wavelength_m,
             self._pupils.centres_px, self._config.devices.wfs.region[:1:-1], self._modulation,
@@ -325,14 +320,12 @@ class PyramidModel:
 
     # ------------------------------------------------------------------ mirror
     def _slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Slopes ``(n_slopes, k)`` of surfaces ``(m, m, k)`` on the nodes, in fractions of full stroke."""
-        # Few modes cost what it takes to read the response: two threads read one half each.
+        """Slopes ``(n_slopes, k)`` of surfaces ``(m, m, k)`` at the nodes, in fractions of full stroke."""
+        # For few modes reading the response from memory dominates: two threads read one half each.
         surface_matrix = surfaces.reshape(-1, surfaces.shape[2]).astype(np.float32, copy=False)
-        middle = len(self._response) // 2
-        lower_half = self._executor.submit(np.matmul, self._response[middle:], surface_matrix)
-        return np.concatenate([self._response[:middle] @ surface_matrix, lower_half.result()]).astype(
-            np.float64
-        )
+        half = len(self._response) // 2
+        second = self._executor.submit(np.matmul, self._response[half:], surface_matrix)
+        return np.concatenate([self._response[:half] @ surface_matrix, second.result()]).astype(np.float64)
 
     def _factors(self, registration: Registration, width: float) -> GaussianFactors:
         return gaussian_factors(
@@ -340,4 +333,4 @@ class PyramidModel:
         )
 
     def _influence(self, width: float) -> InfluenceFunctions:
-        return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)
+        return replace(self._nominal, width=width)

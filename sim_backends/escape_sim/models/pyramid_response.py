@@ -1,17 +1,17 @@
-"""Derivatives of pyramid slopes by the phase, at a flat wavefront or averaged over modulation and Gaussian turbulence (coherence function)."""
+"""Derivatives of pyramid slopes by the phase, at a flat wavefront or averaged over Gaussian turbulence."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.api.concurrency import limit_to_one_thread
+from escape_sim.atmosphere.von_karman import lit_columns
 from escape_sim.optics.fourier_filter import FourierFilter, next_fast_length
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import Prism, frequencies
@@ -26,27 +26,11 @@ def _shifted_spread(spread, row, column, light, out):  # type: ignore[no-untyped
             target[j] = line[column - j].conjugate() * amplitude[j]
 
 
-class PixelCorrelations(Protocol):
-    """Means of ``conj(E(u)) f(p) / A(p)`` for the field ``E`` of a pixel and the pupil's ``f``."""
-
-    def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
-        """For each (row, column) ``u`` in turn: rows of ``n`` or more samples, ``n`` of them."""
-        ...
-
-
 class ModulatedCorrelations:
-    """Beams of a modulation without turbulence: one for each point, summed by matrix products.
+    """Correlations of a modulation without turbulence: matrix products over its points.
 
-    Parameters
-    ----------
-    light
-        Pupil amplitude ``(n, n)``.
-    prism
-        Faces, as seen from a pupil in the grid's corner.
-    n_grid
-        Side of the periodic grid in samples.
-    modulation
-        Path of the image over the pyramid.
+    Correlations are means of ``conj(E(u)) f(p) / A(p)`` for the field ``E`` at a pixel and the pupil
+    field ``f``. Parameters as for :func:`slope_response`; ``light`` is the pupil amplitude ``(n, n)``.
     """
 
     def __init__(
@@ -54,14 +38,10 @@ class ModulatedCorrelations:
     ) -> None:
         n = len(light)
         at = np.arange(n) - (n - 1) / 2
-        tilts_per_sample = modulation.points / prism.diameter
-        tilts = np.exp(
-            2j
-            * np.pi
-            * (tilts_per_sample[:, 1, None, None] * at[:, None] + tilts_per_sample[:, 0, None, None] * at)
-        )
+        x, y = modulation.points.T[:, :, None, None] / prism.diameter
+        tilts = np.exp(2j * np.pi * (y * at[:, None] + x * at))
         tilts *= np.sqrt(modulation.weights)[:, None, None]
-        # The frequencies are half-integers; the transform's are not.
+        # The frequencies are half-integers, those of the transform integers.
         carrier = np.exp(-2j * np.pi * frequencies(n_grid)[0] * np.arange(n_grid))
         prism_filter = FourierFilter(prism.mask(n_grid) / n_grid**2, n, n_grid)
         self._fields = np.empty((n_grid, n_grid, modulation.n_points), np.complex64)
@@ -73,26 +53,17 @@ class ModulatedCorrelations:
         self._n = n
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
-        """See :class:`PixelCorrelations`."""
+        """Yield ``n`` rows of ``n`` or more samples for each (row, column) ``u`` in ``pixels``."""
         fields = self._fields[pixels[:, 0], pixels[:, 1]]
         yield from (fields @ self._tilts).reshape(-1, self._n, self._n)
 
 
 class TurbulentCorrelations:
-    """Beams of a modulation under turbulence: a convolution with their coherence for each pixel.
+    """Correlations of a modulation under turbulence: one convolution with the coherence per pixel.
 
-    Not for two threads at a time.
-
-    Parameters
-    ----------
-    light
-        Pupil amplitude ``(n, n)``.
-    spread
-        Field at ``u`` of a point at ``p``, for ``u - p`` from ``1 - n`` on along y and x.
-    mean
-        From :func:`coherence`.
-    uneven
-        What to add where the phase moves more than in ``mean``, if anywhere.
+    ``light`` is the pupil amplitude ``(n, n)``, ``spread`` the point response from :func:`_spread`,
+    ``mean`` the :func:`coherence`, to which ``variation`` is added where the phase varies more. Not
+    thread-safe.
     """
 
     def __init__(
@@ -107,14 +78,14 @@ class TurbulentCorrelations:
         self._variation_filter = None if variation is None else _convolution(variation.difference, len(light))
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
-        """See :class:`PixelCorrelations`."""
+        """Yield ``n`` rows of ``n`` or more samples for each (row, column) ``u`` in ``pixels``."""
         n, filter_, variation_filter = len(self._light), self._filter, self._variation_filter
         for row, column in pixels:
             _shifted_spread(self._spread, n - 1 + row, n - 1 + column, self._light, filter_.field)
             filter_.run()
             result = filter_.result[:n, :n]
             if variation_filter is not None and self._variation is not None:
-                # With s(p, q) = (s(p) + s(q)) / 2 one half belongs to either side of the convolution.
+                # With s(p, q) = (s(p) + s(q)) / 2, half the share is on either side of the convolution.
                 half_share = self._variation.half_share
                 variation_filter.field[:n, :n] = filter_.field[:n, :n]
                 variation_filter.run()
@@ -125,16 +96,14 @@ class TurbulentCorrelations:
             yield filter_.result
 
 
+PixelCorrelations = ModulatedCorrelations | TurbulentCorrelations
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CoherenceVariation:
-    """A coherence that changes from place to place, linearly between two.
+    """Coherence interpolated between two: half the weight of the second, and its difference to the first.
 
-    Parameters
-    ----------
-    half
-        Half the share ``(n, n)`` of the way from the first to the second.
-    difference
-        The second less the first ``(2 n - 1, 2 n - 1)``, see :func:`coherence`.
+    ``half_share`` is ``(n, n)`` and ``difference`` ``(2 n - 1, 2 n - 1)``, see :func:`coherence`.
     """
 
     half_share: NDArray[np.float32]
@@ -142,7 +111,7 @@ class CoherenceVariation:
 
 
 def _convolution(kernel: NDArray[np.complex128], n: int) -> FourierFilter:
-    """The convolution of fields of ``n`` samples with a kernel ``(2 n - 1, 2 n - 1)``."""
+    """Convolution of fields of ``n`` samples with a kernel ``(2 n - 1, 2 n - 1)``."""
     size = next_fast_length(2 * n - 1)
     padded = np.zeros((size, size), complex)
     steps = np.arange(1 - n, n) % size
@@ -157,19 +126,17 @@ def coherence(
 
     Parameters
     ----------
-    n
-        Samples across the pupil.
-    diameter
-        Pupil diameter in samples.
+    n, diameter
+        Samples across the pupil's array, and pupil diameter in samples.
     modulation
         Path of the image over the pyramid.
     structure
-        Structure function ``(2 n - 1, 2 n - 1)`` of the turbulence in square radians, at distances
-        ``p - q`` from ``-(n - 1)`` to ``n - 1`` samples along y and x.
+        Structure function ``(2 n - 1, 2 n - 1)`` of the turbulence in rad^2, at distances ``p - q`` from
+        ``-(n - 1)`` to ``n - 1`` samples along y and x.
     """
     steps = np.arange(1 - n, n)
     x, y = (np.exp(2j * np.pi * np.outer(steps, t) / diameter) for t in modulation.points.T)
-    # A Gaussian phase: its characteristic function is all that is needed.
+    # Characteristic function of a Gaussian phase.
     return np.asarray((y * modulation.weights) @ x.T * np.exp(-0.5 * structure))
 
 
@@ -203,14 +170,14 @@ def _add_pixel_response(spread, row, column, light, correlations, spans, weights
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NonuniformPhase:
-    """Gaussian phases that move more in some places of the pupil than in others.
+    """Gaussian phases whose variance depends on the position in the pupil.
 
     Parameters
     ----------
     structure
-        Their mean structure function ``(2 n - 1, 2 n - 1)`` in square radians.
+        Mean structure function ``(2 n - 1, 2 n - 1)`` in rad^2.
     strength
-        How much more than in the mean they move at each sample ``(n, n)``, in squares: 1 on average.
+        Factor ``(n, n)`` on it at each sample, 1 on average.
     """
 
     structure: NDArray[np.float64]
@@ -225,7 +192,7 @@ class SlopeResponse:
     ----------
     flat
         Slopes ``(n_slopes,)``, all x then all y.
-    by_phase
+    phase_derivatives
         Derivatives ``(n_slopes, m * m)`` in 1 / rad, by the phase at the nodes, rows along y.
     """
 
@@ -247,13 +214,13 @@ def slope_response(
     samples: int = 1,
     local: bool = False,
 ) -> SlopeResponse:
-    """Derivatives of all slopes by the phase.
+    """Compute the derivatives of all slopes by the phase.
 
-    With ``a(d)`` the spread of the prism, the field of one modulation point is ``E(u) = sum_p
+    With ``a(d)`` the point response of the prism, the field of one modulation point is ``E(u) = sum_p
     a(u - p) f(p)``, so ``dI(u)/dphi(p) = -2 Im(a(u - p) conj(E(u)) f(p))``. The mean of ``conj(E(u))
     f(p)`` over modulation points is a matrix product; over Gaussian phases it is, exactly, the
     convolution ``A(p) sum_q conj(a(u - q)) A(q) C(p - q)`` with the coherence ``C``. The
-    normalisation is differentiated too; with turbulence, the mean of a quotient is taken for the
+    normalisation is differentiated too; under turbulence the mean of a quotient is approximated by the
     quotient of the means.
 
     Parameters
@@ -261,27 +228,27 @@ def slope_response(
     amplitude
         Pupil amplitude ``(n, n)``.
     prism
-        Faces, as seen from a pupil in the grid's corner.
+        Faces, for a pupil in the grid's corner.
     n_grid
         Side of the periodic grid in samples.
     corners
-        First camera pixel ``(4, 2)`` as (x, y) of each image's box, counted from the grid's corner.
+        First camera pixel ``(4, 2)`` as (x, y) of each image's box, from the grid's corner.
     valid
         Valid pixels of a box ``(m, m)``.
     modulation
         Path of the image over the pyramid.
     structure
-        Structure function ``(2 n - 1, 2 n - 1)`` in square radians of the turbulence to average
-        over, at distances from ``-(n - 1)`` to ``n - 1`` samples along y and x; none by default.
-    unsteady
-        What moves beside, and not alike everywhere; ``structure`` must be given then.
-    carry
+        Structure function ``(2 n - 1, 2 n - 1)`` in rad^2 of the turbulence to average over, at
+        distances from ``-(n - 1)`` to ``n - 1`` samples along y and x; none by default.
+    nonuniform
+        Further phases with position-dependent variance; requires ``structure``.
+    interpolation
         Matrix ``(n, m)`` from the phase at nodes to the phase at samples, along either axis; by
         default the nodes are the samples.
     samples
         Pupil samples across a camera pixel.
     local
-        Normalise by each pixel's own light instead of the mean of all.
+        Normalise by each pixel's own flux instead of the mean of all.
 
     Raises
     ------
@@ -292,7 +259,7 @@ def slope_response(
     pixels_xy = np.argwhere(valid)
     first_samples = (corners[:, None, ::-1] + pixels_xy) * samples
     if first_samples.min() < 0 or first_samples.max() + samples > n_grid:
-        raise ValueError("the pupil images leave the grid that the light is followed on")
+        raise ValueError("the pupil images leave the periodic grid; enlarge the camera region")
     m = len(light) if interpolation is None else interpolation.shape[1]
     sums = _Sums(
         np.empty((2, len(pixels_xy), m, m), np.float32),
@@ -300,19 +267,19 @@ def slope_response(
         np.zeros((len(pixels_xy) if local else _WORKERS, m, m), np.float32),
     )
     spread = _spread(prism, len(light), n_grid)
-    beams: list[PixelCorrelations]
+    correlations: list[PixelCorrelations]
     if structure is None:
-        beams = [ModulatedCorrelations(light, prism, n_grid, modulation)] * _WORKERS
+        correlations = [ModulatedCorrelations(light, prism, n_grid, modulation)] * _WORKERS
     else:
         mean, variation = _mean_and_varying_coherence(
             len(light), prism.diameter, modulation, structure, nonuniform
         )
-        beams = [TurbulentCorrelations(light, spread, mean, variation) for _ in range(_WORKERS)]
+        correlations = [TurbulentCorrelations(light, spread, mean, variation) for _ in range(_WORKERS)]
     task = _ResponseTask(spread, light, _spans(light), first_samples, samples, interpolation, sums)
     parts = np.array_split(np.arange(len(pixels_xy)), _WORKERS)
-    # The workers multiply matrices too, each for itself.
+    # Each worker multiplies matrices on its own thread.
     with limit_to_one_thread(), ThreadPoolExecutor(_WORKERS) as pool:
-        for future in [pool.submit(task.run, beams[k], part, k) for k, part in enumerate(parts)]:
+        for future in [pool.submit(task.run, correlations[k], part, k) for k, part in enumerate(parts)]:
             future.result()
     return sums.normalise(local)
 
@@ -324,10 +291,9 @@ def _mean_and_varying_coherence(
     structure: NDArray[np.float64],
     nonuniform: NonuniformPhase | None,
 ) -> tuple[NDArray[np.complex128], CoherenceVariation | None]:
-    """The coherence where phases move little, and what is added where they move more.
+    """Coherence of the least varying quarter of the pupil, and what is added where phases vary more.
 
-    Between two samples the structure function is taken for the mean one by the mean of both strengths,
-    and the coherence for linear in it between the quiet and the restless quarter of the pupil.
+    Between two samples the strength is the mean of both, and the coherence is taken as linear in it.
     """
     if nonuniform is None:
         return coherence(n, diameter, modulation, structure), None
@@ -341,11 +307,11 @@ def _mean_and_varying_coherence(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sums:
-    """Differences of images and their derivatives, not normalised yet.
+    """Differences of images and their derivatives, not yet normalised.
 
     ``phase_derivatives (2, n_valid, m, m)`` for x and y; ``light (3, n_valid)`` is the x difference, the y
     difference and the sum; ``total`` holds the derivative of each pixel's sum, or of all pixels' sum
-    in as many parts as there are workers.
+    in one part per worker.
     """
 
     phase_derivatives: NDArray[np.float32]
@@ -367,7 +333,7 @@ class _Sums:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ResponseTask:
-    """What all workers need to know."""
+    """Inputs and outputs shared by the workers of :func:`slope_response`."""
 
     spread: NDArray[np.complex64]
     light: NDArray[np.float32]
@@ -377,8 +343,8 @@ class _ResponseTask:
     interpolation: NDArray[np.float32] | None
     sums: _Sums
 
-    def run(self, beams: PixelCorrelations, pixels: NDArray[np.intp], worker: int) -> None:
-        """Add up ``pixels``."""
+    def run(self, pixel_correlations: PixelCorrelations, pixels: NDArray[np.intp], worker: int) -> None:
+        """Compute the sums of ``pixels``."""
         n, s, out = len(self.light), self.samples, self.sums
         local = len(out.total) == out.light.shape[1]
         inner = np.stack(np.divmod(np.arange(s * s), s), axis=1)
@@ -386,7 +352,7 @@ class _ResponseTask:
         for k in pixels:
             sums[: 3 if local else 2] = 0
             pixels_xy = (self.first_samples[:, k, None] + inner).reshape(-1, 2)
-            for i, correlations in enumerate(beams.correlations(pixels_xy)):
+            for i, correlations in enumerate(pixel_correlations.correlations(pixels_xy)):
                 row, column = pixels_xy[i] + (n - 1)
                 signs = _SIGNS[i // (s * s)]
                 light = _add_pixel_response(
@@ -400,23 +366,21 @@ class _ResponseTask:
             out.total[worker] = self._to_nodes(sums[2])
 
     def _to_nodes(self, by_sample: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Derivatives by the phase at nodes, of derivatives by the phase at samples."""
+        """Convert derivatives by the phase at samples to those by the phase at nodes."""
         if self.interpolation is None:
             return by_sample
         return np.asarray(self.interpolation.T @ (by_sample @ self.interpolation))
 
 
 def _spans(light: NDArray[np.float32]) -> NDArray[np.intp]:
-    """First lit column of each row and the one behind its last ``(n, 2)``."""
-    lit: NDArray[np.bool_] = np.array(light > 0)
-    last = light.shape[1] - np.flip(lit, axis=1).argmax(axis=1)
-    return np.where(np.any(lit, axis=1)[:, None], np.stack([lit.argmax(axis=1), last], axis=1), 0)
+    """First lit column of each row and the one after the last ``(n, 2)``."""
+    return np.stack(lit_columns(np.asarray(light > 0)), axis=1)
 
 
 def _spread(prism: Prism, n: int, n_grid: int) -> NDArray[np.complex64]:
     """Field at ``u`` of a point at ``p``, for ``u - p`` from ``1 - n`` to ``n_grid - 1`` along y and x."""
     mask = np.fft.ifft2(prism.mask(n_grid))
     steps = np.arange(1 - n, n_grid)
-    # The frequencies are half-integers: a period on, the field has the other sign.
+    # The frequencies are half-integers: the field changes sign after a period.
     carrier = np.exp(2j * np.pi * frequencies(n_grid)[0] * steps)
     return np.asarray(mask[np.ix_(steps % n_grid, steps % n_grid)] * np.outer(carrier, carrier), np.complex64)

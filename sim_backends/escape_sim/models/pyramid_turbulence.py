@@ -1,4 +1,8 @@
-"""Turbulence and random pokes in front of a pyramid during a calibration: their statistics, the turbulence strength estimated from the motion of the slopes, and the registration scatter that a finite number of turbulence states leaves."""
+"""Turbulence and random pokes in front of a pyramid during a calibration.
+
+Their statistics, the turbulence strength estimated from the motion of the slopes, and the registration
+scatter that a finite number of turbulence states leaves.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +17,13 @@ from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 from escape_sim.models.pyramid_response import NonuniformPhase
 from escape_sim.optics.pyramid import PyramidOptics
 
-#: Strengths tried, as pupil diameters over r0; beyond the last the slopes tell them apart no more.
+#: Trial strengths in pupil diameters over r0; beyond the last the slopes no longer distinguish them.
 _TRIAL_STRENGTHS = 2.0 ** np.arange(-1, 5, 0.5)
-#: What the slopes' rms, relatively, and the share that lasts may be off by in a run of seconds.
+#: Errors of the slopes' rms (relative) and of the persistent fraction in a run of seconds.
 _RMS_ERROR, _PERSISTENCE_ERROR = 0.05, 0.05
-#: Pairs of phase screens tried with each.
+#: Pairs of phase screens per trial strength.
 _N_PAIRS = 6
-#: Side of the screens in pupils: the outer scale must fit in.
+#: Side of the screens in pupils; must contain the outer scale.
 _SCREEN_PUPILS = 8
 
 
@@ -30,9 +34,9 @@ class RandomPokes:
     Parameters
     ----------
     modes_rad
-        Phase of every mode's usual poke ``(n_modes, n, n)`` in radians.
+        Phase ``(n_modes, n, n)`` in radians of each mode at its rms amplitude.
     lit
-        Samples of the pupil that carry light ``(n, n)``.
+        Lit samples of the pupil ``(n, n)``.
     """
 
     modes_rad: NDArray[np.float64]
@@ -46,18 +50,18 @@ class RandomPokes:
         modes_rad: NDArray[np.float64],
         lit: NDArray[np.bool_],
     ) -> RandomPokes:
-        """Pokes of a given rms over all modes, each as strong as the others unless its actuators forbid.
+        """Pokes of a given rms over all modes, of equal amplitude except for modes at their maximum.
 
         Parameters
         ----------
         rms
             Root of the sum of the modes' squared amplitudes.
-        most
+        max_amplitude
             Largest amplitude of every mode ``(n_modes,)``.
         modes_rad
             Phase ``(n_modes, n, n)`` of every mode at unit amplitude, in radians.
         lit
-            As above.
+            Lit samples of the pupil ``(n, n)``.
         """
         lower, upper = 0.0, float(max_amplitude.max())
         for _ in range(40):
@@ -74,9 +78,9 @@ class RandomPokes:
         return float(np.sqrt(self.modes_rad[:, self.lit].var(axis=1).sum()))
 
     def structure(self) -> NDArray[np.float64]:
-        """Structure function in square radians ``(2 n - 1, 2 n - 1)``, by the separation of two samples.
+        """Structure function in rad^2 ``(2 n - 1, 2 n - 1)``, by the separation of two samples.
 
-        The mean over all pairs of lit samples so far apart; 0 where the pupil has none.
+        The mean over all pairs of lit samples with that separation; 0 if there are none.
         """
         n = self.lit.shape[0]
         size = (2 * n, 2 * n)
@@ -90,16 +94,16 @@ class RandomPokes:
         return np.asarray(mean[np.ix_(steps, steps)])
 
     def nonuniform(self) -> NonuniformPhase:
-        """What a mean response needs of them: how they move in the mean, and where more.
+        """Mean structure function, and its variation over the pupil.
 
-        Modes of high order live at the rim of a mirror, so pokes move the rim more than the middle. How
-        much a place moves is told by the mean square slope of the phase there.
+        High-order modes are strong at the rim of a mirror, so pokes move the phase more there than in
+        the centre. The local strength is the mean square slope of the phase.
         """
         squares = np.sum([np.square(np.gradient(mode)).sum(axis=0) for mode in self.modes_rad], axis=0)
         return NonuniformPhase(self.structure(), np.where(self.lit, squares / squares[self.lit].mean(), 1.0))
 
     def phases(self, count: int) -> NDArray[np.float64]:
-        """Random phases ``(count, n, n)`` in radians; always the same."""
+        """Random phases ``(count, n, n)`` in radians, from a fixed seed."""
         draws = np.random.default_rng(1).standard_normal((count, len(self.modes_rad)))
         return np.asarray(np.tensordot(draws, self.modes_rad, 1))
 
@@ -113,31 +117,31 @@ def sample_distances(n: int, pixel_m: float) -> NDArray[np.float64]:
 def estimate_strength(
     optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float, pokes: RandomPokes | None = None
 ) -> float:
-    """Pupil diameters over r0 at the sensor's wavelength, from how the slopes moved.
+    """Estimate the pupil diameters over r0 at the sensor's wavelength from the motion of the slopes.
 
-    There is no formula: frames under a few random phases of each strength are made and their slopes
-    compared; always the same phases, so that equal motions give equal strengths.
+    Slopes are simulated under random phases of each trial strength, always the same ones, so that the
+    result depends on the measured motion only.
 
-    The slopes of a pyramid saturate: their rms rises with the turbulence at first, and falls again beyond
-    some ten r0 across the pupil. Beside random pokes, which are new in every frame, the share of the slopes'
-    variance that lasts rises where the rms hardly changes, and the rms falls where the share hardly
-    rises; both together tell the strength. Without pokes the rising rms does, up to where it turns.
+    The slopes of a pyramid saturate: their rms rises with the turbulence and falls again beyond about
+    ten r0 across the pupil. With random pokes, new in every frame, the persistent fraction of the
+    variance rises where the rms hardly changes, and the rms falls where the fraction hardly rises; both
+    together determine the strength. Without pokes the rising branch of the rms is used.
 
     Parameters
     ----------
     optics
         The nominal sensor.
     pupils
-        Geometry, with the motion measured.
+        Pupil images, with the measured motion.
     outer_scale
         Outer scale of the turbulence in pupil diameters.
     pokes
-        What the mirror did meanwhile; ``None`` if it was still.
+        Random pokes during the measurement; None without pokes.
 
     Returns
     -------
     float
-        Between 0 (no motion, or none that lasts) and the strongest that was tried.
+        Between 0 (no motion, or none that persists) and the strongest trial.
     """
     if not pupils.motion:
         return 0.0
@@ -148,7 +152,7 @@ def estimate_strength(
 
 
 def _strength_from_rms(optics: PyramidOptics, pupils: PyramidPupils, screens: NDArray[np.float64]) -> float:
-    """Strength by the slopes' rms, while it rises."""
+    """Strength from the slopes' rms on its rising branch."""
     values: list[float] = []
     for ratio in _TRIAL_STRENGTHS:
         values.append(float(np.sqrt(np.square(_slopes(optics, pupils, screens * ratio ** (5 / 6))).mean())))
@@ -158,7 +162,7 @@ def _strength_from_rms(optics: PyramidOptics, pupils: PyramidPupils, screens: ND
         if values[-1] > pupils.motion:
             break
     if pupils.motion <= values[0]:
-        # Weak turbulence moves slopes in proportion to the phase.
+        # Weak turbulence moves the slopes in proportion to the phase.
         return float(_TRIAL_STRENGTHS[0] * (pupils.motion / values[0]) ** (6 / 5))
     return float(2 ** np.interp(pupils.motion, values, np.log2(_TRIAL_STRENGTHS[: len(values)])))
 
@@ -166,7 +170,7 @@ def _strength_from_rms(optics: PyramidOptics, pupils: PyramidPupils, screens: ND
 def _strength_with_pokes(
     optics: PyramidOptics, pupils: PyramidPupils, screens: NDArray[np.float64], pokes: RandomPokes
 ) -> float:
-    """Strength by the slopes' rms and by the share of their variance that lasts, beside pokes."""
+    """Strength from the slopes' rms and the persistent fraction of their variance, with pokes."""
     halves = np.split(pokes.phases(2 * len(screens)), 2)
     rms, persistence = [], []
     for ratio in (0.0, *_TRIAL_STRENGTHS):
@@ -174,10 +178,10 @@ def _strength_with_pokes(
         squares = np.mean(np.square([first, second]), axis=(1, 2))
         rms.append(float(np.sqrt(squares.mean())))
         persistence.append(float(np.mean(first * second) / np.sqrt(squares.prod())))
-    # Few pokes seem to last by chance; how much, those without turbulence tell.
+    # A finite number of pokes correlates by chance, as the trial without turbulence shows.
     persistence = [share - persistence[0] * (1 - share) for share in persistence]
     if pupils.persistent_fraction <= persistence[1]:
-        # A share of the variance goes by the squares.
+        # A fraction of the variance scales as the square of the phase.
         return float(_TRIAL_STRENGTHS[0] * (pupils.persistent_fraction / persistence[1]) ** (3 / 5))
     rms, persistence = rms[1:], persistence[1:]
     at = np.linspace(np.log2(_TRIAL_STRENGTHS[0]), np.log2(_TRIAL_STRENGTHS[-1]), 200)
@@ -211,9 +215,9 @@ def unit_screens(n: int, outer_scale: float) -> NDArray[np.float64]:
     return np.stack(screens)
 
 
-#: Rms path of a shape in waves: small enough for differences to be derivatives.
+#: Rms path of a mirror shape in waves, in the linear range.
 _STEP_WAVES = 0.01
-#: Share of the whole scatter that the air's is taken for at least: few states tell a covariance badly.
+#: Smallest ratio of the turbulence's variance to the total: few states estimate a covariance poorly.
 _MIN_SHARE = 0.1
 
 Jacobian = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -227,26 +231,24 @@ def turbulence_registration_scatter(
     influence_m: NDArray[np.float64],
     jacobian: Jacobian,
 ) -> NDArray[np.float64]:
-    """Standard deviation over states of the air of the registration that fits best ``(5,)``.
+    """Standard deviation ``(5,)`` over turbulence states of the best-fitting registration.
 
-    A pyramid answers differently under every wavefront: where this is steep a pixel is saturated, and
-    what it still sees lies a little aside. A model knows the mean only. Its registration therefore
-    errs by this much over the root of the number of states that a measurement averaged, however little
-    noise there was. Told by frames: differences of two with the mirror's shape up and down. Pokes are
-    new in every frame and average out as noise does, which the fit's own errors count. So each state is
-    fitted twice, under the pokes of every other shape, and what the two have in common is the air's.
+    The response of a pyramid depends on the wavefront: pixels saturate where it is steep. A model
+    describes the mean, so its registration errs by this scatter over the root of the number of states
+    that a measurement averaged. It is computed from differences of frames with a mirror shape up and
+    down. Pokes are new in every frame and average as noise, which the fit's standard errors include.
+    Therefore each state is fitted twice, under different pokes, and the covariance of the two fits is
+    that of the turbulence.
 
     Parameters
     ----------
-    optics
-        The nominal sensor.
-    pupils
-        Its geometry.
+    optics, pupils
+        The nominal sensor and its pupil images.
     phases
         Random states ``(count, k, n, n)`` in radians: turbulence, with other pokes for every shape.
     shapes
-        Commands ``(count, n_act, k)`` whose response is looked at under each state, of all modes of a
-        calibration: fine shapes tell the registration better than coarse ones.
+        Commands ``(count, n_act, k)`` whose response is computed under each state, of all modes of a
+        calibration, since fine shapes constrain the registration better than coarse ones.
     influence_m
         Optical path per unit command of each actuator ``(n_act, n, n)`` in metres.
     jacobian
@@ -268,14 +270,14 @@ def turbulence_registration_scatter(
     freedom = len(deviations) - 1
     common_variance = np.prod(deviations, axis=1).sum(axis=0) / freedom
     total_variance = np.square(deviations.mean(axis=1)).sum(axis=0) / freedom
-    # Air and pupil have no preferred direction, and few states tell a variance badly.
+    # Turbulence and pupil have no preferred direction; averaging x and y improves the estimate.
     for variance in (common_variance, total_variance):
         variance[:2] = variance[:2].mean()
     return np.asarray(np.sqrt(np.maximum(common_variance, _MIN_SHARE * total_variance)))
 
 
 def _fit_registration(terms: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Registration ``(5,)`` by matrix and derivatives ``(6, n_slopes, k)`` from slopes ``(n_slopes, k)``."""
+    """Registration ``(5,)`` from slopes ``(n_slopes, k)`` by matrix and derivatives ``(6, n_slopes, k)``."""
     design = terms.reshape(6, -1)
     gain, *shifts = np.linalg.lstsq(design @ design.T, design @ slopes.ravel())[0]
     return np.asarray(np.array(shifts) / gain)

@@ -1,4 +1,8 @@
-"""Fast analytic model of a Shack-Hartmann system: derivatives of the slopes by the optical path, averaged over spot motion and turbulence, applied to mirror surfaces. Holds the factory of the model `fast`."""
+"""Fast analytic model of a Shack-Hartmann system.
+
+Derivatives of the slopes by the optical path, averaged over spot motion and turbulence, are applied to
+mirror surfaces.
+"""
 
 from __future__ import annotations
 
@@ -10,34 +14,33 @@ from numba import njit
 from numpy.typing import DTypeLike, NDArray
 from scipy.special import ndtri
 
-from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
-from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, require_kind
+from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, nominal_influence_functions
 from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, gaussian_factors, mode_surfaces
-from escape_sim.optics.pupil import PupilGeometry, actuator_positions, pitch_on_pupil, pupil_geometry
+from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_geometry
 from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
 
-#: Steps (rows down, columns right) from a window to the lenslets whose light it sees.
+#: Steps (rows down, columns right) from a window to the lenslets whose light it receives.
 NEIGHBOURS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
-#: Shapes of the wavefront within a lenslet that turbulence is made of there; the rest is a thousandth.
+#: Turbulence modes within a lenslet; all others together have a thousandth of the variance.
 _N_SHAPES = 14
 #: Variance of a spot's motion along an axis for a lenslet as wide as r0, in (lambda / d)^2 (Fried 1975).
 _TILT_VARIANCE = 0.17
 #: Outer scale of the turbulence in pupil diameters.
 _OUTER_SCALE = 4.0
-#: Nodes of the average over spot motion, and the step of their lattice: neighbouring Fibonacci numbers.
+#: Nodes of the average over spot motion, and step of their lattice: successive Fibonacci numbers.
 _N_NODES, _LATTICE_STEP = 34, 21
-#: Share of a full turn from one window's lattice to the next one's: the golden one, no multiple repeats.
+#: Rotation, in turns, of the lattice from one window to the next: the golden ratio, so that none repeats.
 _GOLDEN_TURN = (np.sqrt(5) - 1) / 2
-#: Ways to see a wavefront: quarter turns, mirrored or not.
+#: Orientations of a square wavefront: quarter turns, mirrored or not.
 _N_ORIENTATIONS = 8
 
 
@@ -46,22 +49,22 @@ def slope_weights(
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
     """Mean derivative of each slope by the optical path on its lenslet and on the eight around it.
 
-    With ``E(u) = sum_p A_p exp(i phi_p) F(u, p)``, the light of all lenslets added as intensity and
+    With ``E(u) = sum_p A_p exp(i phi_p) F(u, p)``, the intensities of all lenslets added and
     ``s = sum u I / sum I`` over the window,
     ``ds/dphi_p = -2 A_p Im sum_u (u - s) conj(E(u)) F(u, p) / sum I``.
-    Pixels below the threshold drop out of both sums, and the threshold is subtracted from those
-    above. Which pixels these are changes as the spot moves, so the derivative is averaged over a
-    Gaussian motion of the spots of ``grid.motion_px`` rms along each axis; without the average the
-    response would depend on how each lenslet happens to fall on the pixels. And it is averaged over what
-    turbulence there is within a lenslet (:func:`lenslet_turbulence`), which lifts the wings of the spots
-    above the threshold: without it more of them would seem cut off, and scalings come out too small.
+    Pixels below the threshold are omitted from both sums, and the threshold is subtracted from the
+    others. As these pixels change when the spot moves, the derivative is averaged over a Gaussian motion
+    of ``grid.motion_px`` rms along each axis; otherwise it would depend on the position of each lenslet
+    relative to the pixels. It is also averaged over the turbulence within a lenslet
+    (:func:`lenslet_turbulence`), which lifts the wings of the spots above the threshold; without it
+    scalings would be underestimated.
 
     Parameters
     ----------
     config
         Design of sensor, camera and beam.
     grid
-        The grid found on the camera.
+        The grid measured on the camera.
     pupil
         The sampled pupil.
 
@@ -83,42 +86,33 @@ def slope_weights(
 
 
 def gaussian_lattice() -> NDArray[np.float64]:
-    """Places ``(n, 2)`` of equal weight whose mean stands for that over a round Gaussian of unit rms.
+    """Nodes ``(n, 2)`` of equal weight for the mean over a round Gaussian of unit rms.
 
-    What pixels and threshold do to a slope repeats from pixel to pixel, and a grid of few nodes that lie
-    more than half a pixel apart takes the repetition for a constant: with five Gauss-Hermite nodes per
-    axis the response kept a pattern of 4 %, and slopes seemed to sample the wavefront up to 2.5 % of a
-    sub-aperture off. On a Fibonacci lattice (Sloan & Joe 1994), mapped to the Gaussian axis by axis, no
-    two nodes share a coordinate; it is shifted so that every node has its mirror image.
+    The effect of pixels and threshold on a slope is periodic in pixels, and a regular grid of few nodes
+    aliases it: five Gauss-Hermite nodes per axis left a pattern of 4 % in the response and errors of
+    the sampling positions up to 2.5 % of a sub-aperture. In a Fibonacci lattice (Sloan & Joe 1994),
+    mapped to the Gaussian along each axis, no two nodes share a coordinate. It is symmetric about 0.
     """
     i = np.arange(_N_NODES)
     paired = (i * _LATTICE_STEP + (_LATTICE_STEP - 1) // 2) % _N_NODES
-    places = ndtri((np.stack([i, paired], axis=1) + 0.5) / _N_NODES)
-    return np.asarray(places / places.std(axis=0))
+    nodes = ndtri((np.stack([i, paired], axis=1) + 0.5) / _N_NODES)
+    return np.asarray(nodes / nodes.std(axis=0))
 
 
 def lenslet_turbulence(samples: int) -> NDArray[np.float64]:
-    """Wavefronts within a square lenslet as wide as r0, without piston and tilt, in radians.
+    """Wavefronts ``(n_nodes, samples, samples)`` in radians within a square lenslet as wide as r0.
 
-    Kolmogorov turbulence of structure function ``6.88 (r / r0)^(5/3)``, one wavefront for each place of
-    :func:`gaussian_lattice`: its shapes are independent of one another and of the places, and opposite places
-    have wavefronts turned by half a turn, so that on the whole no side of the lenslet is preferred.
-
-    Parameters
-    ----------
-    samples
-        Across the lenslet.
-
-    Returns
-    -------
-    ndarray, ``(n_places, samples, samples)``
+    Kolmogorov turbulence of structure function ``6.88 (r / r0)^(5/3)`` without piston and tilt, one
+    wavefront for each node of :func:`gaussian_lattice`. The modes' coefficients are uncorrelated with
+    one another and with the nodes. Opposite nodes have wavefronts rotated by half a turn, so that no
+    side of the lenslet is preferred. ``samples`` is the number of samples across the lenslet.
     """
     u = (np.arange(samples) - (samples - 1) / 2) / samples
-    x, y = (at.ravel() for at in np.meshgrid(u, u))
-    apart = np.hypot(x[:, None] - x, y[:, None] - y)
+    x, y = (grid.ravel() for grid in np.meshgrid(u, u))
+    distance = np.hypot(x[:, None] - x, y[:, None] - y)
     tilts = np.linalg.qr(np.stack([np.ones_like(x), x, y], axis=1))[0]
     without_tilt = np.eye(x.size) - tilts @ tilts.T
-    power, shapes = np.linalg.eigh(without_tilt @ (-0.5 * 6.88 * apart ** (5 / 3)) @ without_tilt)
+    power, shapes = np.linalg.eigh(without_tilt @ (-0.5 * 6.88 * distance ** (5 / 3)) @ without_tilt)
     half = gaussian_lattice()[: _N_NODES // 2]
     coefficients = np.random.default_rng(5).standard_normal((len(half), _N_SHAPES))
     coefficients = np.linalg.qr(np.concatenate([half, coefficients], axis=1))[0][:, 2:] * np.sqrt(len(half))
@@ -128,18 +122,12 @@ def lenslet_turbulence(samples: int) -> NDArray[np.float64]:
 
 
 def _orientations(phase: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A wavefront ``(p, p)`` in all orientations that a square has ``(8, p, p)``; each is as likely."""
-    return np.stack(
-        [
-            np.rot90(above_threshold, turns)
-            for above_threshold in (phase, phase.T)
-            for turns in range(_N_ORIENTATIONS // 2)
-        ]
-    )
+    """The eight orientations ``(8, p, p)`` of a square wavefront ``(p, p)``."""
+    return np.stack([np.rot90(p, turns) for p in (phase, phase.T) for turns in range(_N_ORIENTATIONS // 2)])
 
 
 def _turbulence_strength(config: SystemConfig, grid: SubApertureGrid) -> float:
-    """``(d / r0)^(5/3)`` of the turbulence on a lenslet, from how far the air moves its spot."""
+    """``(d / r0)^(5/3)`` of the turbulence on a lenslet, from the spot motion that it causes."""
     sensor = config.sensor_as(ShackHartmannSection)
     large = 1 - (1 / (_OUTER_SCALE * sensor.n_sub)) ** (1 / 3)
     return float((grid.turbulence_px / sensor.spot_px) ** 2 / (_TILT_VARIANCE * large))
@@ -157,7 +145,7 @@ class _WindowImages:
         size = int((boxes[:, 1::2] - boxes[:, ::2]).max())
         self._rows_at = boxes[:, 0, None] + np.arange(size)
         self._columns_at = boxes[:, 2, None] + np.arange(size)
-        # All windows of a row begin at the same pixel row, all of a column at the same pixel column.
+        # All windows of a row start at the same pixel row, all of a column at the same pixel column.
         row_at, column_at = np.zeros((2, n, size), np.intp)
         row_at[rows], column_at[columns] = self._rows_at, self._columns_at
         in_y, in_x = self._rows_at < boxes[:, 1, None], self._columns_at < boxes[:, 3, None]
@@ -165,23 +153,23 @@ class _WindowImages:
         blocks = pupil.amplitude.reshape(n, p, n, p).transpose(0, 2, 1, 3).astype(float)
         light = np.square(blocks).sum(axis=(2, 3))
         counts = sensor.threshold * (2**config.devices.wfs.bit_depth - 1)
-        # The threshold in the units of the intensities here, by the light of a bright sub-aperture.
+        # Threshold in units of the intensities here, relative to a bright sub-aperture.
         self._threshold = (
             counts / grid.counts * float(np.percentile(light[light > 0], 95)) if grid.counts else 0.0
         )
         self._samples = (np.arange(p) - (p - 1) / 2) / p
         self._spot = spot
         angle = 2 * np.pi * _GOLDEN_TURN * np.arange(len(rows))
-        #: Directions of the lattice's axes in each window ``(2, n_valid)``, and how it sees the wavefronts.
+        # Axes of the lattice in each window (2, n_valid), and orientation of the wavefronts in it.
         self._axes = np.stack([np.cos(angle), np.sin(angle)])
         self._orientation = np.arange(len(rows)) % _N_ORIENTATIONS
-        # An average over motion is not worth double precision; a small-signal limit is.
+        # Single precision suffices for the average over motion, not for the small-signal limit.
         self._real = np.dtype(np.float32 if grid.motion_px else np.float64)
         self._complex = np.dtype(np.complex64 if grid.motion_px else np.complex128)
         self._blocks, self._along = {}, {}
         field = field_pixels(p, spot)
-        # The windows stay on the grid as it was found; the lenslets stand where the references,
-        # averaged over the whole run, put the lattice.
+        # Windows are on the measured grid; lenslets are where the references, averaged over the run,
+        # place the lattice.
         (y_first, y_pitch), (x_first, x_pitch) = _fit_lattice(grid)
         for step in NEIGHBOURS:
             i, j = rows + step[0], columns + step[1]
@@ -199,7 +187,7 @@ class _WindowImages:
     def _transform(
         self, centre: NDArray[np.floating], at: NDArray[np.intp], p: int, field: int
     ) -> NDArray[np.complex128]:
-        """Fourier matrices ``(n_valid, p, size)``, zero where the lenslet's image does not reach."""
+        """Fourier matrices ``(n_valid, p, size)``, zero outside the lenslet's rendered field."""
         first = first_pixels(centre, field)
         size = at.shape[1]
         reach = (at >= first[:, None]) & (at < first[:, None] + field)
@@ -213,9 +201,9 @@ class _WindowImages:
         phase: NDArray[np.float64],
         share: float,
     ) -> None:
-        """Add ``share`` times the derivatives, spots moved by some pixels ``(2,)`` and blurred by a phase.
+        """Add ``share`` times the derivatives for spots shifted by ``shift (2,)`` pixels and blurred.
 
-        Every window turns the move and mirrors the phase in its own way.
+        Every window rotates the shift, and orients the blurring ``phase``, in its own way.
         """
         (cosine, sine), (along, across) = self._axes, shift
         blur = np.exp(1j * _orientations(phase)).astype(self._complex)[self._orientation]
@@ -237,9 +225,9 @@ class _WindowImages:
         above_threshold = self._inside & (image > self._threshold)
         x, y = self._columns_at[:, None, :], self._rows_at[:, :, None]
         for axis, at in enumerate((x, y)):
-            middle = (counted * at).sum(axis=(1, 2)) / total
+            centroid = (counted * at).sum(axis=(1, 2)) / total
             moment_arm = (
-                (at - middle[:, None, None]) * above_threshold * (share / total)[:, None, None]
+                (at - centroid[:, None, None]) * above_threshold * (share / total)[:, None, None]
             ).astype(self._real)
             for step, (amplitude, e) in fields.items():
                 fy, fx = self._along[step]
@@ -248,7 +236,7 @@ class _WindowImages:
 
 
 def _fit_lattice(grid: SubApertureGrid) -> tuple[tuple[float, float], tuple[float, float]]:
-    """First centre and pitch of the lenslets along rows and along columns, references included."""
+    """First centre and pitch of the lenslets along y and along x, fitted to the references."""
     rows, columns = np.nonzero(grid.valid)
     out = []
     for axis, number in ((1, rows), (0, columns)):
@@ -257,24 +245,23 @@ def _fit_lattice(grid: SubApertureGrid) -> tuple[tuple[float, float], tuple[floa
     return out[0], out[1]
 
 
-#: Nodes across a lenslet that carry a surface as smooth as an influence function: with 6, what is
-#: lost of a Gaussian two lenslets wide is 1e-8 of its slope.
+#: Nodes across a lenslet that interpolate a mirror surface: with 6, the error for a Gaussian two
+#: lenslets wide is 1e-8 of its slope.
 NODES = 6
-#: Lenslets whose light a window sees, per axis.
+#: Lenslets per axis whose light a window receives.
 _LENSLETS_ACROSS = 3
 
 
 class SlopeOperator:
-    """Slopes of surfaces given on a few nodes per lenslet.
+    """Slopes of surfaces given at a few nodes per lenslet.
 
-    A window sees its own lenslet and the eight around it, so each slope is a weighted sum over
-    ``3 x 3`` lenslets of ``NODES x NODES`` nodes.
+    A window receives light of its own lenslet and the eight around it, so each slope is a weighted sum
+    over ``3 x 3`` lenslets of ``NODES x NODES`` nodes.
 
     Parameters
     ----------
     weights
-        ``(2, n_valid, p, p)`` for each step (rows down, columns right) to a lenslet around: slopes
-        per unit of surface on each pupil sample, x then y.
+        From :func:`slope_weights`: slopes per unit of surface on each pupil sample.
     valid
         Lenslets with a window ``(n_sub, n_sub)``.
     sub_aperture_m
@@ -298,7 +285,7 @@ class SlopeOperator:
                 1, 0, 2, 3
             )
         self._table = table.reshape(rows.size, 2, _LENSLETS_ACROSS * k, _LENSLETS_ACROSS * k)
-        # Lenslets beyond the edge exist on the grid of nodes, with weights of zero.
+        # Lenslets beyond the edge have nodes with zero weights.
         lattice = np.arange(-1, n_sub + 1) - (n_sub - 1) / 2
         self.nodes_m = ((lattice[:, None] + nodes) * sub_aperture_m).ravel()
         self._first_y, self._first_x = (rows * k).astype(np.int64), (columns * k).astype(np.int64)
@@ -310,22 +297,19 @@ class SlopeOperator:
         return 2 * len(self._table)
 
     def slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Slopes ``(n_slopes, n)`` of surfaces ``(n_nodes, n_nodes, n)`` on the nodes.
+        """Slopes ``(n_slopes, n)`` of surfaces ``(n_nodes, n_nodes, n)`` at the nodes.
 
-        Every node is weighted once per window, so this is the way for a few surfaces.
+        Every node is weighted once per window, which is efficient for a few surfaces.
         """
         out = np.zeros((2, len(self._table), surfaces.shape[2]), surfaces.dtype)
         _apply_to_surfaces(self._weights(surfaces.dtype), self._first_y, self._first_x, surfaces, out)
         return out.reshape(self.n_slopes, -1)
 
     def zonal(self, factors: GaussianFactors, *, derivatives: bool = False) -> NDArray[np.floating]:
-        """Slopes of all influence functions, made from their factors without forming surfaces.
+        """Slopes of all influence functions ``(n, n_slopes, n_act)``, from their separable factors.
 
-        Returns
-        -------
-        ndarray, ``(n, n_slopes, n_act)``
-            ``n`` is 1, or 5 with derivatives: the slopes, then their derivatives by the place along x
-            and y and by the logarithm of the width along x and y.
+        ``n`` is 1, or 5 with derivatives: the slopes and their derivatives by the position along x and
+        y and by the logarithm of the width along x and y.
         """
         x, y = factors.along_x, factors.along_y
         kinds = 3 if derivatives else 1
@@ -342,7 +326,7 @@ class SlopeOperator:
 
 
 def _lenslet_nodes(p: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes within a lenslet ``(k,)`` of unit size, and the map ``(p, k)`` from them to the samples."""
+    """Nodes ``(k,)`` within a lenslet of unit size, and interpolation ``(p, k)`` to its samples."""
     samples = (np.arange(p) - (p - 1) / 2) / p
     if p <= NODES:
         return samples, np.eye(p)
@@ -372,9 +356,9 @@ def _apply_to_surfaces(table, first_y, first_x, surfaces, out):  # type: ignore[
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _apply_to_factors(table, first_y, first_x, side, y, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Sums over both factors; ``side (n_x, kinds * n_act)``, ``y (3, n_y, n_act)``."""
+    """Sums over both factors, ``side (n_x, kinds * n_act)`` and ``y (3, n_y, n_act)``."""
     size, n_act = table.shape[2], y.shape[2]
-    # Products this small stay on one thread in any linear-algebra library.
+    # Products this small run on one thread in any linear-algebra library.
     lines = np.empty((2 * size, side.shape[1]), side.dtype)
     for s in range(table.shape[0]):
         np.dot(table[s].reshape(2 * size, size), side[first_x[s] : first_x[s] + size], lines)
@@ -391,31 +375,22 @@ def _apply_to_factors(table, first_y, first_x, side, y, out):  # type: ignore[no
                         out[4, axis, s, a] += y[2, row, a] * line[a]
 
 
-#: Relative doubt about the spots' motion: blur within the lenslets counts as motion too.
+#: Relative uncertainty of the spots' motion: blur within the lenslets is counted as motion, too.
 _MOTION_UNCERTAINTY = 0.25
-#: Up to this many modes, their surfaces are quicker made than the slopes of all actuators.
+#: Up to this many modes, forming their surfaces is faster than the slopes of all actuators.
 _MAX_DIRECT_MODES = 12
 
 
 def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticModel:
-    """Entry point ``fast``; without a grid, the nominal one of the design."""
-    if config.sensor.kind == "pyramid":
-        from escape_sim.models.pyramid import PyramidModel, nominal_pupils
+    """Entry point ``fast`` of installations made before :mod:`escape_sim.models.factory`."""
+    from escape_sim.models.factory import make_fast_model
 
-        return PyramidModel(
-            config, nominal_pupils(config) if grid is None else require_kind(grid, PyramidPupils)
-        )
-    return ShackHartmannModel(
-        config, nominal_grid(config) if grid is None else require_kind(grid, SubApertureGrid)
-    )
+    return make_fast_model(config, grid)
 
 
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:
-    """The design's grid, centred on the camera region, valid where the design beam is bright enough."""
-    pupil = pupil_geometry(config)
-    n, p = pupil.n_sub, pupil.n_pix
-    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
-    flux /= np.percentile(flux[flux > 0], 95)
+    """The design's grid, centred on the camera region; valid where the design flux is sufficient."""
+    flux, n = nominal_flux(config), config.sensor.n_sub
     valid = flux >= config.sensor.min_flux
     pitch = config.sensor_as(ShackHartmannSection).pitch_px
     width, height = config.devices.wfs.region[2:]
@@ -425,18 +400,22 @@ def nominal_grid(config: SystemConfig) -> SubApertureGrid:
 
 
 class ShackHartmannModel:
-    """Small-signal slopes of a diffractive Shack-Hartmann sensor behind a Gaussian-actuator mirror.
+    """Small-signal slopes of a diffractive Shack-Hartmann sensor with a mirror of Gaussian actuators.
 
-    The centre of gravity of a spot is a smooth function of the phase on its lenslet; its first
-    derivative at a flat wavefront is a fixed weight map per lenslet, so a matrix is one small
-    product per sub-aperture and no frame is ever rendered.
+    The centre of gravity of a spot is a smooth function of the phase on its lenslet. Its derivative is
+    a fixed weight map per lenslet, so a matrix needs one small product per sub-aperture and no frames.
 
     Parameters
     ----------
     config
         The design: sensor, mirror and beam. Its ``twin`` section is not read.
     grid
-        The grid found on the camera.
+        The grid measured on the camera.
+
+    Raises
+    ------
+    ValueError
+        The grid does not fit the design.
     """
 
     name = "fast"
@@ -448,9 +427,7 @@ class ShackHartmannModel:
                 f"the grid has {grid.valid.shape} lenslets, "
                 f"the design {self._pupil.n_sub} x {self._pupil.n_sub}"
             )
-        self._positions = actuator_positions(config)
-        self._pitch = pitch_on_pupil(config)
-        self._coupling = config.devices.dm.coupling
+        self._nominal = nominal_influence_functions(config)
         self._opd_per_command_m = 2 * config.devices.dm.stroke_m
         self._config, self._grid = config, grid
         self._variants: list[ShackHartmannModel] | None = None
@@ -460,7 +437,7 @@ class ShackHartmannModel:
     @property
     def n_act(self) -> int:
         """Number of actuators."""
-        return len(self._positions)
+        return self._nominal.n_act
 
     @property
     def sub_aperture_m(self) -> float:
@@ -469,7 +446,7 @@ class ShackHartmannModel:
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
-        # Half the sampling is ample for shapes as smooth as these.
+        # Half the sampling suffices for shapes as smooth as these.
         pupil = PupilGeometry(
             self._pupil.n_sub, self._pupil.n_pix // 2, self._pupil.sub_aperture_m,
             self._pupil.coordinates_m.reshape(-1, 2).mean(axis=1), self._pupil.amplitude[::2, ::2],
@@ -483,7 +460,7 @@ class ShackHartmannModel:
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
         if registration.anamorphosis_angle:
-            # A slanted Gaussian has no factors along x and y.
+            # An inclined elliptic Gaussian is not separable in x and y.
             at = self._slopes.nodes_m
             surfaces = self._influence(width).surfaces(registration, self.sub_aperture_m, at, at)
             return np.asarray(
@@ -539,7 +516,7 @@ class ShackHartmannModel:
         return np.asarray(parts[0] @ modes, dtype=float), out
 
     def variants(self) -> list[ShackHartmannModel]:
-        """The same sensor with spots that move by a quarter more than the slopes say."""
+        """The model with spot motion larger by its uncertainty, see :class:`SyntheticModel`."""
         if self._variants is None:
             grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_UNCERTAINTY))
             self._variants = [ShackHartmannModel(self._config, grid)] if grid.motion_px else []
@@ -550,4 +527,4 @@ class ShackHartmannModel:
         return gaussian_factors(self._influence(width), registration, self.sub_aperture_m, at, at, dtype)
 
     def _influence(self, width: float) -> InfluenceFunctions:
-        return InfluenceFunctions(self._positions, self._pitch, self._coupling, width)
+        return replace(self._nominal, width=width)

@@ -1,1 +1,4 @@
-"""OOPAO as reference: its optics for the twin (`system.optics = "oopao"`) and its synthetic models (`calibration.model = "oopao"`). OOPAO itself is imported on first use only."""
+"""OOPAO as optics of the twin (``system.optics``) and as synthetic model (``calibration.model``).
+
+OOPAO itself is imported on first use.
+"""

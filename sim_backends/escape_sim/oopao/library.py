@@ -1,7 +1,7 @@
-"""OOPAO on a leash: imported late, silent, seeded by nothing, never able to end the process.
+"""Access to OOPAO: imported on first use, output suppressed, ``sys.exit`` turned into an error.
 
-OOPAO 1.0 prints dozens of lines per object, has no switch against it, and ends the interpreter on
-a command of the wrong length. Everything that touches OOPAO goes through this module.
+OOPAO 1.0 prints dozens of lines per object, which no option prevents, and ends the interpreter on a
+command of the wrong length. All use of OOPAO goes through this module.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 from escape_hw.api.registration import Registration
 from escape_hw.errors import ConfigError
 
-# One user at a time: OOPAO's objects share their source, and the mute swaps sys.stdout.
+# One user at a time: OOPAO's objects share their source, and suppression replaces sys.stdout.
 _oopao_lock = threading.RLock()
 
 
 class _ThreadFilteredOutput(io.TextIOBase):
-    """Standard output that drops what one thread writes and passes on everything else."""
+    """Standard output that drops what one thread writes."""
 
-    def __init__(self, thread: int, behind: TextIO) -> None:
-        self._thread, self._stream = thread, behind
+    def __init__(self, thread: int, stream: TextIO) -> None:
+        self._thread, self._stream = thread, stream
 
     def write(self, text: str) -> int:
         return len(text) if threading.get_ident() == self._thread else self._stream.write(text)
@@ -41,28 +41,22 @@ class _ThreadFilteredOutput(io.TextIOBase):
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Silence what OOPAO prints from this thread, and turn its ``sys.exit`` into an error.
-
-    Raises
-    ------
-    RuntimeError
-        OOPAO tried to end the process.
-    """
+def suppress_output() -> Iterator[None]:
+    """Suppress what OOPAO prints from this thread; raise RuntimeError if it calls ``sys.exit``."""
     with _oopao_lock:
         original_stdout = sys.stdout
         sys.stdout = _ThreadFilteredOutput(threading.get_ident(), original_stdout)
         try:
             yield
         except SystemExit as exit_error:
-            raise RuntimeError("OOPAO tried to end the process; its input was refused") from exit_error
+            raise RuntimeError("OOPAO tried to end the process; it rejected its input") from exit_error
         finally:
             sys.stdout = original_stdout
 
 
 @cache
-def oopao() -> SimpleNamespace:
-    """The classes used, imported on first call (about two seconds).
+def oopao_classes() -> SimpleNamespace:
+    """OOPAO's classes used here, imported on first call (about two seconds).
 
     Raises
     ------
@@ -72,7 +66,7 @@ def oopao() -> SimpleNamespace:
     names = (
         "DeformableMirror", "MisRegistration", "OPD_map", "Pyramid", "ShackHartmann", "Source", "Telescope",
     )  # fmt: skip
-    with quiet():
+    with suppress_output():
         try:
             return SimpleNamespace(**{name: getattr(import_module(f"OOPAO.{name}"), name) for name in names})
         except ImportError as import_error:
@@ -82,8 +76,8 @@ def oopao() -> SimpleNamespace:
 
 
 def mis_registration(registration: Registration, sub_aperture_m: float) -> Any:
-    """OOPAO's ``MisRegistration`` for ours: same rotation and scalings, opposite shifts in metres."""
-    out = oopao().MisRegistration()
+    """OOPAO's ``MisRegistration``: same rotation and scalings, opposite shifts in metres."""
+    out = oopao_classes().MisRegistration()
     out.shiftX = -registration.shift_x / 100 * sub_aperture_m
     out.shiftY = -registration.shift_y / 100 * sub_aperture_m
     out.rotationAngle = registration.rotation
@@ -95,9 +89,9 @@ def mis_registration(registration: Registration, sub_aperture_m: float) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceAndTelescope:
-    """A monochromatic source behind a pupil.
+    """A monochromatic source and a telescope.
 
-    ``photons_per_unit`` is what OOPAO calls one unit of ``amplitude ** 2``, in photons.
+    ``photons_per_unit`` is the number of photons for one unit of ``amplitude ** 2``.
     """
 
     source: Any
@@ -106,19 +100,9 @@ class SourceAndTelescope:
 
 
 def make_source(amplitude: NDArray[np.float32], diameter_m: float, wavelength_m: float) -> SourceAndTelescope:
-    """Source and telescope for a square pupil map.
-
-    Parameters
-    ----------
-    amplitude
-        Pupil amplitude ``(n, n)``; zero outside the pupil.
-    diameter_m
-        Side of the map in metres.
-    wavelength_m
-        Wavelength in metres; set after the source is made, for OOPAO knows named bands only.
-    """
-    lib = oopao()
-    with quiet():
+    """Source and telescope for a pupil amplitude ``(n, n)`` whose side is ``diameter_m``."""
+    lib = oopao_classes()
+    with suppress_output():
         power = np.square(amplitude, dtype=float)
         telescope = lib.Telescope(
             resolution=amplitude.shape[0],
@@ -128,7 +112,7 @@ def make_source(amplitude: NDArray[np.float32], diameter_m: float, wavelength_m:
             pupilReflectivity=power,
         )
         source = lib.Source("R", 0, display_properties=False)
-        source.wavelength = wavelength_m
+        source.wavelength = wavelength_m  # OOPAO's constructor takes named bands only
         source * telescope
         photons_per_unit = (
             float(source.nPhoton) * telescope.samplingTime * (diameter_m / amplitude.shape[0]) ** 2
@@ -139,20 +123,12 @@ def make_source(amplitude: NDArray[np.float32], diameter_m: float, wavelength_m:
 def make_lenslets(light: SourceAndTelescope, n_sub: int, window: int) -> Any:
     """A noise-free diffractive ``ShackHartmann``, two pixels per lambda/d.
 
-    The relative threshold of OOPAO's centroid (1 % by default) makes small-signal slopes depend on
-    the stroke, so it is off; ``slopes_units`` is 1, so slopes are plain centroids in its pixels.
-
-    Parameters
-    ----------
-    light
-        Source and telescope.
-    n_sub
-        Lenslets across the pupil map.
-    window
-        Pixels across each lenslet's image, even.
+    The relative threshold of OOPAO's centroid (1 % by default) makes small-signal slopes depend on the
+    stroke and is switched off. ``slopes_units`` is 1, so slopes are centroids in its pixels. ``window``
+    is the number of pixels across each lenslet's image, even.
     """
-    with quiet():
-        sensor = oopao().ShackHartmann(
+    with suppress_output():
+        sensor = oopao_classes().ShackHartmann(
             nSubap=n_sub,
             telescope=light.telescope,
             lightRatio=1e-6,
@@ -161,29 +137,21 @@ def make_lenslets(light: SourceAndTelescope, n_sub: int, window: int) -> Any:
             n_pixel_per_subaperture=window,
         )
         sensor.slopes_units = 1.0
-        # Batches of wavefronts are sized by this; the default of 1 GB is too much for a side task.
+        # Limits the size of batches of wavefronts; the default is 1 GB.
         sensor.cpu_batch_memory = 1.5e8
-        # fft_workers only helps asterisms; -1 would start a thread per core.
+        # fft_workers speeds up asterisms only; -1 would start a thread per core.
         sensor.fft_workers = 1
     return sensor
 
 
 def make_pyramid(light: SourceAndTelescope, n_sub: int, separation: int, edge: int, roof: float = 0.0) -> Any:
-    """A noise-free ``Pyramid`` at rest, every pixel valid.
+    """A noise-free ``Pyramid`` without modulation, every pixel valid.
 
-    Parameters
-    ----------
-    light
-        Source and telescope.
-    n_sub
-        Camera pixels across the pupil map.
-    separation, edge
-        Pixels between two pupil images, and beside them.
-    roof
-        Its ``rooftop``.
+    ``n_sub`` is the number of camera pixels across the pupil, ``separation`` and ``edge`` those between
+    two pupil images and beside them, ``roof`` its ``rooftop``.
     """
-    with quiet():
-        sensor = oopao().Pyramid(
+    with suppress_output():
+        sensor = oopao_classes().Pyramid(
             nSubap=n_sub,
             telescope=light.telescope,
             modulation=0,
@@ -192,6 +160,6 @@ def make_pyramid(light: SourceAndTelescope, n_sub: int, separation: int, edge: i
             n_pix_edge=edge,
             rooftop=roof,
         )
-        # Its image of the focal plane is not looked at.
+        # Its focal-plane image is not used.
         sensor.compute_focal_plane = False
     return sensor

@@ -1,4 +1,4 @@
-"""OOPAO as synthetic model: push-pull of its mirror in front of its Shack-Hartmann sensor or pyramid; the reference for the fast models."""
+"""OOPAO as synthetic model, by push-pull of its mirror; the reference for the fast models."""
 
 from __future__ import annotations
 
@@ -10,117 +10,90 @@ from numpy.typing import NDArray
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
-from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, require_kind
+from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
-from escape_sim.models.shack_hartmann import nominal_grid
+from escape_sim.mirror.influence_functions import nominal_influence_functions
+from escape_sim.models.factory import model_geometry
 from escape_sim.oopao.library import (
     SourceAndTelescope,
     make_lenslets,
     make_source,
     mis_registration,
-    oopao,
-    quiet,
+    oopao_classes,
+    suppress_output,
 )
 from escape_sim.oopao.optics import SAMPLING, OOPAOPyramid, window_moments
 from escape_sim.optics.modulation import ModulationPath
-from escape_sim.optics.pupil import (
-    PupilGeometry,
-    actuator_positions,
-    pitch_on_pupil,
-    pupil_from_images,
-    pupil_geometry,
-)
+from escape_sim.optics.pupil import PupilGeometry, pupil_from_images, pupil_geometry
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
 
-#: Surface in metres of the push and of the pull: a thousandth of a wave, so that what is not
-#: linear stays below the other differences between models.
+#: Surface in metres of a push or pull: a thousandth of a wave, for negligible non-linearity.
 POKE_SURFACE_M = 0.5e-9
 
 
 class OOPAOMirror:
-    """OOPAO's ``DeformableMirror`` for a design.
-
-    Parameters
-    ----------
-    config
-        The design.
-    pupil
-        Its sampled pupil.
-    light
-        Source and telescope of that pupil.
-    """
+    """OOPAO's ``DeformableMirror`` for the design's mirror on a pupil."""
 
     def __init__(self, config: SystemConfig, pupil: PupilGeometry, light: SourceAndTelescope) -> None:
         n = pupil.n_sub * pupil.n_pix
-        self._pupil, self._telescope, self._dm = pupil, light.telescope, config.devices.dm
-        # OOPAO's mirror lays its n samples from edge to edge, its wavefront has them at pixel
-        # centres: everything the mirror is told in metres must be this much larger.
+        self._pupil, self._telescope, self._stroke_m = pupil, light.telescope, config.devices.dm.stroke_m
+        # OOPAO's mirror has its n samples from edge to edge, its wavefront at pixel centres: lengths for
+        # the mirror must be larger by this factor.
         self._edge_factor = n / (n - 1)
-        self._positions = actuator_positions(config)
-        self._pitch = pitch_on_pupil(config)
+        self._influence = nominal_influence_functions(config)
         self._mirrors: dict[float, Any] = {}
 
     @property
     def n_act(self) -> int:
         """Number of actuators."""
-        return len(self._positions)
+        return self._influence.n_act
 
     @property
     def unit_command_factor(self) -> float:
         """Full strokes in the difference of a push and a pull of :data:`POKE_SURFACE_M`."""
-        return self._dm.stroke_m / (2 * POKE_SURFACE_M)
+        return self._stroke_m / (2 * POKE_SURFACE_M)
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-        """Nominal influence functions ``(n_act, n, n)``, pupil ``(n, n)`` and pixel size in metres."""
+        """Nominal influence functions, see :class:`SyntheticModel`."""
         modes = np.asarray(self._nominal(1.0).modes, dtype=float)
         lit = self._pupil.lit
         return modes.T.reshape(self.n_act, *lit.shape), lit, self._pupil.pixel_m
 
-    def moved(self, registration: Registration, width: float) -> Any:
-        """The mirror under a registration, its influence functions ``width`` times as wide."""
+    def apply_registration(self, registration: Registration, width: float) -> Any:
+        """OOPAO's mirror under a registration, its influence functions ``width`` times as wide."""
         shift = mis_registration(registration, self._pupil.sub_aperture_m * self._edge_factor)
-        with quiet():
+        with suppress_output():
             return self._nominal(width).apply_mis_registration(shift)
 
     def _nominal(self, width: float) -> Any:
-        """OOPAO's mirror in nominal position; the few widths in use are kept."""
+        """OOPAO's mirror without misregistration; cached for four widths."""
         if width not in self._mirrors:
             if len(self._mirrors) >= 4:
                 self._mirrors.clear()
-            with quiet():
-                self._mirrors[width] = oopao().DeformableMirror(
+            with suppress_output():
+                self._mirrors[width] = oopao_classes().DeformableMirror(
                     telescope=self._telescope,
                     nSubap=self._pupil.n_sub,
-                    mechCoupling=self._dm.coupling,
-                    coordinates=self._positions * self._edge_factor,
-                    pitch=self._pitch * self._edge_factor * width,
+                    mechCoupling=self._influence.coupling,
+                    coordinates=self._influence.positions_m * self._edge_factor,
+                    pitch=self._influence.pitch_m * self._edge_factor * width,
                     print_dm_properties=False,
                 )
         return self._mirrors[width]
 
 
-#: Actuators propagated together; bounds the memory.
+#: Actuators propagated together; limits the memory.
 _BATCH = 16
 
 
 class OOPAOPushPullModel(abc.ABC):
-    """Small-signal slopes as push minus pull of OOPAO's mirror.
-
-    Parameters
-    ----------
-    config
-        The design.
-    pupil
-        Its sampled pupil.
-    light
-        Source and telescope of that pupil.
-    """
+    """Small-signal slopes as push minus pull of OOPAO's mirror."""
 
     name = "oopao"
 
@@ -139,28 +112,20 @@ class OOPAOPushPullModel(abc.ABC):
         return self._pupil.sub_aperture_m
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-        """Nominal influence functions ``(n_act, n, n)``, pupil ``(n, n)`` and pixel size in metres."""
+        """Nominal influence functions, see :class:`SyntheticModel`."""
         return self._mirror.influence_functions()
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
-        """Slopes per unit command ``(n_slopes, n_act)``, all x then all y, in the sensor's slope unit.
-
-        Parameters
-        ----------
-        registration
-            Registration of the mirror.
-        width
-            Scale of the influence functions' width relative to nominal.
-        """
-        mirror = self._mirror.moved(registration, width)
-        # The mirror reflects: a surface of STEP_M changes the path by twice that.
+        """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
+        mirror = self._mirror.apply_registration(registration, width)
+        # The optical path changes by twice the surface.
         pokes = np.eye(self.n_act) * 2 * POKE_SURFACE_M
-        parts = [pokes[:, start : start + _BATCH] for start in range(0, self.n_act, _BATCH)]
-        moved = [self._slopes(mirror, part) - self._slopes(mirror, -part) for part in parts]
-        return np.asarray(np.concatenate(moved, axis=1) * self._mirror.unit_command_factor)
+        batches = [pokes[:, start : start + _BATCH] for start in range(0, self.n_act, _BATCH)]
+        differences = [self._slopes(mirror, batch) - self._slopes(mirror, -batch) for batch in batches]
+        return np.asarray(np.concatenate(differences, axis=1) * self._mirror.unit_command_factor)
 
     def variants(self) -> list[Self]:
-        """None: OOPAO's sensors at rest leave nothing in doubt, see :class:`SyntheticModel`."""
+        """No variants: there is no turbulence or spot motion to be uncertain about."""
         return []
 
     @abc.abstractmethod
@@ -169,17 +134,16 @@ class OOPAOPushPullModel(abc.ABC):
 
 
 class OOPAOPyramidModel(OOPAOPushPullModel):
-    """Small-signal slopes with mirror, registration, field and prism by OOPAO 1.0.
+    """Small-signal slopes of a pyramid with mirror, registration, field and prism by OOPAO 1.0.
 
-    Slopes are push minus pull about a flat wavefront. OOPAO's own slopes are not used, for they take
-    the four images for a perfect square.
+    OOPAO's own slopes are not used, since they assume that the four images are on a perfect square.
 
     Parameters
     ----------
     config
         The design: sensor, mirror and beam. Its ``twin`` section is not read.
     pupils
-        The pupil images found on the camera.
+        The pupil images measured on the camera.
 
     Raises
     ------
@@ -203,17 +167,17 @@ class OOPAOPyramidModel(OOPAOPushPullModel):
         n = len(self._pupil.coordinates_m)
         out = np.empty((self._pupils.n_slopes, paths_m.shape[1]))
         for number, path in enumerate(paths_m.T):
-            with quiet():
+            with suppress_output():
                 mirror.coefs = path
             surface = np.asarray(mirror.OPD, dtype=float).reshape(n, n)
-            # In double precision: the steps are small.
+            # In double precision, since the pokes are small.
             frame = self._sensor.frame(surface, np.zeros(self._sensor.shape))
             out[:, number] = slopes_of_image(frame, self._pupils)
         return out
 
 
 def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticModel:
-    """Entry point ``oopao``; without a grid, the nominal one of the design.
+    """Entry point ``oopao``; without a grid, on the design's nominal one.
 
     Raises
     ------
@@ -222,30 +186,33 @@ def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticMo
     CalibrationError
         The grid does not fit the design.
     """
-    if config.sensor.kind == "pyramid":
-        from escape_sim.models.pyramid import nominal_pupils
-
-        pupils = nominal_pupils(config) if grid is None else require_kind(grid, PyramidPupils)
-        return OOPAOPyramidModel(config, pupils)
-    return OOPAOShackHartmannModel(
-        config, nominal_grid(config) if grid is None else require_kind(grid, SubApertureGrid)
-    )
+    geometry = model_geometry(config, grid)
+    if isinstance(geometry, PyramidPupils):
+        return OOPAOPyramidModel(config, geometry)
+    return OOPAOShackHartmannModel(config, geometry)
 
 
 class OOPAOShackHartmannModel(OOPAOPushPullModel):
-    """Small-signal slopes with mirror, registration, field and diffraction by OOPAO 1.0.
+    """Small-signal slopes of a Shack-Hartmann sensor with mirror, registration and diffraction by OOPAO 1.0.
 
-    Slopes are push minus pull, the centre of gravity without threshold over the camera's own windows
-    of OOPAO's spots, the neighbours' included. Three things of OOPAO's are not used: its centroid,
-    whose relative threshold makes matrices depend on the stroke; its ``SPRINT``, whose rounding
-    loses shifts at the scale of a bench; its modal bases, whose signs change between runs.
+    Slopes are centres of gravity without threshold over the camera's windows, including light of the
+    neighbouring lenslets. Not used are OOPAO's centroid, whose relative threshold makes matrices depend
+    on the stroke; its ``SPRINT``, whose rounding loses shifts at the scale of a bench; and its modal
+    bases, whose signs change between runs.
 
     Parameters
     ----------
     config
         The design: sensor, mirror and beam. Its ``twin`` section is not read.
     grid
-        The grid found on the camera.
+        The grid measured on the camera.
+
+    Raises
+    ------
+    ConfigError
+        OOPAO is not installed.
+    CalibrationError
+        The grid does not fit the design.
     """
 
     def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
@@ -273,18 +240,18 @@ class OOPAOShackHartmannModel(OOPAOPushPullModel):
     def _slopes(self, mirror: Any, paths_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Spot positions ``(n_slopes, n)`` in camera pixels for mirror shapes ``(n_act, n)``."""
         n = paths_m.shape[1]
-        # OOPAO drops the last axis of a single wavefront, so one is sensed as two.
+        # OOPAO drops the last axis of a single wavefront, so it is propagated twice.
         if n == 1:
             paths_m = np.repeat(paths_m, 2, axis=1)
         light = self._light
-        with quiet():
+        with suppress_output():
             mirror.coefs = paths_m
-            # '**' starts a new propagation; '*' alone would add to the last one.
+            # '**' starts a new propagation; '*' would add to the last one.
             light.source**light.telescope * mirror * self._lenslets
             spots = np.asarray(self._lenslets.maps_intensity)[:n]
         total, along_x, along_y = np.zeros((3, n, len(self._moments[0].lenslet)))
         for part in self._moments:
-            # OOPAO lays the image of a lenslet down with x along its rows.
+            # OOPAO's image of a lenslet has x along its rows.
             over_y = np.einsum("bkxy,kyl->bkxl", spots[:, part.lenslet], part.along_y, optimize=True)
             total += np.einsum("bkx,kx->bk", over_y[..., 0], part.along_x[..., 0])
             along_x += np.einsum("bkx,kx->bk", over_y[..., 0], part.along_x[..., 1])

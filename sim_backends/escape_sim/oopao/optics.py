@@ -1,4 +1,4 @@
-"""OOPAO as the twin's Shack-Hartmann and pyramid optics, and the resampling of its lenslet images to the camera's pixels."""
+"""OOPAO as the twin's Shack-Hartmann and pyramid optics; resampling of its images to camera pixels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
-from escape_sim.oopao.library import make_lenslets, make_pyramid, make_source, oopao, quiet
+from escape_sim.oopao.library import make_lenslets, make_pyramid, make_source, oopao_classes, suppress_output
 from escape_sim.optics.fourier_filter import next_fast_length
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import GridRegion, Prism
@@ -19,26 +19,15 @@ if TYPE_CHECKING:
     from escape_hw.api.sensor import SubApertureGrid
 
 
-#: OOPAO's pixels per lambda/d here: critical sampling of an intensity.
+#: OOPAO's pixels per lambda/d: critical sampling of an intensity.
 SAMPLING = 2
 
 
 def trigonometric_interpolation(at: NDArray[np.float64], period: int) -> NDArray[np.float64]:
-    """Matrix that reads a band-limited periodic signal between its samples.
+    """Matrix ``(*at.shape, period)`` that interpolates a band-limited periodic signal at ``at``.
 
-    An image of ``period / 2`` pupil samples holds frequencies below ``period / 2`` only, so
-    ``period`` samples determine it everywhere and the reading is exact.
-
-    Parameters
-    ----------
-    at
-        Positions, in samples, any shape.
-    period
-        Number of samples, even.
-
-    Returns
-    -------
-    ndarray, ``(*at.shape, period)``
+    An image of ``period / 2`` pupil samples has frequencies below ``period / 2`` only, so the
+    interpolation of ``period`` samples (an even number) is exact.
     """
     top = period // 2 - 1
     phase = 2 * np.pi / period * (at[..., None] - np.arange(period))
@@ -61,7 +50,7 @@ def camera_pixel_matrix(offset_px: NDArray[np.float64], n_pix: int, spot_px: flo
     Returns
     -------
     ndarray, ``(*offset_px.shape, SAMPLING * n_pix)``
-        Scaled so that a whole field holds the light of the lenslet.
+        Normalised so that a whole field contains the light of the lenslet.
     """
     period = SAMPLING * n_pix
     at = (period - 1) / 2 + offset_px * SAMPLING / spot_px
@@ -70,14 +59,14 @@ def camera_pixel_matrix(offset_px: NDArray[np.float64], n_pix: int, spot_px: flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowMoments:
-    """Weights on OOPAO's samples of what each window sees of one lenslet.
+    """Weights of OOPAO's samples of one lenslet in each window's sums.
 
     Parameters
     ----------
     lenslet
-        Number of that lenslet among the lit ones ``(n_valid,)``; any where the weights are 0.
+        Index of the lenslet among the lit ones ``(n_valid,)``; arbitrary where the weights are 0.
     along_x, along_y
-        Weights of the window's sum and of its first moment about its own lenslet's centre,
+        Weights for the window's sum and its first moment about its own lenslet's centre,
         ``(n_valid, samples, 2)``.
     """
 
@@ -89,20 +78,18 @@ class WindowMoments:
 def window_moments(
     grid: SubApertureGrid, lit: NDArray[np.bool_], shape: tuple[int, int], n_pix: int, spot_px: float
 ) -> list[WindowMoments]:
-    """Weights of every valid window on its own lenslet and on the eight around it.
+    """Weights of every valid window for its own lenslet and the eight around it.
 
     Parameters
     ----------
     grid
         The sub-aperture grid.
     lit
-        Lenslets that carry light, in whose order OOPAO delivers images ``(n_sub, n_sub)``.
+        Lit lenslets ``(n_sub, n_sub)``, in whose order OOPAO returns images.
     shape
         Camera region (rows, columns).
-    n_pix
-        Pupil samples across a lenslet.
-    spot_px
-        lambda/d in camera pixels.
+    n_pix, spot_px
+        Pupil samples across a lenslet, and lambda/d in camera pixels.
     """
     n_sub = lit.shape[0]
     number = np.where(lit, np.cumsum(lit).reshape(lit.shape) - 1, -1)
@@ -141,23 +128,19 @@ def window_moments(
 
 
 class OOPAOShackHartmann:
-    """The interface of ``ShackHartmannOptics`` with OOPAO doing the propagation.
+    """OOPAO's propagation with the interface of ``ShackHartmannOptics``.
 
-    OOPAO's detector has a whole number of pixels per lenslet and a pixel scale of lambda/d over a
-    whole number, which is not what the bench's camera has. Each lenslet is therefore computed by
-    OOPAO at two pixels per lambda/d over its full field and then read off at the camera's pixels by
-    trigonometric interpolation, which is exact. What OOPAO does by itself is the pupil, the
-    field and its diffraction by the lenslets.
-
-    Parameters
-    ----------
-    n_sub, n_pix, wavelength_m, pitch_px, spot_px, origin_px, shape, amplitude
-        As for ``ShackHartmannOptics``; ``n_pix`` must be even.
+    OOPAO's detector has a whole number of pixels per lenslet and of pixels per lambda/d, unlike the
+    bench's camera. OOPAO therefore computes each lenslet at two pixels per lambda/d over its full field,
+    which exact trigonometric interpolation resamples to the camera's pixels. Parameters as for
+    ``ShackHartmannOptics``; ``n_pix`` must be even.
 
     Raises
     ------
     ConfigError
         OOPAO is not installed.
+    ValueError
+        The amplitude has another shape, ``n_pix`` is odd, or a lit lenslet is outside the region.
     """
 
     def __init__(
@@ -177,10 +160,10 @@ class OOPAOShackHartmann:
                 f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})"
             )
         if n_pix % 2:
-            raise ValueError(f"{n_pix} samples per lenslet; OOPAO centres its spots on an even number only")
+            raise ValueError(f"{n_pix} samples per lenslet; OOPAO centres its spots on even numbers only")
         self.shape = shape
         self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
-        # Only angles count, so the size of the pupil is free: one metre per lenslet.
+        # Only angles matter, so the size of the pupil is arbitrary: one metre per lenslet.
         self._light = make_source(self.amplitude, float(n_sub), wavelength_m)
         self._sensor = make_lenslets(self._light, n_sub, SAMPLING * n_pix)
         self._data = self._sensor.sh_data["src_0"]
@@ -190,83 +173,72 @@ class OOPAOShackHartmann:
         self._field = field
         line = np.arange(n_sub) * pitch_px
         self._first: list[NDArray[np.intp]] = []
-        self._read: list[NDArray[np.float64]] = []
-        for start, length in zip(origin_px, shape[::-1], strict=True):
+        self._to_pixels: list[NDArray[np.float64]] = []
+        for start, length, numbers in zip(origin_px, shape[::-1], self._lit.T[::-1], strict=True):
             centres = np.asarray(start + line, dtype=np.float64)
             first = first_pixels(centres, field)
             pixels = first[:, None] + np.arange(field) - centres[:, None]
             self._first.append(first)
-            self._read.append(camera_pixel_matrix(pixels, n_pix, spot_px))
-            self._require_inside(first, length)
-
-    def _require_inside(self, first: NDArray[np.intp], length: int) -> None:
-        axis = self._lit[:, 1] if len(self._first) == 1 else self._lit[:, 0]
-        used = first[axis]
-        if used.min() < 0 or used.max() + self._field > length:
-            raise ValueError(
-                f"lit lenslets fall outside the region of {self.shape[1]} x {self.shape[0]} pixels; "
-                "enlarge the camera region or move the grid's origin"
-            )
+            self._to_pixels.append(camera_pixel_matrix(pixels, n_pix, spot_px))
+            used = first[numbers]
+            if used.min() < 0 or used.max() + field > length:
+                raise ValueError(
+                    f"lit lenslets fall outside the region of {shape[1]} x {shape[0]} pixels; "
+                    "enlarge the camera region or move the grid's origin"
+                )
 
     def frame(
         self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """Intensity on the camera.
+        """Add the intensity ``(rows, columns)`` to ``image``, a new array by default, and return it.
 
-        Parameters
-        ----------
-        opd_m
-            Optical path difference ``(n, n)`` in metres.
-        image
-            Where to put the result; added to, so clear it first. A new array by default.
-
-        Returns
-        -------
-        ndarray of float32, ``(rows, columns)``
-            Sums (but for light beyond the field of a lenslet) to the sum of ``amplitude ** 2``.
+        ``opd_m (n, n)`` is the optical path difference in metres. The intensity sums to the sum of
+        ``amplitude ** 2``, except for light outside the field of a lenslet.
         """
         if opd_m.shape != self.amplitude.shape:
             raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
         out = np.zeros(self.shape, np.float32) if image is None else image
         spots = self._spots(opd_m)
         x0, y0 = self._first
-        read_x, read_y = self._read
+        to_x, to_y = self._to_pixels
         size = self._field
         for (i, j), spot in zip(self._lit, spots, strict=True):
-            # OOPAO lays the image of a lenslet down with x along its rows.
-            out[y0[i] : y0[i] + size, x0[j] : x0[j] + size] += read_y[i] @ spot.T @ read_x[j].T
+            # OOPAO's image of a lenslet has x along its rows.
+            out[y0[i] : y0[i] + size, x0[j] : x0[j] + size] += to_y[i] @ spot.T @ to_x[j].T
         return out
 
     def _spots(self, opd_m: NDArray[np.float32]) -> NDArray[np.float64]:
         """OOPAO's images of the lit lenslets ``(n_lit, period, period)``."""
         light = self._light
-        with quiet():
-            # '**' starts a new propagation; '*' alone would add to the last one.
-            light.source**light.telescope * oopao().OPD_map(np.asarray(opd_m, dtype=float)) * self._sensor
+        with suppress_output():
+            # '**' starts a new propagation; '*' would add to the last one.
+            light.source**light.telescope * oopao_classes().OPD_map(
+                np.asarray(opd_m, dtype=float)
+            ) * self._sensor
             return np.asarray(self._sensor.maps_intensity) / light.photons_per_unit
 
 
-#: OOPAO's faces, numbered from the lower right on clockwise, in our order.
+#: OOPAO's faces, numbered clockwise from the lower right, in the order of this package.
 _FACES = (2, 3, 1, 0)
 
 
 class OOPAOPyramid:
-    """The interface of ``PyramidOptics`` with OOPAO doing the propagation.
+    """OOPAO's propagation with the interface of ``PyramidOptics``.
 
     Parameters
     ----------
     amplitude, diameter_px, wavelength_m, centres_px, shape, modulation, rooftop, samples, grid_px
-        As for ``PyramidOptics``. OOPAO's grid holds two pupils side by side, so ``grid_px`` is at
+        As for ``PyramidOptics``. OOPAO's grid contains two pupils side by side, so ``grid_px`` is at
         least twice the pupil map's side.
     diameter_m
-        Side of the pupil map in metres, for a mirror of OOPAO's; angles alone do not need it.
+        Side of the pupil map in metres, needed for OOPAO's mirrors only.
 
     Raises
     ------
     ConfigError
         OOPAO is not installed.
     ValueError
-        The geometry does not fit together.
+        Amplitude, samples or grid are inconsistent.
     """
 
     def __init__(
@@ -293,7 +265,7 @@ class OOPAOPyramid:
         min_grid = max(2 * side, max(shape) if grid_px is None else grid_px)
         grid = next_fast_length(min_grid, samples) if grid_px is None else min_grid
         if grid % 2 or (grid_px is not None and grid != grid_px):
-            raise ValueError(f"a grid of {grid_px} pixels; OOPAO needs an even number from {2 * side} on")
+            raise ValueError(f"a grid of {grid_px} pixels; OOPAO needs an even number, at least {2 * side}")
         self.shape = shape
         self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
         # OOPAO's unit of tilt is one wave between the centres of the outermost samples.
@@ -307,7 +279,7 @@ class OOPAOPyramid:
         self.sensor = make_pyramid(self.light, side, separation, edge, roof)
         nominal = (side + separation) / 2 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
         image_offsets = (shifts - (grid - side) / 2 - nominal)[np.argsort(_FACES)]
-        with quiet():
+        with suppress_output():
             self.sensor.apply_shift_wfs(list(image_offsets[:, 0]), list(-image_offsets[:, 1]))
         self.modulation = modulation
 
@@ -320,35 +292,28 @@ class OOPAOPyramid:
     def modulation(self, modulation: ModulationPath) -> None:
         self._modulation = modulation
         tilts = modulation.points * self._unit
-        with quiet():
+        with suppress_output():
             self.sensor.user_modulation_path = tilts.tolist()
-            # It divides by the number of points in the field and once more in the weighted sum.
+            # OOPAO divides by the number of points in the field and again in the weighted sum.
             self.sensor.weight_vector = modulation.weights * len(tilts) ** 2
             self.sensor.modulation = float(np.hypot(*tilts.T).max())
 
     def frame(
         self, opd_m: NDArray[np.floating], image: NDArray[np.floating] | None = None
     ) -> NDArray[np.floating]:
-        """Intensity on the camera, averaged over the modulation.
+        """Add the mean intensity ``(rows, columns)`` to ``image``, float32 zeros by default; return it.
 
-        Parameters
-        ----------
-        opd_m
-            Optical path difference ``(n, n)`` in metres.
-        image
-            Where to put the result; added to, so clear it first. A new array by default.
-
-        Returns
-        -------
-        ndarray, ``(rows, columns)``, float32 by default
-            Sums (but for light beside the region) to the sum of ``amplitude ** 2``.
+        ``opd_m (n, n)`` is the optical path difference in metres. The intensity sums to the sum of
+        ``amplitude ** 2``, except for light outside the region.
         """
         if opd_m.shape != self.amplitude.shape:
             raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
         out: NDArray[np.floating] = np.zeros(self.shape, np.float32) if image is None else image
         light = self.light
-        with quiet():
-            # '**' starts a new propagation; '*' alone would add to the last one.
-            light.source**light.telescope * oopao().OPD_map(np.asarray(opd_m, dtype=float)) * self.sensor
+        with suppress_output():
+            # '**' starts a new propagation; '*' would add to the last one.
+            light.source**light.telescope * oopao_classes().OPD_map(
+                np.asarray(opd_m, dtype=float)
+            ) * self.sensor
             self._region_on_camera.add(np.asarray(self.sensor.cam.frame) / light.photons_per_unit, out)
         return out

@@ -1,4 +1,4 @@
-"""Camera detector: photon, multiplication, read and fixed-pattern noise, full well, quantisation; exact Poisson numbers for faint light."""
+"""Camera detector: photon, multiplication, read and fixed-pattern noise, full well, quantisation."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import special
 
-#: Above this mean the distribution is close enough to a Gaussian of the same mean and variance.
+#: Largest mean for the Poisson tables; above it a Gaussian of the same mean and variance is accurate.
 MAX_TABLE_MEAN = 20.0
-#: Tables per unit of the mean, numbers per table, and entries into each of them.
+#: Tables per unit of the mean, numbers per table, and starting points of the search in each table.
 _MEANS_PER_UNIT, _TABLE_LENGTH, _N_ENTRIES = 16, 64, 256
 
 
 def poisson_tables() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Tables from which :func:`draw_poisson` draws.
+    """Build the tables of :func:`draw_poisson`.
 
     Returns
     -------
     cumulative : ndarray of float32, ``(n_means, 64)``
         Probability of at most ``k``, for means of 0, 1/16, 2/16, ...
     entry : ndarray of uint8, ``(n_means, 256)``
-        Where to begin looking for a uniform number, by its first 8 bits.
+        First ``k`` to compare with a uniform number, by its first 8 bits.
     """
     means = np.arange(int(MAX_TABLE_MEAN * _MEANS_PER_UNIT) + 1) / _MEANS_PER_UNIT
     exact = special.pdtr(np.arange(_TABLE_LENGTH), means[:, None])
-    exact[:, -1] = 2.0  # so that no uniform number finds an end
+    exact[:, -1] = 2.0  # ends every search
     starts = np.arange(_N_ENTRIES) / _N_ENTRIES
     entry = np.array([np.searchsorted(row, starts, side="right") for row in exact], np.uint8)
     return exact.astype(np.float32), entry
@@ -35,9 +35,9 @@ def poisson_tables() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
 
 @njit(cache=True, nogil=True, inline="always")
 def uniform_pair(key, index):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Two uniform numbers in [0, 1) for an index under a 64-bit key: a hash, so nothing is carried along.
+    """Two uniform numbers in [0, 1): a hash of ``index`` under a 64-bit key, without state.
 
-    The finaliser is that of SplitMix64 (Steele, Lea and Flood 2014).
+    Uses the finaliser of SplitMix64 (Steele, Lea and Flood 2014).
     """
     z = np.uint64(key) + np.uint64(index + 1) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -51,10 +51,10 @@ def uniform_pair(key, index):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 @njit(cache=True, nogil=True, inline="always")
 def draw_poisson(mean, uniform_a, uniform_b, cumulative, entry):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """A Poisson number of a mean up to :data:`MAX_TABLE_MEAN`, from two uniform numbers.
+    """Draw a Poisson number of a mean up to :data:`MAX_TABLE_MEAN` from two uniform numbers.
 
-    The sum of two Poisson numbers is one: of a mean on the tables' grid, found by inversion from an
-    entry that is nearly always right, and of the small rest, found by going up from zero.
+    The sum of two Poisson numbers: one whose mean is on the tables' grid, by inversion from the tabulated
+    starting point, and one of the remaining mean, by inversion from zero.
     """
     row = int(mean * np.float32(16))
     u = uniform_a
@@ -62,7 +62,7 @@ def draw_poisson(mean, uniform_a, uniform_b, cumulative, entry):  # type: ignore
     while cumulative[row, k] <= u:
         k += 1
     remainder = mean - np.float32(row) * np.float32(1 / 16)
-    # exp(-rest) for rest < 1/16; the next term is below the resolution of single precision.
+    # exp(-remainder) for remainder < 1/16; the next term is below float32 resolution.
     term = np.float32(1) - remainder * (
         np.float32(1)
         - remainder * (np.float32(0.5) - remainder * (np.float32(1 / 6) - remainder * np.float32(1 / 24)))
@@ -75,22 +75,22 @@ def draw_poisson(mean, uniform_a, uniform_b, cumulative, entry):  # type: ignore
     return np.float32(k) + more
 
 
-#: Read noise in electrons above which faint light may count as Gaussian: the skewness of the sum is
+#: Read noise in electrons above which faint light is treated as Gaussian: the skewness of the sum is
 #: below 0.385 / read noise, less than a tenth.
 COUNTING_NOISE_E = 4.0
-#: Largest excess noise factor: that of a long multiplying register.
+#: Largest excess noise factor, that of a long multiplication register.
 MAX_EXCESS_NOISE = math.sqrt(2)
 _MAX_TABLE_MEAN = np.float32(MAX_TABLE_MEAN)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _digitise(value, k, gain, offset, well, top, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Counts of a pixel, clipped to the full well and to the converter; 1 when it is saturated."""
+    """Store the counts of a pixel, clipped to full well and converter range; return 1 if saturated."""
     full = value >= well
     value = min(value, well)
     count = max(np.float32(0), value * gain[k] + offset[k])
     level = min(np.int32(count + np.float32(0.5)), np.int32(top))
-    # The pattern is one of sensitivities: whatever its own, a full pixel stands at the top.
+    # A full pixel reads the top of the converter whatever its gain and offset.
     if full:
         level = np.int32(top)
     out[k] = level
@@ -124,7 +124,7 @@ def _expose_counting(settings, key, cumulative, entry):  # type: ignore[no-untyp
             uniform_a, uniform_b = uniform_pair(key, k)
             value = draw_poisson(mean, uniform_a, uniform_b, cumulative, entry)
             if spread > 0 and value > 0:
-                # Gamma distributed with this mean and variance value x spread (Wilson and Hilferty 1931).
+                # Gamma distribution of mean value and variance value x spread (Wilson and Hilferty 1931).
                 small = spread / (np.float32(9) * value)
                 root = np.float32(1) - small + noise[noise.size - 1 - start - k] * np.sqrt(small)
                 value *= max(root, np.float32(0)) ** 3
@@ -134,13 +134,13 @@ def _expose_counting(settings, key, cumulative, entry):  # type: ignore[no-untyp
 
 
 class Detector:
-    """Turns intensities into counts.
+    """Converts intensities to counts.
 
-    Shot and read noise together are Gaussian with variance ``mean + read_noise^2``, which is exact
-    enough for a CMOS camera whose read noise is several electrons. Where the read noise is below
-    :data:`COUNTING_NOISE_E`, light below 20 electrons is counted: true Poisson numbers, spread by the
-    multiplication if there is one. Normal deviates come from a long pool, entered at a random place
-    with a random sign for each frame, which costs a tenth of drawing them afresh.
+    Shot and read noise are one Gaussian of variance ``mean + read_noise^2``, which suits cameras with
+    several electrons of read noise. If the read noise is below :data:`COUNTING_NOISE_E`, means below 20
+    electrons are Poisson distributed, and gamma distributed after multiplication. Normal deviates come
+    from a pool, entered at a random position with a random sign in each frame, which takes a tenth of
+    the time of drawing new ones.
 
     Parameters
     ----------
@@ -149,19 +149,18 @@ class Detector:
     bit_depth
         Bits of the converter.
     full_well_e
-        Electrons at which a pixel saturates; the converter's top stands at this level.
+        Electrons at which a pixel saturates; full scale of the converter.
     read_noise_e, dark_e
-        Read noise (rms) and dark signal per frame in electrons (before multiplication).
+        Read noise (rms) and dark signal per frame in electrons before multiplication.
     background_e
-        Mean black level in electrons; it carries no shot noise.
+        Mean black level in electrons, without shot noise.
     fixed_pattern
-        Relative scatter of the pixels' gains; their black levels scatter by the same share of 100
-        counts.
+        Relative scatter of the pixels' gains; black levels scatter by this share of 100 counts.
     rng
         Source of randomness.
     excess_noise
-        Excess noise factor F of a multiplying detector: shot noise is F times that of the light. 1 for
-        none, 1.25 for an avalanche photodiode array, 1.41 for an electron-multiplying CCD.
+        Excess noise factor F: shot noise is F times that of the light. 1 without multiplication, 1.25
+        for an avalanche photodiode array, 1.41 for an electron-multiplying CCD.
 
     Raises
     ------
@@ -199,13 +198,13 @@ class Detector:
         self._tables = poisson_tables() if read_noise_e < COUNTING_NOISE_E else None
 
     def set_rng(self, rng: np.random.Generator) -> None:
-        """Go on with another source of randomness; the pixels stay what they are."""
+        """Replace the source of randomness; gains, offsets and the pool of deviates are kept."""
         self._rng = rng
 
     def expose(
         self, intensity: NDArray[np.float32], photons: float, sky_e: float = 0.0
     ) -> tuple[NDArray[np.uint16], int]:
-        """One frame.
+        """Expose one frame.
 
         Parameters
         ----------
@@ -214,7 +213,7 @@ class Detector:
         photons
             Electrons per unit of intensity.
         sky_e
-            Further light, the same on every pixel, in electrons.
+            Additional uniform light in electrons per pixel.
 
         Returns
         -------

@@ -16,13 +16,13 @@ class FocalPlane:
     amplitude
         Pupil amplitude ``(n, n)``.
     diameter_px
-        Diameter of the pupil in pupil samples.
+        Pupil diameter in pupil samples.
     wavelength_m
         Wavelength in metres.
     psf_px
         lambda/D in camera pixels.
     shape
-        Region (rows, columns); the optical axis falls on pixel ``(rows // 2, columns // 2)``.
+        Region (rows, columns); the optical axis is on pixel ``(rows // 2, columns // 2)``.
     """
 
     def __init__(

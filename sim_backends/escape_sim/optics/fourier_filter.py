@@ -1,4 +1,4 @@
-"""Filters of square fields with dark borders, by fast Fourier transforms."""
+"""Filtering of square, zero-padded fields by fast Fourier transforms (FFTW)."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pyfftw
 from numba import njit
 from numpy.typing import NDArray
 
-#: Columns beyond a row's end: rows of a power of two would all fall on the same lines of the cache.
+#: Columns added to each row: rows of a power of two would share the same cache lines.
 _ROW_PADDING = 8
-#: Complex numbers in a line of the cache: a transposition moves so many columns at a time.
+#: Complex numbers per cache line; columns transposed at a time.
 _CACHE_LINE = 8
 
 
@@ -28,7 +28,7 @@ def _transpose(source, rows, columns, out):  # type: ignore[no-untyped-def]  # p
             out[j, i] = source[i, j]
 
 
-# One row at a time in a name of its own: only then does the compiler turn the loop into vectors.
+# The loops over rows use local names, without which the compiler does not vectorise them.
 @njit(cache=True, fastmath=True, nogil=True)
 def _multiply(field, factors):  # type: ignore[no-untyped-def]  # pragma: no cover
     """``field[:, :n] *= factors``."""
@@ -39,13 +39,11 @@ def _multiply(field, factors):  # type: ignore[no-untyped-def]  # pragma: no cov
 
 
 class FourierFilter:
-    """A product in Fourier space, for fields that fill a corner of a periodic square.
+    """Multiplication in Fourier space of fields that fill a corner of a periodic square.
 
-    All transforms run along rows in memory, from one buffer to another, with transpositions
-    between: FFTW then needs no trial runs to be at its best, and the same result comes out of every
-    process to the last bit. Rows without light are not transformed, nor are rows that nobody wants.
-
-    Not for two threads at a time: each needs a filter of its own.
+    All transforms run along contiguous rows, from one buffer to another, with transpositions in between.
+    FFTW is then fast without trial runs, and results are identical in every process. Dark input rows
+    and unused output rows are not transformed. Not thread-safe: use one filter per thread.
 
     Parameters
     ----------
@@ -59,10 +57,9 @@ class FourierFilter:
     Attributes
     ----------
     field
-        Where to put the field: ``[:n, :n]`` of a larger array; the rest must stay zero.
+        Input: ``[:n, :n]`` of a larger array; the rest must stay zero.
     result
-        Where the result will be: ``[:rows, :size]`` of a larger array. Not scaled: the inverse
-        transform of numpy is smaller by ``size ** 2``.
+        Output: ``[:rows, :size]`` of a larger array, ``size ** 2`` times numpy's inverse transform.
     """
 
     def __init__(self, transmission: NDArray[np.complexfloating], n: int, rows: int) -> None:
@@ -73,14 +70,14 @@ class FourierFilter:
             pyfftw.zeros_aligned((lines, size + _ROW_PADDING), np.complex64) for lines in (n, *[size] * 3)
         )
         self.result, self._work = first_view, second_view
-        # Along x over the lit rows, along y over all frequencies, back along y, back along x.
+        # Along x over the lit rows, along y over all frequencies, inverse along y, inverse along x.
         self._steps = (
             _plan_transform(self.field[:, :size], second_view[:n, :size], "FFTW_FORWARD"),
             _plan_transform(self._column_buffer[:, :size], second_view[:, :size], "FFTW_FORWARD"),
             _plan_transform(second_view[:, :size], first_view[:, :size], "FFTW_BACKWARD"),
             _plan_transform(second_view[:rows, :size], first_view[:rows, :size], "FFTW_BACKWARD"),
         )
-        # Transposing moves whole complex numbers, as if they were doubles.
+        # Complex numbers of 8 bytes are transposed as doubles.
         self._transpose_views = tuple(
             x.view(np.float64) for x in (first_view, second_view, self._column_buffer)
         )
@@ -99,7 +96,7 @@ class FourierFilter:
 
 
 def next_fast_length(shortest: int, samples: int = 1) -> int:
-    """The next number of pixels whose samples FFTW transforms at its best without trial runs."""
+    """Smallest number of pixels, from ``shortest`` on, whose samples FFTW transforms fast without trials."""
     length = shortest
     while not is_fast_length(length * samples):
         length += 1
@@ -114,10 +111,10 @@ def is_fast_length(samples: int) -> bool:
 def _plan_transform(
     source: NDArray[np.complex64], out: NDArray[np.complex64], direction: str
 ) -> Callable[[], None]:
-    """One transform per row, unscaled.
+    """Plan one unscaled transform per row.
 
-    Planned by rule and not by trial: trials choose differently from run to run, and a seed would no
-    longer fix the frames.
+    The plan follows rules (``FFTW_ESTIMATE``): trial runs would choose differently each time, and the
+    seed would no longer fix the frames.
     """
     plan = pyfftw.FFTW(source, out, axes=(1,), direction=direction, flags=("FFTW_ESTIMATE",), threads=1)
     execute: Callable[[], None] = plan.execute

@@ -1,4 +1,4 @@
-"""Modulation of a pyramid: points of a modulation path, and the true path of the simulated beam (ellipse, lag, drift, or an emulated stage)."""
+"""Modulation of a pyramid: points of a modulation path, and the true path of the simulated beam."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 def n_points(radius: float) -> int:
-    """Points on a modulation circle of ``radius`` lambda/D: about one per lambda/D of path.
+    """Points on a modulation circle of ``radius`` lambda/D, about one per lambda/D of path.
 
-    ``4 ceil(2 pi radius / 4)``, as in OOPAO's ``Pyramid``: a multiple of four, so that all four faces
-    see the same; 20 points at 3 lambda/D.
+    ``4 ceil(2 pi radius / 4)`` as in OOPAO's ``Pyramid``, so that all four faces receive the same number;
+    20 points at 3 lambda/D.
     """
     if radius < 0:
         raise ValueError(f"the modulation radius is {radius} lambda/D; it cannot be negative")
@@ -36,7 +36,12 @@ class ModulationPath:
     points
         Positions ``(k, 2)`` as (x, y) in lambda/D from the apex.
     weights
-        Share of the exposure spent on each ``(k,)``; scaled to sum to 1. Equal by default.
+        Share of the exposure at each point ``(k,)``, normalised to sum to 1; equal by default.
+
+    Raises
+    ------
+    ValueError
+        Points or weights have another shape, are not finite or negative.
     """
 
     points: NDArray[np.float64]
@@ -45,7 +50,7 @@ class ModulationPath:
     def __post_init__(self) -> None:
         points = np.array(self.points, dtype=float)
         if points.ndim != 2 or points.shape[1] != 2 or not points.size or not np.isfinite(points).all():
-            raise ValueError(f"modulation points must be finite and (k, 2); these are {points.shape}")
+            raise ValueError(f"modulation points have shape {points.shape}; they must be finite and (k, 2)")
         weights = np.array(self.weights, dtype=float) if np.size(self.weights) else np.ones(len(points))
         if weights.shape != (len(points),) or not (weights >= 0).all() or not weights.sum() > 0:
             raise ValueError(
@@ -69,22 +74,19 @@ class ModulationPath:
         phase: float = 0.0,
         centre: tuple[float, float] = (0.0, 0.0),
     ) -> ModulationPath:
-        """Points spread evenly in time over a circle, the first on the +x axis.
+        """Points evenly spaced in time on a circle or ellipse, by default from the +x axis on.
 
         Parameters
         ----------
-        radius
-            Radius in lambda/D; at 0 the image rests at ``centre``.
+        radius, centre
+            Radius and centre (x, y) in lambda/D. With radius 0 the path is the centre.
         points
             Number of points; :func:`n_points` of the radius by default.
-        ellipse
-            Relative difference of the two axes: the axes are ``radius (1 +- ellipse / 2)``.
-        ellipse_angle
-            Direction of the longer axis in radians.
+        ellipse, ellipse_angle
+            Relative difference of the axes, ``radius (1 +- ellipse / 2)``, and direction of the longer
+            axis in radians.
         phase
             Angle of the first point in radians.
-        centre
-            Centre (x, y) of the circle in lambda/D.
         """
         k = n_points(radius) if points is None else points
         if radius == 0:
@@ -96,25 +98,16 @@ class ModulationPath:
         return ModulationPath(np.stack([c * along - s * across, s * along + c * across], axis=1) + centre)
 
 
-#: An emulated stage: duration and places of its turn, and what tilt a place is.
+#: Reads duration and positions of an emulated stage's cycle; converts such positions to tilts.
 _CycleReader = Callable[[], tuple[float, NDArray[np.float64]] | None]
 _TiltConverter = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class BeamPath:
-    """State of the modulator and what the beam makes of it.
+    """Path of the simulated beam on the pyramid, commanded by the modulator or by an emulated stage.
 
-    Parameters
-    ----------
-    config
-        Gives the tilt per lambda/D and the hidden imperfections.
-    phase
-        Where in its drift the centre starts, radians, along x and y.
-
-    Attributes
-    ----------
-    modulation
-        What the modulator does; ``None`` when it is parked.
+    The true imperfections are those of ``twin.pyramid``; ``phase (2,)`` is the phase of the centre's drift
+    along x and y in radians. ``modulation`` is the commanded modulation, None when parked.
     """
 
     def __init__(self, config: SystemConfig, phase: NDArray[np.float64]) -> None:
@@ -123,40 +116,37 @@ class BeamPath:
         self._emulated: tuple[_CycleReader, _TiltConverter] | None = None
 
     def follow_stage(self, read_cycle: _CycleReader, to_tilt: _TiltConverter) -> None:
-        """From now on the beam goes where an emulated stage points, and ``modulation`` counts no more.
+        """Let an emulated stage move the beam from now on; ``modulation`` is ignored.
 
         Parameters
         ----------
-        turn
-            Duration of a turn in seconds and places over it ``(k, 2)``, ``None`` at rest; the same object
-            as long as nothing changes.
-        tilt
-            Makes tilts (x, y) in radians from its places.
+        read_cycle
+            Returns the duration of a cycle in seconds and positions over it ``(k, 2)``, or None at rest;
+            the same object until something changes.
+        to_tilt
+            Converts positions to tilts (x, y) in radians.
         """
         self._emulated = (read_cycle, to_tilt)
 
     @property
     def change_key(self) -> object:
-        """Another object whenever the circle has changed."""
+        """Object that is replaced whenever the path changes."""
         return self.modulation if self._emulated is None else self._emulated[0]()
 
     @property
     def cycle_period_s(self) -> float | None:
-        """Duration of a turn in seconds; ``None`` when parked."""
+        """Duration of a modulation cycle in seconds; None when parked."""
         if self._emulated is not None:
             cycle = self._emulated[0]()
             return None if cycle is None else cycle[0]
         return None if self.modulation is None else 1 / self.modulation.frequency_hz
 
     def points(self) -> ModulationPath:
-        """Points on the pyramid in lambda/D."""
+        """Modulation path of the beam in lambda/D, without the drift of its centre."""
         if self._emulated is not None:
             return self._points_of_emulated_stage(*self._emulated)
-        modulator, commanded, twin = (
-            self._config.devices.modulator,
-            self.modulation,
-            self._config.twin.pyramid,
-        )
+        modulator, commanded = self._config.devices.modulator, self.modulation
+        twin = self._config.twin.pyramid
         if commanded is None or modulator is None:
             return ModulationPath.circle(0.0)
         radius = commanded.radius_rad / modulator.rad_per_lambda_d
@@ -167,7 +157,7 @@ class BeamPath:
         return ModulationPath(circle + np.divide(commanded.centre_rad, modulator.rad_per_lambda_d))
 
     def _points_of_emulated_stage(self, read_cycle: _CycleReader, to_tilt: _TiltConverter) -> ModulationPath:
-        """As many points as a circle of that size gets, evenly spread over the turn."""
+        """Path of the stage, sampled evenly in time with as many points as a circle of its radius."""
         cycle, modulator = read_cycle(), self._config.devices.modulator
         if cycle is None or modulator is None:
             return ModulationPath.circle(0.0)
@@ -179,6 +169,6 @@ class BeamPath:
         return ModulationPath(np.stack([np.interp(at, grid, closed[:, axis]) for axis in (0, 1)], axis=1))
 
     def drift(self, time_s: float) -> NDArray[np.float64]:
-        """Where the circle's centre has wandered ``(2,)`` as (x, y) in lambda/D."""
+        """Drift ``(2,)`` of the modulation centre as (x, y) in lambda/D at a time."""
         twin = self._config.twin.pyramid
         return np.asarray(twin.drift * np.sin(2 * np.pi * time_s / twin.drift_time_s + self._phase))

@@ -1,4 +1,4 @@
-"""Sampled pupil of a system (obscuration, Gaussian beam, contamination) and actuator positions on it, from the configuration."""
+"""Sampled pupil of a system: obscuration, Gaussian beam, contamination."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from escape_hw.config.twin import TwinContamination
 
 
-#: Highest order of the smooth unevenness: waves across the pupil, or around its edge.
+#: Highest order of the smooth unevenness: waves across the pupil or around its edge.
 _MAX_WAVES = 5
 
 
@@ -30,20 +30,20 @@ def pupil_transmission(
     coordinates_m: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Share of the light that each sample of a soiled pupil still passes ``(n, n)``.
+    """Transmission ``(n, n)`` of a contaminated pupil.
 
-    The contaminated arc passes ``transmission``. The unevenness is a sum of a few waves with random
-    phases, none shorter than a fifth of the diameter; the radius of the pupil varies likewise around
-    its circumference, always inwards.
+    The contaminated arc transmits ``contamination.transmission``. The unevenness is a sum of random
+    waves, none shorter than a fifth of the diameter. The radius of the pupil varies likewise around its
+    circumference, always inwards.
 
     Parameters
     ----------
-    dirt
-        What lies on the pupil.
+    contamination
+        The settings ``twin.contamination``.
     diameter_m, coordinates_m
-        Diameter of the pupil, and coordinates of the samples along either axis ``(n,)``, in metres.
+        Pupil diameter, and coordinates ``(n,)`` of the samples along either axis, in metres.
     rng
-        Of the unevenness.
+        Source of randomness.
     """
     u = coordinates_m / (diameter_m / 2)
     x, y = np.meshgrid(u, u)
@@ -63,7 +63,7 @@ def pupil_transmission(
 def _random_smooth_map(
     rng: np.random.Generator, axes: tuple[NDArray[np.float64], ...]
 ) -> NDArray[np.float64]:
-    """A random smooth function of unit mean square; each axis is periodic over -1..1."""
+    """Draw a smooth function of unit mean square; each axis is periodic over -1..1."""
     total = np.zeros_like(axes[0])
     for _ in range(4 * _MAX_WAVES):
         waves = rng.integers(-_MAX_WAVES, _MAX_WAVES + 1, len(axes))
@@ -74,14 +74,14 @@ def _random_smooth_map(
     return np.asarray(total / np.sqrt(2 * _MAX_WAVES))
 
 
-#: Pupil samples across one lenslet: alias-free to +-4 lambda/d, several times the largest tilt.
+#: Pupil samples across a lenslet: alias-free to +-4 lambda/d, several times the largest tilt.
 PUPIL_SAMPLES = 8
-#: Pupil samples across one actuator pitch that a pyramid needs at least: a Gaussian influence function
-#: keeps less than a ten-thousandth of its amplitude beyond their highest frequency.
+#: Least pupil samples across an actuator pitch for a pyramid: beyond their Nyquist frequency a Gaussian
+#: influence function has less than a ten-thousandth of its amplitude.
 SAMPLES_PER_PITCH = 2.0
-#: Share of the design's light below which a pixel of the rim tells nothing of what dims it, ...
+#: Pixels of the rim with less than this share of the largest design flux do not measure transmission.
 _MIN_RIM_LIGHT = 0.4
-#: ... and the least share that a sample is left with: what the design lights counts as lit.
+#: Smallest transmission of a sample that the design illuminates; it stays lit.
 _MIN_TRANSMISSION = 1e-3
 
 
@@ -98,7 +98,7 @@ class PupilGeometry:
     coordinates_m
         Coordinates of the samples along either axis ``(n,)`` in metres, from the grid's centre.
     amplitude
-        Amplitude ``(n, n)`` of the beam inside the round pupil, 1 at its brightest.
+        Amplitude ``(n, n)`` of the beam inside the round pupil, 1 at its maximum.
     """
 
     n_sub: int
@@ -119,14 +119,9 @@ class PupilGeometry:
 
 
 def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeometry:
-    """The pupil that the configuration describes: round, lit by a Gaussian beam, partly obscured.
+    """Nominal pupil of a system: round, Gaussian illumination, with its obscuration.
 
-    Parameters
-    ----------
-    config
-        The system.
-    n_pix
-        Samples across a sub-aperture; as usual for the kind of sensor by default.
+    ``n_pix`` is the number of samples across a sub-aperture, by default :func:`default_samples`.
     """
     n_pix = n_pix or default_samples(config)
     n_sub, diameter = config.sensor.n_sub, config.system.pupil_m
@@ -136,16 +131,24 @@ def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeome
     r2 = x[:, None] ** 2 + x[None, :] ** 2
     amplitude = np.where(r2 <= (diameter / 2) ** 2, np.exp(-r2 / config.sensor.beam_radius_m**2), 0.0)
     if config.telescope.obscuration or config.telescope.spiders_deg:
-        # A sample that is covered in part keeps its share of the light, not of the amplitude.
+        # A partly covered sample keeps that share of the light, not of the amplitude.
         amplitude *= np.sqrt(transmitted_fraction(config.telescope, diameter, x))
     return PupilGeometry(n_sub, n_pix, d, x, amplitude.astype(np.float32))
 
 
-def pupil_from_images(config: SystemConfig, pupils: PyramidPupils) -> PupilGeometry:
-    """The pupil that a pyramid's images show.
+def nominal_flux(config: SystemConfig) -> NDArray[np.float64]:
+    """Flux ``(n_sub, n_sub)`` of the design's sub-apertures, 1 for a bright one."""
+    pupil = pupil_geometry(config)
+    n, p = pupil.n_sub, pupil.n_pix
+    flux = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
+    return np.asarray(flux / np.percentile(flux[flux > 0], 95))
 
-    On a telescope it is lit as they say, for what lies on its mirrors dims parts of it; a bench's beam
-    is taken for the design's.
+
+def pupil_from_images(config: SystemConfig, pupils: PyramidPupils) -> PupilGeometry:
+    """Pupil with the illumination of measured pyramid images.
+
+    On a telescope the images' flux sets the illumination, which contamination changes; on a bench it
+    is the design's.
 
     Raises
     ------
@@ -155,22 +158,23 @@ def pupil_from_images(config: SystemConfig, pupils: PyramidPupils) -> PupilGeome
     pupil = pupil_geometry(config)
     if pupils.valid.shape != (pupil.n_sub, pupil.n_sub):
         raise CalibrationError(
-            f"the pupil images have {pupils.valid.shape} pixels; sensor.n_sub is {pupil.n_sub}"
+            f"the pupil images have {pupils.valid.shape} pixels; sensor.n_sub is {pupil.n_sub}; "
+            "calibrate the pupil images again or correct sensor.n_sub"
         )
     return apply_measured_illumination(pupil, pupils) if config.telescope.obscuration else pupil
 
 
 def apply_measured_illumination(pupil: PupilGeometry, pupils: PyramidPupils) -> PupilGeometry:
-    """A pupil, brightened or dimmed by the light of its images relative to the design's."""
+    """Multiply a pupil's illumination by the ratio of measured to nominal flux of its images."""
     n, p = pupil.n_sub, pupil.n_pix
     design = ndimage.gaussian_filter(np.square(pupil.amplitude, dtype=float), RIM_SOFTNESS * p)
-    # Boxes lie a fraction of a pixel beside their images.
+    # The boxes are aligned to pixels, the images are not.
     offset_px = pupils.corners_px + (n - 1) / 2 - pupils.centres_px
     shifted = [ndimage.shift(design, (-y * p, -x * p), order=1) for x, y in offset_px]
     expected = np.mean(shifted, axis=0).reshape(n, p, n, p).sum(axis=(1, 3))
     usable = expected > _MIN_RIM_LIGHT * expected.max()
     share = np.where(usable, pupils.flux / np.where(usable, expected, 1.0), 0.0)
-    # Beyond the last pixel that tells, the nearest one does.
+    # Extrapolate from the nearest usable pixel.
     share = share[tuple(ndimage.distance_transform_edt(~usable, return_indices=True)[1])]
     sample_px = (np.arange(n * p) + 0.5) / p - 0.5
     x, y = offset_px.mean(axis=0)
@@ -183,28 +187,19 @@ def apply_measured_illumination(pupil: PupilGeometry, pupils: PyramidPupils) -> 
 
 
 def default_samples(config: SystemConfig) -> int:
-    """Pupil samples across a sub-aperture: as many as the mirror or the lenslets ask for.
+    """Pupil samples across a sub-aperture.
 
-    A pyramid's sub-aperture is a pixel of the pupil image, which may be wider than an actuator pitch.
+    For a pyramid, whose sub-aperture (a pixel of the pupil image) may be wider than an actuator pitch,
+    as many as the mirror's pitch requires.
     """
     if config.sensor.kind != "pyramid":
         return PUPIL_SAMPLES
-    least = SAMPLES_PER_PITCH * config.devices.dm.pitches_across_pupil / config.sensor.n_sub
-    return max(1, math.ceil(least))
+    required = SAMPLES_PER_PITCH * config.devices.dm.pitches_across_pupil / config.sensor.n_sub
+    return max(1, math.ceil(required))
 
 
 def contaminated_pupil(config: SystemConfig, rng: np.random.Generator) -> PupilGeometry:
-    """The pupil of the twin, with whatever ``twin.contamination`` puts on it."""
+    """True pupil of the twin, with ``twin.contamination``."""
     pupil, contamination = pupil_geometry(config), config.twin.contamination
     share = pupil_transmission(contamination, config.system.pupil_m, pupil.coordinates_m, rng)
     return replace(pupil, amplitude=(pupil.amplitude * np.sqrt(share)).astype(np.float32))
-
-
-def actuator_positions(config: SystemConfig) -> NDArray[np.float64]:
-    """Actuator positions ``(n_act, 2)`` as (x, y) in metres on the pupil."""
-    return config.devices.dm.positions() * pitch_on_pupil(config)
-
-
-def pitch_on_pupil(config: SystemConfig) -> float:
-    """Actuator pitch in metres, as relayed onto the pupil."""
-    return config.system.pupil_m / config.devices.dm.pitches_across_pupil

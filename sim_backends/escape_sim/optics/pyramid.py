@@ -1,4 +1,7 @@
-"""Modulated diffractive pyramid sensor: the prism, propagation by Fourier transforms or by separable matrix products, four pupil images on a camera."""
+"""Modulated diffractive pyramid sensor: prism, propagation, and four pupil images on a camera.
+
+The light is propagated by Fourier transforms or by separable matrix products.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +21,26 @@ from escape_sim.optics.shack_hartmann import pupil_field
 
 @dataclass(frozen=True, eq=False)
 class Prism:
-    """Four planes that meet in an edge each, and in one point unless there is a roof.
+    """Four planes that meet in edges and in one point, or in a ridge (rooftop).
 
-    A face tilts the light that falls on it and so moves its image of the pupil; the tilt is the
-    gradient of the face. The glass is the uppermost of the four planes everywhere (as in OOPAO's
-    ``Pyramid.get_phase_mask``), so faces of unequal tilt meet along edges that are not quite square.
+    A face tilts the light on it and so shifts its image of the pupil; the tilt is the gradient of the
+    face. The surface is the highest of the four planes everywhere, as in OOPAO's
+    ``Pyramid.get_phase_mask``, so faces of unequal tilt meet along edges that are not quite square.
 
     Parameters
     ----------
     shifts
         Shift ``(4, 2)`` as (x, y) of each image in pupil samples: upper left, upper right, lower
         left, lower right.
-    rooftop
-        Length of the ridge that stands in place of the apex, in samples of ``1 / D`` spatial
-        frequency (lambda/D), for a pupil of ``diameter`` samples; negative for the other diagonal.
     diameter
         Pupil diameter in samples.
+    rooftop
+        Length in lambda/D of the ridge that replaces the apex; negative for the other diagonal.
+
+    Raises
+    ------
+    ValueError
+        The shifts are not four finite points in this order.
     """
 
     shifts: NDArray[np.float64]
@@ -43,11 +50,11 @@ class Prism:
     def __post_init__(self) -> None:
         shifts = np.array(self.shifts, dtype=float)
         if shifts.shape != (4, 2) or not np.isfinite(shifts).all():
-            raise ValueError(f"the images of a pyramid are four points (x, y); these are {shifts.shape}")
+            raise ValueError(f"image shifts have shape {shifts.shape}; they must be finite and (4, 2)")
         ul, ur, ll, lr = shifts
         if not (max(ul[0], ll[0]) < min(ur[0], lr[0]) and max(ul[1], ur[1]) < min(ll[1], lr[1])):
             raise ValueError(
-                "the four images must come in the order upper left, upper right, lower left, lower right"
+                "the four images must be in the order upper left, upper right, lower left, lower right"
             )
         object.__setattr__(self, "shifts", shifts)
 
@@ -59,10 +66,9 @@ class Prism:
         return np.asarray(np.exp(-1j * planes.max(axis=0)))
 
     def half_distances(self, centre: float) -> tuple[float, float] | None:
-        """Half the distances of images that stand on a rectangle around a shift of ``centre``.
+        """Half the distances (x, y) of images on a rectangle around a shift of ``centre``; else None.
 
-        None if they do not. Only then is the transmission a product of a factor along x and one
-        along y, both the same to either side.
+        Only for a rectangle is the transmission a product of symmetric factors along x and y.
         """
         signs = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
         half = (self.shifts - centre)[3]
@@ -80,11 +86,11 @@ class Prism:
 
 
 def frequencies(n_grid: int) -> NDArray[np.float64]:
-    """Spatial frequencies of the focal plane in cycles per sample: the apex lies between four of them."""
+    """Spatial frequencies of the focal plane in cycles per sample; the apex is between four of them."""
     return (np.arange(n_grid) - (n_grid - 1) / 2) / n_grid
 
 
-# One row at a time in a name of its own: only then does the compiler turn the loops into vectors.
+# The loops over rows use local names, without which the compiler does not vectorise them.
 @njit(cache=True, fastmath=True, nogil=True)
 def _tilt(field, tilt_y, tilt_x, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """``out[:, :n] = tilt_y[:, None] field tilt_x``."""
@@ -104,33 +110,23 @@ def _add_power(field, power):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 
 class FourierKernel:
-    """Power of a field behind the prism, summed over modulation points, on a periodic grid.
+    """Power of a field behind the prism, summed over modulation points, by Fourier transforms.
 
-    Not for two threads at a time: each needs a kernel of its own.
-
-    Parameters
-    ----------
-    prism
-        The faces.
-    n
-        Pupil samples across the field.
-    n_grid
-        Side of the grid, even. Light that leaves it on one side comes in on the other.
-    rows
-        Number of output rows wanted, from row 0 on.
+    ``n`` is the number of pupil samples across the field, ``n_grid`` the even side of the periodic grid,
+    ``rows`` the number of output rows wanted from row 0 on. Not thread-safe: use one kernel per thread.
     """
 
     def __init__(self, prism: Prism, n: int, n_grid: int, rows: int) -> None:
         self.shape = (rows, n_grid)
         self._n = n
-        # Half-integer frequencies, and the scale of the inverse transform, ride on the tilts.
+        # The tilts include the half-integer frequencies and the scale of the inverse transform.
         self._carrier = np.exp(-2j * np.pi * frequencies(n_grid)[0] * np.arange(n)) / n_grid
         self._filter = FourierFilter(prism.mask(n_grid), n, rows)
 
-    def tilts(self, turns: NDArray[np.float64]) -> NDArray[np.complex64]:
-        """Factors ``(k, n)`` for tilts of so many turns of phase per sample ``(k,)``."""
+    def tilts(self, cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
+        """Factors ``(k, n)`` for tilts in cycles of phase per sample ``(k,)``."""
         samples = np.arange(self._n) - (self._n - 1) / 2
-        return np.asarray(self._carrier * np.exp(2j * np.pi * np.outer(turns, samples)), np.complex64)
+        return np.asarray(self._carrier * np.exp(2j * np.pi * np.outer(cycles, samples)), np.complex64)
 
     def add(
         self,
@@ -139,7 +135,7 @@ class FourierKernel:
         tilts_y: NDArray[np.complex64],
         power: NDArray[np.float32],
     ) -> None:
-        """Add the power of ``field (n, n)`` under each tilt to ``power`` (of ``shape``)."""
+        """Add the power of ``field (n, n)`` under each tilt to ``power``, of shape ``self.shape``."""
         for tilt_x, tilt_y in zip(tilts_x, tilts_y, strict=True):
             _tilt(field, tilt_y, tilt_x, self._filter.field)
             self._filter.run()
@@ -150,8 +146,8 @@ class FourierKernel:
 def _fold_parity(field, tilt_y, tilt_x, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Parts of the tilted field that are even and odd along y and x: ``out (2, 2h, h)``.
 
-    The first axis is the parity along x; the rows are the even part along y, then the odd one. Both
-    tilts are those of the second half of the samples; those of the first half are their conjugates.
+    The first axis is the parity along x; the rows are the even part along y, then the odd part. The
+    tilts are given for the second half of the samples; those of the first half are their conjugates.
     """
     h = tilt_x.size
     for i in range(h):
@@ -159,9 +155,9 @@ def _fold_parity(field, tilt_y, tilt_x, out):  # type: ignore[no-untyped-def]  #
         ee, eo, oe, oo = out[0, i], out[0, h + i], out[1, i], out[1, h + i]
         for j in range(h):
             u = tilt_x[j]
-            turn, back = t * u, t * u.conjugate()
-            a, b = lower[h + j] * turn, upper[h - 1 - j] * turn.conjugate()
-            c, d = lower[h - 1 - j] * back, upper[h + j] * back.conjugate()
+            tilt, across = t * u, t * u.conjugate()
+            a, b = lower[h + j] * tilt, upper[h - 1 - j] * tilt.conjugate()
+            c, d = lower[h - 1 - j] * across, upper[h + j] * across.conjugate()
             ee[j] = (a + c) + (b + d)
             eo[j] = (a + c) - (b + d)
             oe[j] = (a - c) - (b - d)
@@ -170,9 +166,9 @@ def _fold_parity(field, tilt_y, tilt_x, out):  # type: ignore[no-untyped-def]  #
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _add_unfolded_power(parts, power):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add the power of even plus odd parts ``(2, H, 2H)`` to all four quarters of ``power (2H, 2H)``.
+    """Add the power of even plus odd parts ``(2, H, 2H)`` to all quadrants of ``power (2H, 2H)``.
 
-    The first axis is the parity along y; the columns are the even part along x, then the odd one.
+    The first axis is the parity along y; the columns are the even part along x, then the odd part.
     """
     half = parts.shape[1]
     for i in range(half):
@@ -191,9 +187,8 @@ def _add_unfolded_power(parts, power):  # type: ignore[no-untyped-def]  # pragma
 def image_matrix(n: int, n_grid: int, shift: float) -> NDArray[np.complex128]:
     """Matrix ``(n_grid, n)`` from pupil samples to the images ``+-shift`` samples away, along one axis.
 
-    It is zero padding, Fourier transform, the factor ``exp(-2 i pi shift |k|)`` and inverse
-    transform in one: ``sum_k exp(2 i pi k (u - p) - 2 i pi shift |k|) / n_grid``, with ``u`` and
-    ``p`` counted from the middle.
+    Zero padding, Fourier transform, the factor ``exp(-2 i pi shift |k|)`` and inverse transform in one:
+    ``sum_k exp(2 i pi k (u - p) - 2 i pi shift |k|) / n_grid``, with ``u`` and ``p`` from the centre.
     """
     k = frequencies(n_grid)
     u = np.arange(n_grid) - (n_grid - 1) / 2
@@ -203,8 +198,7 @@ def image_matrix(n: int, n_grid: int, shift: float) -> NDArray[np.complex128]:
 
 
 def _symmetric_halves(matrix: NDArray[np.complex128]) -> NDArray[np.complex64]:
-    """What an even and an odd input see of :func:`image_matrix`: ``(2, n_grid / 2, n / 2)``."""
-    # The matrix is the same read from both ends, so half of it says all.
+    """Action of the symmetric :func:`image_matrix` on even and odd inputs: ``(2, n_grid / 2, n / 2)``."""
     rows, columns = matrix.shape[0] // 2, matrix.shape[1] // 2
     same_side, opposite_side = matrix[rows:, columns:], matrix[rows:, columns - 1 :: -1]
     return np.stack([same_side + opposite_side, same_side - opposite_side]).astype(np.complex64)
@@ -213,20 +207,12 @@ def _symmetric_halves(matrix: NDArray[np.complex128]) -> NDArray[np.complex64]:
 class SeparableKernel:
     """Power of a field behind the prism, summed over modulation points, by matrix products.
 
-    With the images on a rectangle the transmission is ``m(x) m(y)``, and everything from the pupil
-    to the camera is ``A field B^T``. Both matrices are the same from either end, so even and odd
-    parts of the field stay apart and each product needs half the work.
+    With the images on a rectangle the transmission is ``m(x) m(y)`` and the propagation is
+    ``A field B^T``. Both matrices are symmetric under reversal, so even and odd parts of the field
+    are propagated separately with half the work. Not thread-safe: use one kernel per thread.
 
-    Not for two threads at a time: each needs a kernel of its own.
-
-    Parameters
-    ----------
-    shift_x, shift_y
-        Half the distance of the images along x and y in samples.
-    n
-        Pupil samples across the field, even.
-    n_grid
-        Side of the grid, even; the images stand around its middle.
+    ``shift_x`` and ``shift_y`` are half the distances of the images in samples; ``n`` and ``n_grid``, the
+    pupil samples and the grid around whose centre the images are, are even.
     """
 
     def __init__(self, shift_x: float, shift_y: float, n: int, n_grid: int) -> None:
@@ -236,17 +222,17 @@ class SeparableKernel:
         self._along_x = np.ascontiguousarray(
             _symmetric_halves(image_matrix(n, n_grid, shift_x)).transpose(0, 2, 1)
         )
-        # The four sums of a fold each count a sample four times over.
+        # The four sums of a fold each count a sample four times.
         self._along_y = _symmetric_halves(image_matrix(n, n_grid, shift_y)) / np.complex64(4)
         self._folded = np.empty((2, n, h), np.complex64)
         self._half = np.empty((2, n, half), np.complex64)
         self._rows = np.empty((2, h, n_grid), np.complex64)
         self._parts = np.empty((2, half, n_grid), np.complex64)
 
-    def tilts(self, turns: NDArray[np.float64]) -> NDArray[np.complex64]:
-        """Factors ``(k, n / 2)`` for tilts of so many turns of phase per sample ``(k,)``."""
+    def tilts(self, cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
+        """Factors ``(k, n / 2)`` for tilts in cycles of phase per sample ``(k,)``."""
         samples = np.arange(self._n // 2) + 0.5
-        return np.asarray(np.exp(2j * np.pi * np.outer(turns, samples)), np.complex64)
+        return np.asarray(np.exp(2j * np.pi * np.outer(cycles, samples)), np.complex64)
 
     def add(
         self,
@@ -255,7 +241,7 @@ class SeparableKernel:
         tilts_y: NDArray[np.complex64],
         power: NDArray[np.float32],
     ) -> None:
-        """Add the power of ``field (n, n)`` under each tilt to ``power`` (of ``shape``)."""
+        """Add the power of ``field (n, n)`` under each tilt to ``power``, of shape ``self.shape``."""
         half = self.shape[0] // 2
         h = self._n // 2
         for tilt_x, tilt_y in zip(tilts_x, tilts_y, strict=True):
@@ -267,8 +253,7 @@ class SeparableKernel:
             _add_unfolded_power(self._parts, power)
 
 
-#: Threads that share the modulation points of a frame. Fixed, so that sums are rounded alike on
-#: every machine.
+#: Threads that share the modulation points of a frame; fixed, so that rounding is the same everywhere.
 WORKERS = 2
 
 Method = Literal["auto", "separable", "fourier"]
@@ -277,25 +262,25 @@ Method = Literal["auto", "separable", "fourier"]
 class PyramidOptics:
     """Pyramid sensor: four images of the pupil on one camera.
 
-    A pupil sample is a camera pixel, or a whole fraction of one. A positive slope of the optical
-    path along x moves the image to +x on the pyramid, and that light goes to the right-hand images.
-    The images are not mirrored. Conventions as OOPAO's ``Pyramid``, except that a tilt of one
-    lambda/D is one wave across the pupil's diameter; OOPAO's is one between the centres of the
-    outermost samples. Not for two threads at a time, though it uses two itself.
+    A camera pixel is one pupil sample, or a whole number of them. A positive slope of the optical path
+    along x moves the image to +x on the pyramid, whose light goes to the right-hand images. The images
+    are not mirrored. Conventions as in OOPAO's ``Pyramid``, except that a tilt of one lambda/D is one
+    wave across the pupil's diameter; OOPAO's is one wave between the centres of the outermost samples.
+    Not thread-safe, although it uses two threads.
 
     Parameters
     ----------
     amplitude
         Pupil amplitude ``(n, n)``, ``n`` even.
     diameter_px
-        Diameter of a pupil image in camera pixels, that of lambda/D.
+        Diameter of a pupil image in camera pixels, which defines lambda/D.
     wavelength_m
         Wavelength in metres.
     centres_px
         Centres ``(4, 2)`` as (x, y) of the pupil images on the region in camera pixels: upper left,
         upper right, lower left, lower right.
     shape
-        Camera region (rows, columns). Light that falls beside it is lost.
+        Camera region (rows, columns). Light outside it is lost.
     modulation
         Path of the image over the pyramid.
     rooftop
@@ -303,16 +288,15 @@ class PyramidOptics:
     samples
         Pupil samples across a camera pixel.
     grid_px
-        Side in camera pixels of the periodic square that the light is followed on; by default the
-        next good length for the region.
+        Side of the periodic grid in camera pixels; by default the next fast length for the region.
     method
-        Matrix products (``separable``, for images on a rectangle only) or Fourier transforms; the
-        faster one by default. Both give the same frames to single precision.
+        ``separable`` (matrix products, for images on a rectangle only) or ``fourier``; the faster one
+        by default. Both give the same frames in single precision.
 
     Raises
     ------
     ValueError
-        The geometry does not fit together.
+        Amplitude, samples, grid or images are inconsistent.
     """
 
     def __init__(
@@ -333,14 +317,14 @@ class PyramidOptics:
         if amplitude.shape != (n, n) or n % 2:
             raise ValueError(f"amplitude has shape {amplitude.shape}; it must be square, of even side")
         if samples < 1 or not diameter_px > 0:
-            raise ValueError(f"{samples} samples per pixel over {diameter_px} pixels; both must be positive")
+            raise ValueError(f"{samples} samples per pixel, {diameter_px} pixels; both must be positive")
         self.shape = shape
         self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
         self._diameter, self.wavelength_m = diameter_px * samples, wavelength_m
         grid = next_fast_length(max(shape), samples) if grid_px is None else grid_px
         if grid * samples < n or grid * samples % 2:
             raise ValueError(
-                f"a grid of {grid} pixels has {grid * samples} samples; it needs {n} or more, evenly"
+                f"a grid of {grid} pixels has {grid * samples} samples; it must have {n} or more, even"
             )
         self._region_on_camera = GridRegion(np.asarray(centres_px, dtype=float), shape, grid, samples)
         self.prism = Prism(self._region_on_camera.shifts(n), self._diameter, rooftop)
@@ -366,36 +350,23 @@ class PyramidOptics:
 
     @property
     def method(self) -> Method:
-        """How the light is computed."""
+        """Method in use, ``separable`` or ``fourier``."""
         return "separable" if isinstance(self._kernels[0], SeparableKernel) else "fourier"
 
     def frame(
         self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """Intensity on the camera, averaged over the modulation.
+        """Add the mean intensity ``(rows, columns)`` to ``image``, a new array by default, and return it.
 
-        Parameters
-        ----------
-        opd_m
-            Optical path difference ``(n, n)`` in metres.
-        image
-            Where to put the result; added to, so clear it first. A new array by default.
-
-        Returns
-        -------
-        ndarray of float32, ``(rows, columns)``
-            Sums (but for light beside the region) to the sum of ``amplitude ** 2``.
+        ``opd_m (n, n)`` is the optical path difference in metres. The intensity sums to the sum of
+        ``amplitude ** 2``, except for light outside the region.
         """
         if opd_m.shape != self.amplitude.shape:
             raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
         out = np.zeros(self.shape, np.float32) if image is None else image
         opd = np.ascontiguousarray(opd_m, dtype=np.float32)
-        pupil_field(
-            opd.ravel(),
-            1 / self.wavelength_m,
-            self.amplitude.ravel(),
-            self._field.view(np.float32).reshape(-1, 2),
-        )
+        field = self._field.view(np.float32).reshape(-1, 2)
+        pupil_field(opd.ravel(), 1 / self.wavelength_m, self.amplitude.ravel(), field)
         if self._executor is None:
             for k in range(WORKERS):
                 self._propagate_share(k)
@@ -409,7 +380,7 @@ class PyramidOptics:
         return out
 
     def _propagate_share(self, worker: int) -> None:
-        """Power of one worker's modulation points."""
+        """Compute the power of one worker's modulation points."""
         power = self._power[worker]
         power.fill(0)
         self._kernels[worker].add(self._field, *self._tilts[worker], power)
@@ -418,7 +389,7 @@ class PyramidOptics:
         half_distances = self.prism.half_distances((n_grid - n) / 2)
         if method == "separable" and half_distances is None:
             raise ValueError(
-                "the images do not stand on a rectangle around the grid's middle; use method 'fourier'"
+                "the images are not on a rectangle around the grid's centre; use method 'fourier'"
             )
         if half_distances is not None and (
             method == "separable" or (method == "auto" and _matrix_product_is_faster(n, n_grid))
@@ -429,24 +400,15 @@ class PyramidOptics:
 
 
 class GridRegion:
-    """Where a square of samples lies on the camera region.
+    """Position on a camera region ``shape`` of a square grid around pupil images ``centres_px (4, 2)``.
 
-    Parameters
-    ----------
-    centres_px
-        Centres ``(4, 2)`` of the pupil images on the region.
-    shape
-        Region (rows, columns).
-    grid
-        Side of the square in camera pixels.
-    samples
-        Samples across a camera pixel.
+    The square has ``grid`` camera pixels with ``samples`` samples across each.
     """
 
     def __init__(
         self, centres_px: NDArray[np.float64], shape: tuple[int, int], grid: int, samples: int
     ) -> None:
-        # The square stands around the images, and covers the region if it is large enough.
+        # The square is centred on the images, shifted to cover the region if it is large enough.
         first = np.round(centres_px.mean(axis=0) + 0.5 - grid / 2).astype(int)
         for axis, length in enumerate(shape[::-1]):
             if grid >= length:
@@ -463,12 +425,12 @@ class GridRegion:
         self.rows = int(self._part[0].stop)
 
     def shifts(self, n: int) -> NDArray[np.float64]:
-        """Shift ``(4, 2)`` in samples from a pupil of ``n`` samples at the square's corner to its images."""
-        middles = (self._centres - self.first + 0.5) * self._samples - 0.5
-        return np.asarray(middles - (n - 1) / 2)
+        """Shift ``(4, 2)`` in samples of the images from a pupil of ``n`` samples in the grid's corner."""
+        centres = (self._centres - self.first + 0.5) * self._samples - 0.5
+        return np.asarray(centres - (n - 1) / 2)
 
     def add(self, power: NDArray[np.floating], image: NDArray[np.floating]) -> None:
-        """Add the part of ``power`` that lies on the region to ``image``, samples summed to pixels."""
+        """Add the part of ``power`` on the region to ``image``, samples summed to pixels."""
         part, s = power[self._part], self._samples
         if s > 1:
             rows, columns = part.shape
@@ -477,10 +439,10 @@ class GridRegion:
 
 
 def _matrix_product_is_faster(n: int, n_grid: int) -> bool:
-    """Whether matrix products beat transforms, by the operations of both and their measured rates.
+    """Whether matrix products are faster than transforms, from operation counts and measured rates.
 
-    Products run at 85 Gflop/s and fold in 20 us; transforms run at 40 Gflop/s, or 17 where the length
-    does not suit them, and need 0.8 ns for each sample of the grid in between.
+    Products run at 85 Gflop/s plus 20 us for folding; transforms at 40 Gflop/s, or 17 for slow lengths,
+    plus 0.8 ns per sample of the grid.
     """
     products = 4 * (n * n * n_grid + n * n_grid**2) / 85e9 + 20e-6
     rate = 40e9 if is_fast_length(n_grid) else 17e9

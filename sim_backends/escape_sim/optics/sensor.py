@@ -19,24 +19,23 @@ if TYPE_CHECKING:
 
 
 class SensorOptics(Protocol):
-    """Optics of a wavefront sensor: optical path in metres to relative intensity."""
+    """Optics of a wavefront sensor: from optical path in metres to relative intensity."""
 
     def frame(
         self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
         """Add the intensity to ``image`` and return it."""
-        ...
 
 
 @runtime_checkable
 class ModulatedOptics(SensorOptics, Protocol):
-    """Optics of a pyramid: the beam's points on it may be changed at any time."""
+    """Optics of a pyramid, whose modulation path may be set between frames."""
 
     modulation: ModulationPath
 
 
 def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOptics:
-    """The twin's sensor as it really stands, which the design does not know exactly."""
+    """Build the true optics of the twin's sensor, which differ from the design as ``twin`` says."""
     amplitude = pupil.amplitude / np.sqrt(np.sum(np.square(pupil.amplitude, dtype=float)))
     if isinstance(config.sensor, PyramidSection):
         return make_pyramid(config, config.sensor, pupil, amplitude.astype(np.float32))
@@ -46,10 +45,10 @@ def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOpti
 def make_pyramid(
     config: SystemConfig, sensor: PyramidSection, pupil: PupilGeometry, amplitude: NDArray[np.float32]
 ) -> PyramidOptics | OOPAOPyramid:
-    """A pyramid with its images where they really fall, not modulated yet."""
+    """Build a pyramid without modulation, with its images at their true positions."""
     optics_class: type[PyramidOptics | OOPAOPyramid] = PyramidOptics
     if config.system.optics == "oopao":
-        # Imported here: OOPAO loads for two seconds and 1,600 modules.
+        # Imported here: OOPAO takes two seconds and 1,600 modules to load.
         from escape_sim.oopao.optics import OOPAOPyramid
 
         optics_class = OOPAOPyramid
@@ -81,7 +80,6 @@ def _make_lenslets(
         n_sub, pupil.n_pix, c.system.wavelength_m, pitch, sensor.spot_px, origin, (height, width), amplitude,
     )  # fmt: skip
     if c.system.optics == "oopao":
-        # Imported here: OOPAO loads for two seconds and 1,600 modules.
         from escape_sim.oopao.optics import OOPAOShackHartmann
 
         return OOPAOShackHartmann(*geometry)

@@ -8,8 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-# Taylor coefficients of sin(x) and cos(x) for |x| <= pi/2: error below 6e-8, the precision of
-# single-precision arithmetic itself.
+# Taylor coefficients of sin(x) and cos(x) for |x| <= pi/2; the error of 6e-8 is that of float32.
 _S3, _S5, _S7, _S9, _S11 = (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
 _C2, _C4, _C6, _C8, _C10, _C12 = (-1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600)
 _F = np.float32
@@ -48,7 +47,7 @@ def _add_intensities(spots, lit, y0, x0, image):  # type: ignore[no-untyped-def]
 
 
 def field_pixels(n_pix: int, spot_px: float) -> int:
-    """Pixels rendered per lenslet: one alias period of its samples, so that no light counts twice."""
+    """Pixels rendered per lenslet: one alias period of its samples, so that no light is counted twice."""
     return int(n_pix * spot_px)
 
 
@@ -60,29 +59,25 @@ def first_pixels(centres_px: NDArray[np.floating], field: int) -> NDArray[np.int
 def lenslet_transform(
     centres_px: NDArray[np.floating], first_px: NDArray[np.intp], n_pix: int, field: int, spot_px: float
 ) -> NDArray[np.complex128]:
-    """Fourier matrices from the pupil samples of a lenslet to its camera pixels, along one axis.
+    """Fourier matrices from the pupil samples of lenslets to camera pixels, along one axis.
 
     Parameters
     ----------
-    centres_px
-        Lenslet centres along the axis in camera pixels ``(n_sub,)``.
-    first_px
-        First pixel rendered for each lenslet ``(n_sub,)``.
-    n_pix
-        Pupil samples across a lenslet.
-    field
-        Pixels rendered per lenslet.
+    centres_px, first_px
+        Centre of each lenslet, and first pixel rendered for it, in camera pixels ``(n_sub,)``.
+    n_pix, field
+        Pupil samples across a lenslet, and pixels rendered per lenslet.
     spot_px
         lambda/d in camera pixels.
 
     Returns
     -------
     ndarray of complex, ``(n_sub, n_pix, field)``
-        Scaled so that a whole alias period of the image holds the power of the pupil.
+        Normalised so that a whole alias period of the image contains the power of the pupil.
     """
     pixels = first_px[:, None] + np.arange(field)[None, :] - centres_px[:, None]
     samples = (np.arange(n_pix) - (n_pix - 1) / 2) / n_pix
-    # The minus sign makes a positive slope of the path move the spot to higher pixels, as in OOPAO.
+    # With the minus sign a positive slope of the path moves the spot to higher pixels, as in OOPAO.
     phase = -2j * np.pi * samples[None, :, None] * pixels[:, None, :] / spot_px
     return np.asarray(np.exp(phase) / np.sqrt(n_pix * spot_px), dtype=np.complex128)
 
@@ -90,27 +85,28 @@ def lenslet_transform(
 class ShackHartmannOptics:
     """Shack-Hartmann sensor on a camera whose pixels need not match the lenslets.
 
-    Every lenslet forms its own image on the ``field`` pixels around it; images of neighbours add
-    as intensities. A positive slope of the optical path along x moves spots to higher columns.
+    Every lenslet forms an image on the ``field`` pixels around it; images of neighbours add as
+    intensities. A positive slope of the optical path along x moves spots to higher columns.
 
     Parameters
     ----------
-    n_sub
-        Lenslets across the grid.
-    n_pix
-        Pupil samples across a lenslet.
+    n_sub, n_pix
+        Lenslets across the grid, and pupil samples across a lenslet.
     wavelength_m
         Wavelength in metres.
-    pitch_px
-        Lenslet pitch in camera pixels.
-    spot_px
-        lambda/d in camera pixels.
+    pitch_px, spot_px
+        Lenslet pitch and lambda/d in camera pixels.
     origin_px
         Centre (x, y) of lenslet (0, 0) in pixels.
     shape
         Camera region (rows, columns).
     amplitude
         Pupil amplitude ``(n_sub * n_pix, n_sub * n_pix)``; lenslets without light are skipped.
+
+    Raises
+    ------
+    ValueError
+        The amplitude has another shape, or a lit lenslet is outside the region.
     """
 
     def __init__(
@@ -161,19 +157,10 @@ class ShackHartmannOptics:
     def frame(
         self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """Intensity on the camera.
+        """Add the intensity ``(rows, columns)`` to ``image``, a new array by default, and return it.
 
-        Parameters
-        ----------
-        opd_m
-            Optical path difference ``(n, n)`` in metres.
-        image
-            Where to put the result; added to, so clear it first. A new array by default.
-
-        Returns
-        -------
-        ndarray of float32, ``(rows, columns)``
-            Sums (but for light beyond the field of a lenslet) to the sum of ``amplitude ** 2``.
+        ``opd_m (n, n)`` is the optical path difference in metres. The intensity sums to the sum of
+        ``amplitude ** 2``, except for light outside the field of a lenslet.
         """
         out = np.zeros(self.shape, np.float32) if image is None else image
         opd = np.ascontiguousarray(opd_m, dtype=np.float32)
@@ -181,7 +168,7 @@ class ShackHartmannOptics:
         pupil_field(
             opd.ravel(), self._per_wave, self.amplitude.ravel(), self._field.view(np.float32).reshape(-1, 2)
         )
-        # Columns first, one product per lenslet column; then rows, one product per lenslet row.
+        # One product per lenslet column, then one per lenslet row.
         columns = self._field.reshape(n, k, p).transpose(1, 0, 2)
         np.matmul(columns, self._along_x, out=self._half.transpose(1, 0, 2))
         np.matmul(self._along_y, self._half.reshape(k, p, k * f), out=self._spots)

@@ -1,11 +1,11 @@
-"""A simulated bench that the stand-ins of vendor libraries talk to: real drivers close the loop on it.
+"""Server that connects the stand-ins of vendor libraries to a simulated bench, for loops with real drivers.
 
-A driver's process loads a stand-in, which connects to this server over a local socket: shapes go in, frames
-come out, one request and one reply at a time. Time is the twin's: it advances when a frame is asked for, as
-it does for the twin's own devices, however long a driver takes.
+A driver loads a stand-in, which connects to this server over a local socket and sends shapes and fetches
+frames, one request and one reply at a time. The simulated time advances when a frame is requested, as for
+the simulated devices, however long a driver takes.
 
-Request: verb and length (two uint32), then so many bytes. Reply: status (0 good, 1 nothing in time, 2
-refused) and length (two int32), then so many bytes. All in the machine's own byte order.
+Request: kind and length (two uint32), then the payload. Reply: status (0 success, 1 time-out, 2 refused) and
+length (two int32), then the payload. All in native byte order.
 """
 
 from __future__ import annotations
@@ -42,25 +42,25 @@ log = logging.getLogger(__name__)
 _REQUEST_HEAD, _REPLY_HEAD = struct.Struct("=II"), struct.Struct("=ii")
 _START, _FRAME, _FRAME_HEAD = struct.Struct("=4I3d"), struct.Struct("=d"), struct.Struct("=qq")
 _OK, _TIMEOUT, _REFUSED = 0, 1, 2
-#: Larger requests than any shape are nonsense.
+#: Limit for requests, larger than any shape.
 _MAX_REQUEST_BYTES = 1 << 20
-#: A wait that only asks whether a frame is there; the twin's clock hardly moves.
+#: Time-out in seconds of a poll for a frame, too short to advance the simulated time noticeably.
 _POLL_S = 1e-6
-#: Environment variable that names each stand-in's library to its driver.
+#: Environment variable by which a driver finds the library of each stand-in.
 VARIABLES = {
     "asdk": "ESCAPE_ALPAO_LIBRARY",
     "m3api": "ESCAPE_XIMEA_LIBRARY",
     "aravis": "ESCAPE_ARAVIS_LIBRARY",
 }
 _SOCKET_VARIABLE = "ESCAPE_STAND_IN_BENCH"
-#: Environment variable that leads the modulator's driver to an emulated controller.
+#: Environment variable by which the modulator's driver finds the emulated controller.
 E727_VARIABLE = "ESCAPE_E727"
 
 Reply = tuple[int, bytes]
 
 
 class RequestKind(enum.IntEnum):
-    """What a stand-in asks, see ``stand_in.h``."""
+    """Kinds of request, as in ``stand_in.h``."""
 
     HELLO = 1
     SEND = 2
@@ -70,23 +70,23 @@ class RequestKind(enum.IntEnum):
 
 
 class StandInBench:
-    """The twin of a system behind a local socket; usable as a context manager.
+    """The simulated bench of a system behind a local socket; usable as a context manager.
 
     Parameters
     ----------
     config
-        The system; its devices need not be in hardware mode here.
+        The system; the modes of its devices are ignored.
     shared
-        Dictionary of the opened system, through which emulators of other devices find the same twin.
+        Dictionary of the opened system, through which emulators of other devices find the same bench.
 
     Attributes
     ----------
     environment
-        What a process needs in its environment for its drivers to find the stand-ins and this bench.
+        Environment variables by which drivers find the stand-ins and this bench.
     requests
-        Number of requests answered, per verb.
+        Number of requests by kind.
     modulator
-        Emulated controller of the modulator, where the system has one.
+        Emulated controller of the modulator, if the system has one.
     """
 
     def __init__(self, config: SystemConfig, shared: dict[str, object] | None = None) -> None:
@@ -94,7 +94,7 @@ class StandInBench:
         self.shared: dict[str, object] = {} if shared is None else shared
         self.environment: dict[str, str] = {}
         self.requests = dict.fromkeys(RequestKind, 0)
-        # The twin is one world with one clock; its devices take turns.
+        # The bench has one clock; requests of its devices are processed one at a time.
         self._twin_lock = threading.Lock()
         self._listener: socket.socket | None = None
         self._folder: Path | None = None
@@ -103,7 +103,7 @@ class StandInBench:
         self._threads: list[threading.Thread] = []
 
     def start(self) -> str:
-        """Build the twin and listen; returns the socket's path.
+        """Build the bench and listen; returns the socket's path.
 
         Raises
         ------
@@ -124,7 +124,7 @@ class StandInBench:
         return path
 
     def _start_modulator_emulator(self) -> dict[str, str]:
-        """Start the controller of a modulator, which turns the twin's beam; returns where it listens."""
+        """Start the emulated controller, which moves the simulated beam; returns its environment variable."""
         section = self.config.devices.modulator
         if section is None or section.driver != "pi-e727":
             return {}
@@ -134,7 +134,7 @@ class StandInBench:
         return {E727_VARIABLE: self.modulator.start().removeprefix("tcp ")}
 
     def stop(self) -> None:
-        """Hang up and stop listening; may be repeated."""
+        """Close all connections and stop listening; may be repeated."""
         if self.modulator is not None:
             self.modulator.stop()
             self.modulator = None
@@ -166,7 +166,7 @@ class StandInBench:
             try:
                 connection, _ = listener.accept()
             except OSError:
-                # Closed by stop(); there is no other way to end an accept.
+                # The socket was shut down by stop(), the only way to end accept().
                 return
             self._connections.add(connection)
             thread = threading.Thread(target=self._serve, args=(connection,), daemon=True)
@@ -174,30 +174,29 @@ class StandInBench:
             self._threads.append(thread)
 
     def _serve(self, connection: socket.socket) -> None:
-        """Answer one device's stand-in until it hangs up."""
+        """Process the requests of one stand-in until it disconnects."""
         handle_request: Callable[[RequestKind, bytes], Reply] = self._refuse_before_hello
         with connection:
             try:
                 while (request := _receive(connection)) is not None:
-                    verb, payload = request
-                    self.requests[verb] += 1
-                    if verb is RequestKind.HELLO:
+                    kind, payload = request
+                    self.requests[kind] += 1
+                    if kind is RequestKind.HELLO:
                         status, reply, handle_request = self._select_device(payload)
                     else:
                         with self._twin_lock:
-                            status, reply = handle_request(verb, payload)
+                            status, reply = handle_request(kind, payload)
                     connection.sendall(_REPLY_HEAD.pack(status, len(reply)) + reply)
             except (OSError, ValueError, struct.error) as error:
-                log.info("a stand-in hung up: %s", error)
+                log.info("a stand-in disconnected: %s", error)
             finally:
                 self._connections.discard(connection)
 
-    def _refuse_before_hello(self, verb: RequestKind, payload: bytes) -> Reply:
-        """Refuse what comes before the greeting."""
+    def _refuse_before_hello(self, kind: RequestKind, payload: bytes) -> Reply:
         return _REFUSED, b""
 
     def _select_device(self, payload: bytes) -> tuple[int, bytes, Callable[[RequestKind, bytes], Reply]]:
-        """Find the device that a stand-in wants to be; its serial number must be the configured one."""
+        """Select the device of a stand-in by kind and serial number, which must be the configured one."""
         kind, _, serial = payload.decode(errors="replace").partition(" ")
         devices = self.config.devices
         section = {"mirror": devices.dm, "wfs": devices.wfs, "science": devices.science}.get(kind)
@@ -213,36 +212,37 @@ class StandInBench:
 
     def _open_mirror(self) -> Callable[[RequestKind, bytes], Reply]:
         mirror = make_mirror("dm", self.config, self.shared).open()
+        bench = shared_bench(self.config, self.shared)
 
-        def handle_request(verb: RequestKind, payload: bytes) -> Reply:
-            if verb is not RequestKind.SEND or len(payload) != 8 * mirror.info.n_act:
+        def handle_request(kind: RequestKind, payload: bytes) -> Reply:
+            if kind is not RequestKind.SEND or len(payload) != 8 * mirror.info.n_act:
                 return _REFUSED, b""
-            # The guard stands before the driver; electronics take any shape, such as that of a reset.
-            mirror._send(np.frombuffer(payload))
+            # Without the guard, which is in the driver: electronics accept any shape.
+            bench.drive(np.frombuffer(payload))
             return _OK, b""
 
         return handle_request
 
 
 class _CameraEndpoint:
-    """What a stand-in of a camera's library gets to see of the twin's camera."""
+    """Handles the requests of a camera's stand-in."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
 
-    def __call__(self, verb: RequestKind, payload: bytes) -> Reply:
+    def __call__(self, kind: RequestKind, payload: bytes) -> Reply:
         try:
-            if verb is RequestKind.START:
+            if kind is RequestKind.START:
                 return self._start(*_START.unpack(payload))
-            if verb is RequestKind.FRAME:
+            if kind is RequestKind.FRAME:
                 return self._frame(*_FRAME.unpack(payload))
-            if verb is RequestKind.STOP:
+            if kind is RequestKind.STOP:
                 self._camera.stop()
                 return _OK, b""
         except FrameTimeout:
             return _TIMEOUT, b""
         except EscapeError as error:
-            log.warning("the twin refuses: %s", error)
+            log.warning("the simulated camera refused a request: %s", error)
         return _REFUSED, b""
 
     def _start(self, *numbers: float) -> Reply:
@@ -259,21 +259,15 @@ class _CameraEndpoint:
 
 
 def _receive(connection: socket.socket) -> tuple[RequestKind, bytes] | None:
-    """One whole request, or ``None`` when the other side has hung up.
-
-    Raises
-    ------
-    ValueError
-        It is nonsense.
-    """
+    """Receive one request; None at the end of the connection, ValueError if it is invalid."""
     head = _receive_exactly(connection, _REQUEST_HEAD.size)
     if head is None:
         return None
-    verb, length = _REQUEST_HEAD.unpack(head)
+    kind, length = _REQUEST_HEAD.unpack(head)
     if length > _MAX_REQUEST_BYTES:
-        raise ValueError(f"a request of {length} bytes")
+        raise ValueError(f"a request of {length} bytes; the limit is {_MAX_REQUEST_BYTES}")
     payload = _receive_exactly(connection, length)
-    return None if payload is None else (RequestKind(verb), payload)
+    return None if payload is None else (RequestKind(kind), payload)
 
 
 def _receive_exactly(connection: socket.socket, length: int) -> bytes | None:
@@ -288,7 +282,7 @@ def _receive_exactly(connection: socket.socket, length: int) -> bytes | None:
 
 @contextmanager
 def stand_in_environment(server: StandInBench) -> Iterator[None]:
-    """Let the drivers of this very process find the stand-ins and the bench."""
+    """Set the environment variables of a bench in this process."""
     before = {key: os.environ.get(key) for key in server.environment}
     os.environ.update(server.environment)
     try:

@@ -1,4 +1,7 @@
-"""Compiles a stand-in with the system's C compiler into the user's cache, and controls it: fault script, call log, protocol violations."""
+"""Compiles the stand-ins of vendor libraries into the user's cache, and controls them.
+
+Control is by script of faults, log of calls and list of violations.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +21,11 @@ from platformdirs import user_cache_path
 
 from escape_hw.errors import EscapeError
 
-#: What can be built: the vendor library that each stands for.
-LIBRARIES = {
-    "asdk": "ALPAO's libasdk",
-    "m3api": "XIMEA's libm3api",
-    "aravis": "libaravis-0.8",
-}
+#: Stand-ins and the vendor libraries that they replace.
+LIBRARIES = {"asdk": "ALPAO's libasdk", "m3api": "XIMEA's libm3api", "aravis": "libaravis-0.8"}
 _FLAGS = ("-std=gnu11", "-shared", "-fPIC", "-O2", "-Wall", "-Wextra", "-fvisibility=hidden")
 _LIBS = ("-lm", "-lpthread")
-#: Names that a C compiler goes by; ``CC`` in the environment comes first.
+#: C compilers, tried after the environment variable ``CC``.
 _COMPILERS = ("cc", "gcc", "clang")
 _COMPILE_S = 120
 
@@ -38,24 +37,16 @@ class StandInUnavailable(EscapeError):
 
 
 def build_library(name: str) -> Path:
-    """The shared library that stands in for a vendor's, compiled if it is not in the cache yet.
+    """Path of a stand-in's shared library, compiled unless it is in the user's cache.
 
-    Parameters
-    ----------
-    name
-        One of :data:`LIBRARIES`.
-
-    Returns
-    -------
-    Path
-        In ``stand-ins`` below the user's cache folder; its name holds a checksum of its sources.
+    Its name contains a checksum of the sources.
 
     Raises
     ------
     StandInUnavailable
-        No C compiler, or it failed.
+        There is no C compiler, or compilation failed.
     ValueError
-        There is no such stand-in.
+        The name is not in :data:`LIBRARIES`.
     """
     if name not in LIBRARIES:
         raise ValueError(f"no stand-in {name!r}; there are {', '.join(LIBRARIES)}")
@@ -70,22 +61,35 @@ def build_library(name: str) -> Path:
 
 
 def _compiler() -> str:
-    wanted = (os.environ.get("CC", ""), *_COMPILERS)
-    for name in wanted:
-        found = shutil.which(name) if name else None
-        if found is not None:
-            return found
+    candidates = tuple(filter(None, (os.environ.get("CC", ""), *_COMPILERS)))
+    for name in candidates:
+        if (path := shutil.which(name)) is not None:
+            return path
     raise StandInUnavailable(
-        f"no C compiler found (tried {', '.join(filter(None, wanted))}); install one "
+        f"no C compiler found (tried {', '.join(candidates)}); install one "
         "(Debian: apt install gcc libc6-dev) or name it in the environment variable CC"
     )
 
 
 def _compile(compiler: str, name: str, sources: dict[str, bytes], target: Path) -> None:
-    """Compile beside the target and move it there, so that nobody ever loads half a library."""
+    """Compile in a temporary folder and move the result, so that no incomplete library is ever loaded."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        _compile_in_place(compiler, name, sources, target)
+        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+            for file, text in sources.items():
+                (Path(folder) / file).write_bytes(text)
+            command = [compiler, *_FLAGS, f"{name}.c", "-o", target.name, *_LIBS]
+            done = subprocess.run(
+                command, cwd=folder, capture_output=True, text=True, check=False, timeout=_COMPILE_S
+            )
+            if done.returncode != 0:
+                raise StandInUnavailable(
+                    f"{compiler} did not compile the stand-in of {name}; is its C library installed "
+                    f"(Debian: libc6-dev)?\n{done.stderr.strip()}"
+                )
+            os.replace(Path(folder) / target.name, target)
+    except subprocess.TimeoutExpired as error:
+        raise StandInUnavailable(f"{compiler} did not compile the stand-in of {name}: {error}") from error
     except OSError as error:
         raise StandInUnavailable(
             f"the stand-in of {name} was not compiled: {error}; is {target.parent} writable? "
@@ -93,98 +97,71 @@ def _compile(compiler: str, name: str, sources: dict[str, bytes], target: Path) 
         ) from error
 
 
-def _compile_in_place(compiler: str, name: str, sources: dict[str, bytes], target: Path) -> None:
-    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-        for file, text in sources.items():
-            (Path(folder) / file).write_bytes(text)
-        out = Path(folder) / target.name
-        command = [compiler, *_FLAGS, f"{name}.c", "-o", str(out), *_LIBS]
-        try:
-            done = subprocess.run(
-                command, cwd=folder, capture_output=True, text=True, check=False, timeout=_COMPILE_S
-            )
-        except subprocess.TimeoutExpired as error:
-            raise StandInUnavailable(f"{compiler} did not compile the stand-in of {name}: {error}") from error
-        if done.returncode != 0:
-            raise StandInUnavailable(
-                f"{compiler} did not compile the stand-in of {name}; is its C library installed "
-                f"(Debian: libc6-dev)?\n{done.stderr.strip()}"
-            )
-        os.replace(out, target)
-
-
 class StandIn:
-    """One stand-in, as this process has it loaded; there is one state per process.
-
-    Parameters
-    ----------
-    name
-        Of the stand-in, see :data:`~escape_sim.stand_ins.library.LIBRARIES`.
+    """A stand-in loaded in this process; its state is global to the process.
 
     Attributes
     ----------
     path
         The shared library, to be given to a driver.
     library
-        The same as ctypes has it loaded.
+        The library as loaded by ctypes.
 
     Raises
     ------
     StandInUnavailable
-        It cannot be compiled here.
+        It cannot be compiled on this machine.
     """
 
     def __init__(self, name: str) -> None:
         self.path: Path = build_library(name)
         self.library = ctypes.CDLL(str(self.path))
         self._text = self.library.escape_stand_in_text
-        self._text.argtypes, self._text.restype = (
-            [ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t],
-            ctypes.c_size_t,
-        )
+        self._text.argtypes = [ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t]
+        self._text.restype = ctypes.c_size_t
         self.library.escape_stand_in_calls.restype = ctypes.c_long
 
     def clear(self, *, record: bool = True) -> Self:
-        """Forget everything, as if freshly loaded; with ``record``, log every call from here on."""
+        """Restore the initial state; with ``record``, log every call from now on."""
         self.library.escape_stand_in_clear()
         self.library.escape_stand_in_record(int(record))
         return self
 
     def script(self, text: str) -> Self:
-        """Add rules to the script of faults, one per line or between semicolons; see ``stand_in.h``.
+        """Add rules of faults, one per line or separated by semicolons; syntax in ``stand_in.h``.
 
         Raises
         ------
         ValueError
-            A rule means nothing.
+            A rule is invalid.
         """
         line = self.library.escape_stand_in_script(text.encode())
         if line:
             wrong = text.replace(";", "\n").split("\n")[line - 1].strip()
-            raise ValueError(f"rule {line} of the script means nothing: {wrong!r}")
+            raise ValueError(f"rule {line} of the script is invalid: {wrong!r}")
         return self
 
     @property
     def calls(self) -> list[str]:
-        """The calls since :meth:`clear`, one line each; complaints stand among them after ``'! '``."""
+        """Calls since :meth:`clear`, one line each; violations are among them after ``'! '``."""
         return self._lines(0)
 
     @property
-    def complaints(self) -> list[str]:
-        """What the caller did that the real library leaves undefined."""
+    def violations(self) -> list[str]:
+        """Uses by the caller that the real library leaves undefined."""
         return self._lines(1)
 
     @property
     def n_calls(self) -> int:
-        """How many calls there were, recorded or not."""
+        """Number of calls, recorded or not."""
         return int(self.library.escape_stand_in_calls())
 
     def names(self) -> list[str]:
-        """Names of the functions called, in order, complaints left out."""
+        """Names of the functions called, in order, without violations."""
         return [line.partition(" ")[0] for line in self.calls if not line.startswith("! ")]
 
     def shape(self, n_act: int) -> NDArray[np.float64]:
-        """The shape ``(n_act,)`` that a mirror has now, fraction of full stroke."""
+        """Present shape ``(n_act,)`` of a mirror, fractions of full stroke."""
         out = np.zeros(n_act)
         self.library.escape_stand_in_shape(out.ctypes.data_as(ctypes.c_void_p), n_act)
         return out

@@ -1,8 +1,8 @@
 /* Stand-in of XIMEA's libm3api: one MQ013MG-ON, strict about order, ranges, types and structure sizes.
  *
- * Properties (set KEY VALUE): serial, width_inc, height_inc, padding (bytes after each row), first (number of
- * the first frame), pace (0: frames are always ready), dim (halvings of the light), trigger_hz (edges on the
- * input; 0: none), lost_code.
+ * Properties (set KEY VALUE): serial, width_inc, height_inc, padding (bytes after each row), first_frame (its
+ * number), real_time (0: frames are always ready), attenuation (halvings of the light), trigger_hz (edges on
+ * the input; 0: none), disconnect_code.
  */
 #define _GNU_SOURCE
 #include "stand_in.h"
@@ -49,7 +49,7 @@ static const DWORD sizes[] = {36,  48,  52,  56,  64,  68,  180, 192, 200,
 #define QUEUE_MAX 64
 #define PITCH_MAX (2 * SENSOR_W + 256)
 
-enum { R = 1, W = 2, L = 4 }; /* readable, writable, locked while acquiring */
+enum { READ = 1, WRITE = 2, READ_WRITE = 3, IDLE_ONLY = 4 }; /* the last: not writable while acquiring */
 struct parameter {
     const char *name;
     int type, access;
@@ -60,53 +60,53 @@ enum {
     DATA_BITS, DOWNSAMPLING, DOWN_TYPE, QUEUE, RECENT, POLICY, TRIGGER, COUNTER, LIMIT, CHIP_TEMP, N_NAMED
 };
 static struct parameter parameters[] = {
-    [EXPOSURE] = {"exposure", FLOATING, R | W, 28, 1000000, 1, 10000, 0},
-    [GAIN] = {"gain", FLOATING, R | W, 0, 12, 0.1, 0, 0},
-    [FRAMERATE] = {"framerate", FLOATING, R | W, 0.8, 0, 0, 30, 0},
-    [TIMING] = {"acq_timing_mode", INTEGER, R | W | L, 0, 2, 1, 0, 0},
-    [WIDTH] = {"width", INTEGER, R | W | L, 16, 0, 0, SENSOR_W, 0},
-    [HEIGHT] = {"height", INTEGER, R | W | L, 2, 0, 0, SENSOR_H, 0},
-    [OFFSET_X] = {"offsetX", INTEGER, R | W | L, 0, 0, 0, 0, 0},
-    [OFFSET_Y] = {"offsetY", INTEGER, R | W | L, 0, 0, 0, 0, 0},
-    [FORMAT] = {"imgdataformat", INTEGER, R | W | L, 0, 7, 1, 0, 0},
-    [OUT_BITS] = {"output_bit_depth", INTEGER, R | W | L, 8, 10, 2, 8, 0},
-    [SENSOR_BITS] = {"sensor_bit_depth", INTEGER, R | W | L, 8, 10, 2, 8, 0},
-    [DATA_BITS] = {"image_data_bit_depth", INTEGER, R | W | L, 8, 10, 2, 8, 0},
-    [DOWNSAMPLING] = {"downsampling", INTEGER, R | W | L, 1, 2, 1, 1, 0},
-    [DOWN_TYPE] = {"downsampling_type", INTEGER, R | W | L, 0, 1, 1, 0, 0},
-    [QUEUE] = {"buffers_queue_size", INTEGER, R | W | L, 2, QUEUE_MAX, 1, 4, 0},
-    [RECENT] = {"recent_frame", INTEGER, R | W, 0, 1, 1, 0, 0},
-    [POLICY] = {"buffer_policy", INTEGER, R | W | L, 0, 1, 1, 0, 0},
-    [TRIGGER] = {"trigger_source", INTEGER, R | W | L, 0, 5, 1, 0, 0},
-    [COUNTER] = {"counter_selector", INTEGER, R | W, 0, 2, 1, 0, 0},
-    [LIMIT] = {"limit_bandwidth", INTEGER, R | W | L, 1, 3000, 1, 2400, 0},
-    [CHIP_TEMP] = {"chip_temp", FLOATING, R, 0, 100, 0, 41.5, 0},
-    {"output_bit_packing", INTEGER, R | W | L, 0, 1, 1, 0, 0},
-    {"acq_buffer_size", INTEGER, R | W | L, 1 << 16, 1 << 30, 1, 1 << 24, 0},
-    {"acq_transport_buffer_commit", INTEGER, R | W | L, 1, 32, 1, 8, 0},
-    {"trigger_software", INTEGER, W, 0, 1, 1, 0, 0},
-    {"trigger_selector", INTEGER, R | W | L, 0, 8, 1, 0, 0},
-    {"trigger_overlap", INTEGER, R | W | L, 0, 2, 1, 0, 0},
-    {"gpi_selector", INTEGER, R | W | L, 1, 1, 1, 1, 0},
-    {"gpi_mode", INTEGER, R | W | L, 0, 2, 1, 0, 0},
-    {"gpo_selector", INTEGER, R | W | L, 1, 1, 1, 1, 0},
-    {"gpo_mode", INTEGER, R | W | L, 0, 15, 1, 0, 0},
-    {"auto_bandwidth_calculation", INTEGER, R | W | L, 0, 1, 1, 1, 0},
-    {"available_bandwidth", INTEGER, R, 2400, 2400, 1, 2400, 0},
-    {"aeag", INTEGER, R | W, 0, 1, 1, 0, 0},
-    {"sensor_feature_selector", INTEGER, R | W | L, 0, 1, 1, 0, 0},
-    {"sensor_feature_value", INTEGER, R | W | L, 0, 1, 1, 0, 0},
-    {"image_black_level", INTEGER, R, 0, 100, 1, 8, 0},
-    {"isexist", INTEGER, R, 0, 1, 1, 1, 0},
-    {"debug_level", INTEGER, R | W, 0, 5, 1, 1, 0},
-    {"counter_value", INTEGER, R, 0, 0, 1, 0, 0},
+    [EXPOSURE] = {"exposure", FLOATING, READ_WRITE, 28, 1000000, 1, 10000, 0},
+    [GAIN] = {"gain", FLOATING, READ_WRITE, 0, 12, 0.1, 0, 0},
+    [FRAMERATE] = {"framerate", FLOATING, READ_WRITE, 0.8, 0, 0, 30, 0},
+    [TIMING] = {"acq_timing_mode", INTEGER, READ_WRITE | IDLE_ONLY, 0, 2, 1, 0, 0},
+    [WIDTH] = {"width", INTEGER, READ_WRITE | IDLE_ONLY, 16, 0, 0, SENSOR_W, 0},
+    [HEIGHT] = {"height", INTEGER, READ_WRITE | IDLE_ONLY, 2, 0, 0, SENSOR_H, 0},
+    [OFFSET_X] = {"offsetX", INTEGER, READ_WRITE | IDLE_ONLY, 0, 0, 0, 0, 0},
+    [OFFSET_Y] = {"offsetY", INTEGER, READ_WRITE | IDLE_ONLY, 0, 0, 0, 0, 0},
+    [FORMAT] = {"imgdataformat", INTEGER, READ_WRITE | IDLE_ONLY, 0, 7, 1, 0, 0},
+    [OUT_BITS] = {"output_bit_depth", INTEGER, READ_WRITE | IDLE_ONLY, 8, 10, 2, 8, 0},
+    [SENSOR_BITS] = {"sensor_bit_depth", INTEGER, READ_WRITE | IDLE_ONLY, 8, 10, 2, 8, 0},
+    [DATA_BITS] = {"image_data_bit_depth", INTEGER, READ_WRITE | IDLE_ONLY, 8, 10, 2, 8, 0},
+    [DOWNSAMPLING] = {"downsampling", INTEGER, READ_WRITE | IDLE_ONLY, 1, 2, 1, 1, 0},
+    [DOWN_TYPE] = {"downsampling_type", INTEGER, READ_WRITE | IDLE_ONLY, 0, 1, 1, 0, 0},
+    [QUEUE] = {"buffers_queue_size", INTEGER, READ_WRITE | IDLE_ONLY, 2, QUEUE_MAX, 1, 4, 0},
+    [RECENT] = {"recent_frame", INTEGER, READ_WRITE, 0, 1, 1, 0, 0},
+    [POLICY] = {"buffer_policy", INTEGER, READ_WRITE | IDLE_ONLY, 0, 1, 1, 0, 0},
+    [TRIGGER] = {"trigger_source", INTEGER, READ_WRITE | IDLE_ONLY, 0, 5, 1, 0, 0},
+    [COUNTER] = {"counter_selector", INTEGER, READ_WRITE, 0, 2, 1, 0, 0},
+    [LIMIT] = {"limit_bandwidth", INTEGER, READ_WRITE | IDLE_ONLY, 1, 3000, 1, 2400, 0},
+    [CHIP_TEMP] = {"chip_temp", FLOATING, READ, 0, 100, 0, 41.5, 0},
+    {"output_bit_packing", INTEGER, READ_WRITE | IDLE_ONLY, 0, 1, 1, 0, 0},
+    {"acq_buffer_size", INTEGER, READ_WRITE | IDLE_ONLY, 1 << 16, 1 << 30, 1, 1 << 24, 0},
+    {"acq_transport_buffer_commit", INTEGER, READ_WRITE | IDLE_ONLY, 1, 32, 1, 8, 0},
+    {"trigger_software", INTEGER, WRITE, 0, 1, 1, 0, 0},
+    {"trigger_selector", INTEGER, READ_WRITE | IDLE_ONLY, 0, 8, 1, 0, 0},
+    {"trigger_overlap", INTEGER, READ_WRITE | IDLE_ONLY, 0, 2, 1, 0, 0},
+    {"gpi_selector", INTEGER, READ_WRITE | IDLE_ONLY, 1, 1, 1, 1, 0},
+    {"gpi_mode", INTEGER, READ_WRITE | IDLE_ONLY, 0, 2, 1, 0, 0},
+    {"gpo_selector", INTEGER, READ_WRITE | IDLE_ONLY, 1, 1, 1, 1, 0},
+    {"gpo_mode", INTEGER, READ_WRITE | IDLE_ONLY, 0, 15, 1, 0, 0},
+    {"auto_bandwidth_calculation", INTEGER, READ_WRITE | IDLE_ONLY, 0, 1, 1, 1, 0},
+    {"available_bandwidth", INTEGER, READ, 2400, 2400, 1, 2400, 0},
+    {"aeag", INTEGER, READ_WRITE, 0, 1, 1, 0, 0},
+    {"sensor_feature_selector", INTEGER, READ_WRITE | IDLE_ONLY, 0, 1, 1, 0, 0},
+    {"sensor_feature_value", INTEGER, READ_WRITE | IDLE_ONLY, 0, 1, 1, 0, 0},
+    {"image_black_level", INTEGER, READ, 0, 100, 1, 8, 0},
+    {"isexist", INTEGER, READ, 0, 1, 1, 1, 0},
+    {"debug_level", INTEGER, READ_WRITE, 0, 5, 1, 1, 0},
+    {"counter_value", INTEGER, READ, 0, 0, 1, 0, 0},
 };
 #define N_PARAMETERS (int)(sizeof parameters / sizeof *parameters)
-#define VALUE(which) (parameters[which].value)
+#define CURRENT(which) (parameters[which].value)
 
 struct camera {
     atomic_int open, acquiring, imaging;
-    struct si_link bench;
+    struct si_connection bench;
     int linked;
     int64_t start_ns;
     double period_ns;
@@ -115,7 +115,7 @@ struct camera {
 };
 static struct camera camera;
 static char serial[64];
-static int width_inc, height_inc, padding, first, pace, dim, lost_code;
+static int width_inc, height_inc, padding, first_frame, real_time, attenuation, disconnect_code;
 static double trigger_hz;
 static uint16_t ring[QUEUE_MAX][SENSOR_H * PITCH_MAX / 2]; /* bytes for 8-bit formats */
 static struct {
@@ -127,82 +127,83 @@ static void defaults(void) {
     for (int k = 0; k < N_PARAMETERS; k++) parameters[k].value = parameters[k].initial;
 }
 
-static void si_forget(void) {
-    if (camera.linked) si_unlink_bench(&camera.bench);
+static void si_reset_device(void) {
+    if (camera.linked) si_disconnect_bench(&camera.bench);
     memset(&camera, 0, sizeof camera);
     camera.bench.fd = -1;
     defaults();
     snprintf(serial, sizeof serial, "SIMWFS");
     width_inc = 8;
     height_inc = 2;
-    pace = 1;
-    lost_code = BAD_HANDLE;
-    padding = first = dim = 0;
+    real_time = 1;
+    disconnect_code = BAD_HANDLE;
+    padding = first_frame = attenuation = 0;
     trigger_hz = 0;
 }
 
-static int si_set(const char *key, const char *value) {
-    int whole = atoi(value);
+static int si_set_property(const char *key, const char *value) {
+    int integer = atoi(value);
     if (strcmp(key, "serial") == 0) return snprintf(serial, sizeof serial, "%s", value) > 0;
-    if (strcmp(key, "width_inc") == 0) return (width_inc = whole) > 0;
-    if (strcmp(key, "height_inc") == 0) return (height_inc = whole) > 0;
-    if (strcmp(key, "padding") == 0) return (padding = whole) >= 0 && padding <= 256 && padding % 2 == 0;
-    if (strcmp(key, "first") == 0) return (first = whole) >= 0;
-    if (strcmp(key, "dim") == 0) return (dim = whole) >= 0;
-    if (strcmp(key, "pace") == 0) return (pace = whole) >= 0;
-    if (strcmp(key, "lost_code") == 0) return (lost_code = whole) > 0;
+    if (strcmp(key, "width_inc") == 0) return (width_inc = integer) > 0;
+    if (strcmp(key, "height_inc") == 0) return (height_inc = integer) > 0;
+    if (strcmp(key, "padding") == 0) return (padding = integer) >= 0 && padding <= 256 && padding % 2 == 0;
+    if (strcmp(key, "first_frame") == 0) return (first_frame = integer) >= 0;
+    if (strcmp(key, "attenuation") == 0) return (attenuation = integer) >= 0;
+    if (strcmp(key, "real_time") == 0) return (real_time = integer) >= 0;
+    if (strcmp(key, "disconnect_code") == 0) return (disconnect_code = integer) > 0;
     if (strcmp(key, "trigger_hz") == 0) return (trigger_hz = atof(value)) >= 0;
     return 0;
 }
 
 EXPORT const char *escape_stand_in(void) { return "libm3api stand-in"; }
 
-/* ---- what the sensor can do -------------------------------------------------------------------------- */
-static double readout_us(void) { return 20 + 4.65 * VALUE(HEIGHT); }
+/* ---- limits of the sensor ------------------------------------------------------------------------------ */
+static double readout_us(void) { return 20 + 4.65 * CURRENT(HEIGHT); }
 
-static double fastest_hz(void) { return 1e6 / fmax(readout_us(), VALUE(EXPOSURE) + 30); }
+static double fastest_hz(void) { return 1e6 / fmax(readout_us(), CURRENT(EXPOSURE) + 30); }
 
 static double present_hz(void) {
-    return VALUE(TIMING) == 1 ? fmin(VALUE(FRAMERATE), fastest_hz()) : fastest_hz();
+    return CURRENT(TIMING) == 1 ? fmin(CURRENT(FRAMERATE), fastest_hz()) : fastest_hz();
 }
 
 static void limits_of(int which, double *low, double *high, double *step) {
-    double width = SENSOR_W / VALUE(DOWNSAMPLING), height = SENSOR_H / VALUE(DOWNSAMPLING);
+    double width = SENSOR_W / CURRENT(DOWNSAMPLING), height = SENSOR_H / CURRENT(DOWNSAMPLING);
     *low = parameters[which].low, *high = parameters[which].high, *step = parameters[which].step;
     switch (which) {
-    case WIDTH: *high = width - VALUE(OFFSET_X), *step = width_inc; break;
-    case HEIGHT: *high = height - VALUE(OFFSET_Y), *step = height_inc; break;
-    case OFFSET_X: *high = width - VALUE(WIDTH), *step = width_inc; break;
-    case OFFSET_Y: *high = height - VALUE(HEIGHT), *step = height_inc; break;
+    case WIDTH: *high = width - CURRENT(OFFSET_X), *step = width_inc; break;
+    case HEIGHT: *high = height - CURRENT(OFFSET_Y), *step = height_inc; break;
+    case OFFSET_X: *high = width - CURRENT(WIDTH), *step = width_inc; break;
+    case OFFSET_Y: *high = height - CURRENT(HEIGHT), *step = height_inc; break;
     case FRAMERATE:
         *high = fastest_hz();
-        if (VALUE(TIMING) != 1) *low = *high = present_hz();
+        if (CURRENT(TIMING) != 1) *low = *high = present_hz();
         break;
     default: break;
     }
 }
 
-static int bits(void) { return VALUE(FORMAT) == 1 || VALUE(FORMAT) == 6 ? (int)VALUE(DATA_BITS) : 8; }
-static int bytes_per_pixel(void) { return VALUE(FORMAT) == 1 || VALUE(FORMAT) == 6 ? 2 : 1; }
+static int bits(void) { return CURRENT(FORMAT) == 1 || CURRENT(FORMAT) == 6 ? (int)CURRENT(DATA_BITS) : 8; }
+static int bytes_per_pixel(void) { return CURRENT(FORMAT) == 1 || CURRENT(FORMAT) == 6 ? 2 : 1; }
 
-static int pitch_bytes(void) { return (int)VALUE(WIDTH) * bytes_per_pixel() + padding; }
+static int pitch_bytes(void) { return (int)CURRENT(WIDTH) * bytes_per_pixel() + padding; }
 
-/* The test picture: pixel (x, y) holds 3 x + 7 y, but the first one the number of the frame. */
-static void put(int slot, int x, int y, int value) {
+/* The test image: pixel (x, y) is 3 x + 7 y, but the first one is the frame number. */
+static void write_pixel(int slot, int x, int y, int value) {
     unsigned char *row = (unsigned char *)ring[slot] + y * pitch_bytes();
     if (bytes_per_pixel() == 2) ((uint16_t *)row)[x] = (uint16_t)value;
     else row[x] = (unsigned char)value;
 }
 
-/* ---- what every call begins with --------------------------------------------------------------------- */
-static int refused(HANDLE handle, struct si_function *function, struct si_rule *rule, XI_RETURN *outcome) {
-    *rule = si_enter(function);
-    if (rule->action == SI_UNPLUG && rule->argument) lost_code = (int)rule->argument;
+/* Checks at the beginning of every call; 1 if the call ends here, with its result in *outcome. */
+static int call_rejected(HANDLE handle, struct si_function *function, struct si_rule *rule,
+                         XI_RETURN *outcome) {
+    *rule = si_begin_call(function);
+    if (rule->action == SI_UNPLUG && rule->argument) disconnect_code = (int)rule->argument;
     if (handle != &camera || !camera.open) {
-        si_complain("%s: the handle is not that of an open camera", function->name);
+        si_report_violation("%s: the handle is not that of an open camera", function->name);
         return *outcome = BAD_HANDLE, 1;
     }
-    if (si_unplugged) return *outcome = lost_code, 1;
+    if (si_unplugged) return *outcome = disconnect_code, 1;
     if (rule->action == SI_ERROR) return *outcome = (int)rule->argument, 1;
     if (rule->action == SI_IGNORE) return *outcome = OK, 1;
     if (rule->action == SI_RESET) {
@@ -215,16 +216,16 @@ static int refused(HANDLE handle, struct si_function *function, struct si_rule *
 
 /* ---- opening and closing ----------------------------------------------------------------------------- */
 static XI_RETURN open_camera(struct si_function *function, const char *wanted, HANDLE *handle) {
-    struct si_rule rule = si_enter(function);
+    struct si_rule rule = si_begin_call(function);
     if (si_unplugged) return NO_DEVICE;
     if (rule.action == SI_ERROR) return (int)rule.argument;
-    if (handle == NULL) return si_complain("%s: nowhere to write", function->name), BAD_ARGUMENT;
+    if (handle == NULL) return si_report_violation("%s: null pointer", function->name), BAD_ARGUMENT;
     if (camera.open) {
-        si_complain("%s: the camera has an owner already", function->name);
+        si_report_violation("%s: the camera has an owner already", function->name);
         return LOCKED;
     }
     uint32_t greeting[1] = {0};
-    int linked = si_link_bench(&camera.bench, "wfs", wanted ? wanted : "", greeting, sizeof greeting);
+    int linked = si_connect_bench(&camera.bench, "wfs", wanted ? wanted : "", greeting, sizeof greeting);
     if (linked < 0 || (linked == 0 && wanted && strcmp(wanted, serial) != 0)) return NO_DEVICE;
     if (linked) snprintf(serial, sizeof serial, "%s", wanted);
     camera.linked = linked;
@@ -238,7 +239,7 @@ static XI_RETURN open_camera(struct si_function *function, const char *wanted, H
 EXPORT XI_RETURN xiGetNumberDevices(DWORD *n) {
     static struct si_function f = {.name = "xiGetNumberDevices"};
     si_log("xiGetNumberDevices");
-    si_enter(&f);
+    si_begin_call(&f);
     if (n == NULL) return BAD_ARGUMENT;
     *n = !si_unplugged;
     return OK;
@@ -247,7 +248,7 @@ EXPORT XI_RETURN xiGetNumberDevices(DWORD *n) {
 EXPORT XI_RETURN xiGetDeviceInfoString(DWORD index, const char *name, char *value, DWORD size) {
     static struct si_function f = {.name = "xiGetDeviceInfoString"};
     si_log("xiGetDeviceInfoString %u %s", index, name);
-    si_enter(&f);
+    si_begin_call(&f);
     if (si_unplugged || index != 0) return NO_DEVICE;
     if (strcmp(name, "device_sn") == 0) snprintf(value, size, "%s", serial);
     else if (strcmp(name, "device_name") == 0) snprintf(value, size, "MQ013MG-ON");
@@ -258,7 +259,7 @@ EXPORT XI_RETURN xiGetDeviceInfoString(DWORD index, const char *name, char *valu
 EXPORT XI_RETURN xiGetDeviceInfoInt(DWORD index, const char *name, int *value) {
     static struct si_function f = {.name = "xiGetDeviceInfoInt"};
     si_log("xiGetDeviceInfoInt %u %s", index, name);
-    si_enter(&f);
+    si_begin_call(&f);
     if (si_unplugged || index != 0) return NO_DEVICE;
     if (strcmp(name, "isexist") != 0) return UNKNOWN;
     *value = 1;
@@ -282,18 +283,18 @@ EXPORT XI_RETURN xiCloseDevice(HANDLE handle) {
     struct si_rule rule;
     XI_RETURN outcome = OK;
     si_log("xiCloseDevice");
-    int no = refused(handle, &f, &rule, &outcome);
+    int no = call_rejected(handle, &f, &rule, &outcome);
     if (handle != &camera || !camera.open) return outcome;
-    if (camera.imaging) si_complain("xiCloseDevice: xiGetImage is still waiting in another thread");
+    if (camera.imaging) si_report_violation("xiCloseDevice: xiGetImage is still waiting in another thread");
     if (camera.acquiring && !si_unplugged)
-        si_complain("xiCloseDevice: the camera is acquiring; xiStopAcquisition first");
+        si_report_violation("xiCloseDevice: the camera is acquiring; xiStopAcquisition first");
     camera.open = camera.acquiring = 0;
-    si_unlink_bench(&camera.bench);
+    si_disconnect_bench(&camera.bench);
     return no ? outcome : OK;
 }
 
 /* ---- parameters -------------------------------------------------------------------------------------- */
-/* The parameter of a name with its suffix (":min" ...) split off; NULL when there is none. */
+/* The parameter of a name without its suffix (":min" ...), which is returned; NULL if it is unknown. */
 static struct parameter *parameter_of(const char *name, const char **suffix) {
     size_t length = name ? strcspn(name, ":") : 0;
     *suffix = name + length;
@@ -307,13 +308,13 @@ static XI_RETURN number_of(const char *name, int type, double *out) {
     const char *suffix;
     struct parameter *p = parameter_of(name, &suffix);
     if (p == NULL) return UNKNOWN;
-    if (p->type != type) return si_complain("%s is of another type", name), WRONG_TYPE;
-    if (!(p->access & R)) return UNSUPPORTED;
+    if (p->type != type) return si_report_violation("%s has another type", name), WRONG_TYPE;
+    if (!(p->access & READ)) return UNSUPPORTED;
     double low, high, step;
     limits_of((int)(p - parameters), &low, &high, &step);
     *out = p->value;
     if (p == &parameters[FRAMERATE]) *out = present_hz();
-    if (strcmp(p->name, "counter_value") == 0) *out = (double)camera.counters[(int)VALUE(COUNTER)];
+    if (strcmp(p->name, "counter_value") == 0) *out = (double)camera.counters[(int)CURRENT(COUNTER)];
     if (strcmp(suffix, ":min") == 0) *out = low;
     else if (strcmp(suffix, ":max") == 0) *out = high;
     else if (strcmp(suffix, ":inc") == 0) *out = step;
@@ -325,31 +326,31 @@ static XI_RETURN set_number(const char *name, int type, double x) {
     const char *suffix;
     struct parameter *p = parameter_of(name, &suffix);
     if (p == NULL) return UNKNOWN;
-    if (p->type != type) return si_complain("%s is of another type", name), WRONG_TYPE;
+    if (p->type != type) return si_report_violation("%s has another type", name), WRONG_TYPE;
     if (*suffix) return UNSUPPORTED;
-    if (!(p->access & W)) return READ_ONLY;
-    if ((p->access & L) && camera.acquiring) {
-        si_complain("%s cannot be set while the camera is acquiring", name);
+    if (!(p->access & WRITE)) return READ_ONLY;
+    if ((p->access & IDLE_ONLY) && camera.acquiring) {
+        si_report_violation("%s cannot be set while the camera is acquiring", name);
         return NOT_NOW;
     }
-    if (p == &parameters[FRAMERATE] && VALUE(TIMING) != 1) return CONTEXT;
+    if (p == &parameters[FRAMERATE] && CURRENT(TIMING) != 1) return CONTEXT;
     double low, high, step;
     limits_of((int)(p - parameters), &low, &high, &step);
     if (!(x >= low * (1 - 1e-6) && x <= high * (1 + 1e-6))) {
-        si_complain("%s = %g lies outside %g..%g", name, x, low, high);
+        si_report_violation("%s = %g lies outside %g..%g", name, x, low, high);
         return BAD_ARGUMENT;
     }
     if (type == INTEGER && step > 1 && fmod(x - low, step) != 0) {
-        si_complain("%s = %g does not fit its increment of %g", name, x, step);
+        si_report_violation("%s = %g does not fit its increment of %g", name, x, step);
         return WRONG_VALUE;
     }
     if (type == FLOATING && step > 0) x = round(x / step) * step;
     if (p == &parameters[FRAMERATE]) x = 1e6 / ceil(1e6 / x - 1e-3);
     p->value = x;
     if (p == &parameters[DOWNSAMPLING]) {
-        VALUE(WIDTH) = SENSOR_W / x;
-        VALUE(HEIGHT) = SENSOR_H / x;
-        VALUE(OFFSET_X) = VALUE(OFFSET_Y) = 0;
+        CURRENT(WIDTH) = SENSOR_W / x;
+        CURRENT(HEIGHT) = SENSOR_H / x;
+        CURRENT(OFFSET_X) = CURRENT(OFFSET_Y) = 0;
     }
     return OK;
 }
@@ -359,7 +360,7 @@ static XI_RETURN set_number(const char *name, int type, double x) {
     struct si_rule rule;                                                                                      \
     XI_RETURN outcome;                                                                                        \
     si_log(title __VA_ARGS__);                                                                                \
-    if (refused(handle, &f, &rule, &outcome)) return outcome
+    if (call_rejected(handle, &f, &rule, &outcome)) return outcome
 
 EXPORT XI_RETURN xiSetParamInt(HANDLE handle, const char *name, int value) {
     BEGIN("xiSetParamInt", " %s %d", name, value);
@@ -409,7 +410,7 @@ EXPORT XI_RETURN xiGetParamString(HANDLE handle, const char *name, void *value, 
 EXPORT XI_RETURN xiSetParam(HANDLE handle, const char *name, void *value, DWORD size, XI_PRM_TYPE type) {
     BEGIN("xiSetParam", " %s size %u type %d", name, size, type);
     if (type != INTEGER && type != FLOATING) return WRONG_TYPE;
-    if (size != 4) return si_complain("xiSetParam: %s of %u bytes", name, size), WRONG_SIZE;
+    if (size != 4) return si_report_violation("xiSetParam: %s of %u bytes", name, size), WRONG_SIZE;
     return set_number(name, type, type == INTEGER ? *(int *)value : *(float *)value);
 }
 
@@ -417,7 +418,7 @@ EXPORT XI_RETURN xiGetParam(HANDLE handle, const char *name, void *value, DWORD 
     BEGIN("xiGetParam", " %s size %u type %d", name, *size, *type);
     if (*type == TEXT) return text_of(name, value, *size);
     if (*type != INTEGER && *type != FLOATING) return WRONG_TYPE;
-    if (*size < 4) return si_complain("xiGetParam: %s of %u bytes", name, *size), WRONG_SIZE;
+    if (*size < 4) return si_report_violation("xiGetParam: %s of %u bytes", name, *size), WRONG_SIZE;
     double x;
     outcome = number_of(name, *type, &x);
     if (outcome != OK) return outcome;
@@ -432,29 +433,31 @@ static XI_RETURN start_on_bench(void) {
     struct {
         uint32_t region[4];
         double exposure_us, framerate_hz, gain_db;
-    } wanted = {{(uint32_t)VALUE(OFFSET_X), (uint32_t)VALUE(OFFSET_Y), (uint32_t)VALUE(WIDTH),
-                 (uint32_t)VALUE(HEIGHT)},
-                VALUE(EXPOSURE), present_hz(), VALUE(GAIN)};
-    int status = si_ask(&camera.bench, SI_START, &wanted, sizeof wanted, NULL, 0, NULL);
-    return status == 0 ? OK : status < 0 ? lost_code : BAD_ARGUMENT;
+    } wanted = {{(uint32_t)CURRENT(OFFSET_X), (uint32_t)CURRENT(OFFSET_Y), (uint32_t)CURRENT(WIDTH),
+                 (uint32_t)CURRENT(HEIGHT)},
+                CURRENT(EXPOSURE), present_hz(), CURRENT(GAIN)};
+    int status = si_request(&camera.bench, SI_START, &wanted, sizeof wanted, NULL, 0, NULL);
+    return status == 0 ? OK : status < 0 ? disconnect_code : BAD_ARGUMENT;
 }
 
 EXPORT XI_RETURN xiStartAcquisition(HANDLE handle) {
     BEGIN("xiStartAcquisition", "%s", "");
     if (camera.acquiring) return ALREADY_STARTED;
     double rate = present_hz();
-    if (VALUE(WIDTH) * VALUE(HEIGHT) * 8 * bytes_per_pixel() * rate > 1e6 * VALUE(LIMIT)) return BANDWIDTH;
-    if (VALUE(TRIGGER) != 0) rate = trigger_hz / ceil(trigger_hz / fastest_hz() - 1e-9);
+    double bit_rate = CURRENT(WIDTH) * CURRENT(HEIGHT) * 8 * bytes_per_pixel() * rate;
+    if (bit_rate > 1e6 * CURRENT(LIMIT)) return BANDWIDTH;
+    if (CURRENT(TRIGGER) != 0) rate = trigger_hz / ceil(trigger_hz / fastest_hz() - 1e-9);
     camera.period_ns = rate > 0 ? 1e9 / rate : INFINITY;
     camera.start_ns = si_now_ns();
     camera.delivered = -1;
     memset(camera.counters, 0, sizeof camera.counters);
     if (camera.linked && (outcome = start_on_bench()) != OK) return outcome;
     int top = (1 << bits()) - 1;
-    for (int slot = 0; slot < (int)VALUE(QUEUE); slot++) {
-        memset(ring[slot], 0xFF, (size_t)(pitch_bytes() * (int)VALUE(HEIGHT)));
-        for (int y = 0; y < (int)VALUE(HEIGHT); y++)
-            for (int x = 0; x < (int)VALUE(WIDTH); x++) put(slot, x, y, (3 * x + 7 * y) & (top >> dim));
+    for (int slot = 0; slot < (int)CURRENT(QUEUE); slot++) {
+        memset(ring[slot], 0xFF, (size_t)(pitch_bytes() * (int)CURRENT(HEIGHT)));
+        for (int y = 0; y < (int)CURRENT(HEIGHT); y++)
+            for (int x = 0; x < (int)CURRENT(WIDTH); x++)
+                write_pixel(slot, x, y, (3 * x + 7 * y) & (top >> attenuation));
     }
     camera.acquiring = 1;
     return OK;
@@ -462,20 +465,21 @@ EXPORT XI_RETURN xiStartAcquisition(HANDLE handle) {
 
 EXPORT XI_RETURN xiStopAcquisition(HANDLE handle) {
     BEGIN("xiStopAcquisition", "%s", "");
-    if (camera.imaging) si_complain("xiStopAcquisition: xiGetImage is still waiting in another thread");
+    if (camera.imaging)
+        si_report_violation("xiStopAcquisition: xiGetImage is still waiting in another thread");
     if (!camera.acquiring) return STOPPED;
     camera.acquiring = 0;
-    if (camera.linked) si_ask(&camera.bench, SI_STOP, NULL, 0, NULL, 0, NULL);
+    if (camera.linked) si_request(&camera.bench, SI_STOP, NULL, 0, NULL, 0, NULL);
     return OK;
 }
 
-/* Wait for the next frame; its number, or -1 when none came in time. */
-static long next_frame(DWORD timeout_ms, long lose) {
+/* Wait for the next frame; its number, or -1 after the time-out. */
+static long next_frame(DWORD timeout_ms, long n_dropped) {
     int64_t now = si_now_ns(), deadline = now + (int64_t)timeout_ms * 1000000;
-    long next = camera.delivered + 1 + lose;
-    if (pace) {
+    long next = camera.delivered + 1 + n_dropped;
+    if (real_time) {
         long newest = (long)((double)(now - camera.start_ns) / camera.period_ns) - 1;
-        long oldest = VALUE(RECENT) ? newest : newest - (long)VALUE(QUEUE) + 1;
+        long oldest = CURRENT(RECENT) ? newest : newest - (long)CURRENT(QUEUE) + 1;
         if (oldest > next) {
             camera.counters[1] += oldest - next;
             next = oldest;
@@ -490,54 +494,55 @@ static long next_frame(DWORD timeout_ms, long lose) {
     return next;
 }
 
-static XI_RETURN from_the_bench(DWORD timeout_ms, int64_t *stamp_ns, long *number) {
-    int width = (int)VALUE(WIDTH), height = (int)VALUE(HEIGHT);
+static XI_RETURN read_bench_frame(DWORD timeout_ms, int64_t *stamp_ns, long *number) {
+    int width = (int)CURRENT(WIDTH), height = (int)CURRENT(HEIGHT);
     double wait_s = timeout_ms * 1e-3;
     uint32_t got = 0;
-    int status = si_ask(&camera.bench, SI_FRAME, &wait_s, sizeof wait_s, &from_bench, sizeof from_bench, &got);
+    int status = si_request(&camera.bench, SI_FRAME, &wait_s, sizeof wait_s, &from_bench,
+                            sizeof from_bench, &got);
     if (status == 1) return TIMEOUT;
-    if (status != 0 || got != 16 + 2u * (uint32_t)(width * height)) return lost_code;
+    if (status != 0 || got != 16 + 2u * (uint32_t)(width * height)) return disconnect_code;
     *number = (long)from_bench.index;
     *stamp_ns = from_bench.exposed_ns;
-    int slot = (int)(*number % (long)VALUE(QUEUE));
+    int slot = (int)(*number % (long)CURRENT(QUEUE));
     for (int y = 0; y < height; y++)
         memcpy((unsigned char *)ring[slot] + y * pitch_bytes(), from_bench.pixels + y * width,
                2 * (size_t)width);
     return OK;
 }
 
-static XI_RETURN from_the_sensor(DWORD timeout_ms, long lose, int64_t *stamp_ns, long *number) {
-    *number = next_frame(timeout_ms, lose);
-    if (*number >= 0) camera.counters[0] += lose;
-    if (*number < 0) return si_unplugged ? lost_code : TIMEOUT;
-    *stamp_ns = camera.start_ns + (int64_t)((double)(*number + 1) * (pace ? camera.period_ns : 1e6));
-    int slots = (int)VALUE(QUEUE), top = (1 << bits()) - 1;
-    /* The real ring goes on turning: what was handed out before is no longer what it was. */
-    if (si_recording && camera.delivered >= 0) put((int)(camera.delivered % slots), 1, 0, top);
-    put((int)(*number % slots), 0, 0, (int)*number & (top >> dim));
-    put((int)(*number % slots), 1, 0, 3);
+static XI_RETURN generate_frame(DWORD timeout_ms, long n_dropped, int64_t *stamp_ns, long *number) {
+    *number = next_frame(timeout_ms, n_dropped);
+    if (*number >= 0) camera.counters[0] += n_dropped;
+    if (*number < 0) return si_unplugged ? disconnect_code : TIMEOUT;
+    *stamp_ns = camera.start_ns + (int64_t)((double)(*number + 1) * (real_time ? camera.period_ns : 1e6));
+    int slots = (int)CURRENT(QUEUE), top = (1 << bits()) - 1;
+    /* The real ring is overwritten: a buffer that was delivered before changes. */
+    if (si_recording && camera.delivered >= 0) write_pixel((int)(camera.delivered % slots), 1, 0, top);
+    write_pixel((int)(*number % slots), 0, 0, (int)*number & (top >> attenuation));
+    write_pixel((int)(*number % slots), 1, 0, 3);
     return OK;
 }
 
-static XI_RETURN picture(XI_IMG *image, DWORD timeout_ms, long lose, XI_IMG *full) {
+static XI_RETURN acquire_image(XI_IMG *image, DWORD timeout_ms, long n_dropped, XI_IMG *full) {
     int64_t stamp_ns = 0;
     long number = 0;
-    XI_RETURN outcome = camera.linked ? from_the_bench(timeout_ms, &stamp_ns, &number)
-                                      : from_the_sensor(timeout_ms, lose, &stamp_ns, &number);
+    XI_RETURN outcome = camera.linked ? read_bench_frame(timeout_ms, &stamp_ns, &number)
+                                      : generate_frame(timeout_ms, n_dropped, &stamp_ns, &number);
     if (outcome != OK) return outcome;
     camera.delivered = number;
     camera.counters[2]++;
-    full->bp = ring[number % (long)VALUE(QUEUE)];
-    full->bp_size = (DWORD)(pitch_bytes() * (int)VALUE(HEIGHT));
-    if (VALUE(POLICY) == 1) {
+    full->bp = ring[number % (long)CURRENT(QUEUE)];
+    full->bp_size = (DWORD)(pitch_bytes() * (int)CURRENT(HEIGHT));
+    if (CURRENT(POLICY) == 1) {
         if (image->bp == NULL || image->bp_size < full->bp_size) return SMALL_BUFFER;
         memcpy(image->bp, full->bp, full->bp_size);
         full->bp = image->bp;
     }
-    full->width = (DWORD)VALUE(WIDTH);
-    full->height = (DWORD)VALUE(HEIGHT);
-    full->acq_nframe = (DWORD)(number + first);
-    /* The library counts what reached it; what was lost on the cable only the camera knows. */
+    full->width = (DWORD)CURRENT(WIDTH);
+    full->height = (DWORD)CURRENT(HEIGHT);
+    full->acq_nframe = (DWORD)(number + first_frame);
+    /* The library counts frames that reached it; acq_nframe also those lost on the cable. */
     full->nframe = full->acq_nframe - (DWORD)camera.counters[0];
     full->tsSec = (DWORD)(stamp_ns / 1000000000);
     full->tsUSec = (DWORD)(stamp_ns / 1000 % 1000000);
@@ -549,7 +554,8 @@ EXPORT XI_RETURN xiGetImage(HANDLE handle, DWORD timeout_ms, XI_IMG *image) {
     int known = 0;
     for (size_t k = 0; image && k < sizeof sizes / sizeof *sizes; k++) known |= image->size == sizes[k];
     if (!known) {
-        si_complain("xiGetImage: XI_IMG of %u bytes is of no version of this library", image ? image->size : 0);
+        si_report_violation("xiGetImage: no version of this library has an XI_IMG of %u bytes",
+                            image ? image->size : 0);
         return BAD_ARGUMENT;
     }
     if (!camera.acquiring) return STOPPED;
@@ -557,13 +563,14 @@ EXPORT XI_RETURN xiGetImage(HANDLE handle, DWORD timeout_ms, XI_IMG *image) {
         si_sleep_until(si_now_ns() + 1000000 * (int64_t)fmin((double)rule.argument, timeout_ms));
         return TIMEOUT;
     }
-    XI_IMG full = {.size = image->size, .frm = (int)VALUE(FORMAT), .padding_x = (DWORD)padding,
-                   .AbsoluteOffsetX = (DWORD)VALUE(OFFSET_X), .AbsoluteOffsetY = (DWORD)VALUE(OFFSET_Y),
-                   .DownsamplingX = (DWORD)VALUE(DOWNSAMPLING), .DownsamplingY = (DWORD)VALUE(DOWNSAMPLING),
-                   .exposure_time_us = (DWORD)VALUE(EXPOSURE), .gain_db = (float)VALUE(GAIN),
+    XI_IMG full = {.size = image->size, .frm = (int)CURRENT(FORMAT), .padding_x = (DWORD)padding,
+                   .AbsoluteOffsetX = (DWORD)CURRENT(OFFSET_X), .AbsoluteOffsetY = (DWORD)CURRENT(OFFSET_Y),
+                   .DownsamplingX = (DWORD)CURRENT(DOWNSAMPLING),
+                   .DownsamplingY = (DWORD)CURRENT(DOWNSAMPLING),
+                   .exposure_time_us = (DWORD)CURRENT(EXPOSURE), .gain_db = (float)CURRENT(GAIN),
                    .data_saturation = (1 << bits()) - 1, .gain_ratio = 1};
     camera.imaging++;
-    outcome = picture(image, timeout_ms, rule.action == SI_LOSE ? rule.argument : 0, &full);
+    outcome = acquire_image(image, timeout_ms, rule.action == SI_DROP ? rule.argument : 0, &full);
     camera.imaging--;
     if (outcome != OK) return outcome;
     DWORD fill = image->size;
@@ -572,7 +579,7 @@ EXPORT XI_RETURN xiGetImage(HANDLE handle, DWORD timeout_ms, XI_IMG *image) {
     return OK;
 }
 
-/* Nanoseconds per xiGetImage when a C program calls it, the least there can be. */
+/* Nanoseconds per xiGetImage called from C: the lower limit for any driver. */
 EXPORT double escape_stand_in_time(HANDLE handle, XI_IMG *image, long n) {
     int64_t start = si_now_ns();
     for (long k = 0; k < n; k++)

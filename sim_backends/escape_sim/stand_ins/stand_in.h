@@ -1,14 +1,14 @@
-/* Shared by the stand-ins of vendor libraries: fault script, call log, complaints, link to a simulated bench.
+/* Shared by the stand-ins of vendor libraries: fault script, call log, violations, connection to a bench.
  *
- * A stand-in is strict, not obliging: whatever the real library leaves undefined is complained of. Control
- * functions (escape_stand_in...) are exported beside the vendor's names; their presence tells a driver that
- * it is not on metal.
+ * A stand-in is strict: use that the real library leaves undefined is recorded as a violation. The control
+ * functions (escape_stand_in...) are exported beside the vendor's; their presence tells a driver that the
+ * device is simulated.
  *
  * Script, one rule per line or separated by ';':
  *     FUNCTION WHEN ACTION [ARGUMENT]     WHEN: N (the N-th call), N.. (from there on), N..M
  *     set KEY VALUE                       a property of the device
- * FUNCTION '*' counts the calls of all functions together. Actions: error CODE, ignore, timeout MS, reset,
- * short BYTES, unplug, half CODE, lose N; a library says which of them mean something to which function.
+ * FUNCTION '*' counts the calls of all functions. Actions: error CODE, ignore, timeout MS, reset,
+ * short BYTES, unplug, invalid_handle CODE, drop N; a library supports those that apply to a function.
  */
 #ifndef ESCAPE_STAND_IN_H
 #define ESCAPE_STAND_IN_H
@@ -33,11 +33,18 @@
 #define EXPORT __attribute__((visibility("default")))
 #define SI_RULES 256
 #define SI_LOG_BYTES (8u << 20)
-#define SI_PATIENCE_S 60 /* a twin compiles its optics on the first frame */
+#define SI_TIMEOUT_S 60 /* a simulated bench compiles its optics on the first frame */
 
-enum si_action { SI_NONE, SI_ERROR, SI_IGNORE, SI_TIMEOUT, SI_RESET, SI_SHORT, SI_UNPLUG, SI_HALF, SI_LOSE };
+enum si_action {
+    SI_NONE, SI_ERROR, SI_IGNORE, SI_TIMEOUT, SI_RESET, SI_SHORT, SI_UNPLUG, SI_INVALID_HANDLE, SI_DROP
+};
 static const char *const si_actions[] = {"", "error", "ignore", "timeout", "reset",
-                                         "short", "unplug", "half", "lose"};
+                                         "short", "unplug", "invalid_handle", "drop"};
+/* Words of version 0.1.0 and their present names. */
+static const char *const si_renamed[][2] = {
+    {"lose", "drop"}, {"half", "invalid_handle"}, {"peeks", "errors_stay"}, {"dim", "attenuation"},
+    {"pace", "real_time"}, {"first", "first_frame"}, {"lost_code", "disconnect_code"}, {"step", "increment"},
+};
 
 struct si_rule {
     char function[32];
@@ -46,7 +53,7 @@ struct si_rule {
     long argument;
 };
 
-/* One per vendor function, with its own count of calls. */
+/* One per vendor function, with the number of its calls. */
 struct si_function {
     const char *name;
     long calls;
@@ -63,12 +70,12 @@ static struct si_rule si_rules[SI_RULES];
 static int si_n_rules, si_recording, si_unplugged;
 static long si_calls;
 static struct si_function *si_functions;
-static struct si_text si_log_text, si_complaints;
+static struct si_text si_log_text, si_violations;
 
-/* Supplied by each library: a property of the device; 0 when there is no such key or value. */
-static int si_set(const char *key, const char *value);
-/* Supplied by each library: everything as freshly loaded. */
-static void si_forget(void);
+/* Supplied by each library: set a property of the device; 0 if the key or value is invalid. */
+static int si_set_property(const char *key, const char *value);
+/* Supplied by each library: restore the initial state of the device. */
+static void si_reset_device(void);
 
 static void si_append(struct si_text *text, const char *mark, const char *format, va_list arguments) {
     if (text->bytes == NULL && (text->bytes = malloc(SI_LOG_BYTES)) == NULL) return;
@@ -92,20 +99,20 @@ __attribute__((format(printf, 1, 2))) static void si_log(const char *format, ...
     va_end(arguments);
 }
 
-__attribute__((format(printf, 1, 2))) static void si_complain(const char *format, ...) {
+__attribute__((format(printf, 1, 2))) static void si_report_violation(const char *format, ...) {
     va_list arguments, again;
     va_start(arguments, format);
     va_copy(again, arguments);
     pthread_mutex_lock(&si_mutex);
-    si_append(&si_complaints, "", format, arguments);
+    si_append(&si_violations, "", format, arguments);
     if (si_recording) si_append(&si_log_text, "! ", format, again);
     pthread_mutex_unlock(&si_mutex);
     va_end(again);
     va_end(arguments);
 }
 
-/* Count a call; the rule that applies to it (action SI_NONE when none does). */
-static struct si_rule si_enter(struct si_function *function) {
+/* Count a call; returns the rule that applies to it (action SI_NONE without one). */
+static struct si_rule si_begin_call(struct si_function *function) {
     struct si_rule found = {.action = SI_NONE};
     pthread_mutex_lock(&si_mutex);
     if (function->calls++ == 0) {
@@ -127,11 +134,25 @@ static struct si_rule si_enter(struct si_function *function) {
     return found;
 }
 
-static int si_rule_of(const char *line) {
+static void si_replace_old_word(char *word, size_t size) {
+    for (size_t k = 0; k < sizeof si_renamed / sizeof *si_renamed; k++) {
+        const char *const *pair = si_renamed[k];
+        if (strcmp(word, pair[0]) != 0) continue;
+        fprintf(stderr, "deprecated: '%s' is now '%s'; the old word will be removed\n", word, pair[1]);
+        snprintf(word, size, "%s", pair[1]);
+        return;
+    }
+}
+
+static int si_parse_rule(const char *line) {
     char function[32], when[32], action[32], argument[64] = "";
     int n = sscanf(line, " %31s %31s %31s %63s", function, when, action, argument);
     if (n <= 0 || function[0] == '#') return 1;
-    if (strcmp(function, "set") == 0) return n == 3 && si_set(when, action);
+    if (strcmp(function, "set") == 0) {
+        si_replace_old_word(when, sizeof when);
+        return n == 3 && si_set_property(when, action);
+    }
+    si_replace_old_word(action, sizeof action);
     if (n < 3 || si_n_rules == SI_RULES) return 0;
     struct si_rule rule = {.action = SI_NONE};
     snprintf(rule.function, sizeof rule.function, "%s", function);
@@ -150,10 +171,10 @@ static int si_rule_of(const char *line) {
     return 1;
 }
 
-/* What kind of stand-in this is; the name alone tells a driver that there is no metal behind it. */
+/* Description of the stand-in; the presence of this function marks a simulated device. */
 EXPORT const char *escape_stand_in(void);
 
-/* Add rules; 0, or the number of the first line that means nothing (those before it are in force). */
+/* Add rules; returns 0, or the number of the first invalid line (those before it are in force). */
 EXPORT int escape_stand_in_script(const char *text) {
     char line[256];
     int number = 1;
@@ -161,7 +182,7 @@ EXPORT int escape_stand_in_script(const char *text) {
         size_t length = strcspn(text, "\n;");
         snprintf(line, sizeof line, "%.*s", (int)length, text);
         pthread_mutex_lock(&si_mutex);
-        int good = si_rule_of(line);
+        int good = si_parse_rule(line);
         pthread_mutex_unlock(&si_mutex);
         if (!good) return number;
         text += length + (text[length] != 0);
@@ -170,19 +191,19 @@ EXPORT int escape_stand_in_script(const char *text) {
     return 0;
 }
 
-/* Forget calls, script, complaints and the device's state, as if freshly loaded. */
+/* Clear calls, script and violations, and restore the device's initial state. */
 EXPORT void escape_stand_in_clear(void) {
     pthread_mutex_lock(&si_mutex);
     si_n_rules = si_unplugged = si_recording = 0;
     si_calls = 0;
-    si_log_text.length = si_complaints.length = 0;
+    si_log_text.length = si_violations.length = 0;
     for (struct si_function *f = si_functions; f; f = f->next) f->calls = 0;
     si_functions = NULL;
-    si_forget();
+    si_reset_device();
     pthread_mutex_unlock(&si_mutex);
     const char *script = getenv("ESCAPE_STAND_IN_SCRIPT");
     if (script != NULL && escape_stand_in_script(script) != 0) {
-        fprintf(stderr, "ESCAPE_STAND_IN_SCRIPT: a line means nothing: %s\n", script);
+        fprintf(stderr, "ESCAPE_STAND_IN_SCRIPT: invalid line in: %s\n", script);
         exit(2);
     }
 }
@@ -190,10 +211,10 @@ EXPORT void escape_stand_in_clear(void) {
 EXPORT void escape_stand_in_record(int on) { si_recording = on; }
 EXPORT long escape_stand_in_calls(void) { return si_calls; }
 
-/* Copy the log (which 0) or the complaints (which 1); the length of the whole text. */
+/* Copy the log (which 0) or the violations (which 1); returns the length of the whole text. */
 EXPORT size_t escape_stand_in_text(int which, char *out, size_t size) {
     pthread_mutex_lock(&si_mutex);
-    const struct si_text *text = which ? &si_complaints : &si_log_text;
+    const struct si_text *text = which ? &si_violations : &si_log_text;
     size_t length = text->length;
     if (out != NULL && size > 0) {
         size_t n = length < size - 1 ? length : size - 1;
@@ -204,7 +225,7 @@ EXPORT size_t escape_stand_in_text(int which, char *out, size_t size) {
     return length;
 }
 
-__attribute__((constructor)) static void si_loaded(void) { escape_stand_in_clear(); }
+__attribute__((constructor)) static void si_on_load(void) { escape_stand_in_clear(); }
 
 static int64_t si_now_ns(void) {
     struct timespec t;
@@ -217,14 +238,15 @@ static void si_sleep_until(int64_t ns) {
     while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL) == EINTR) continue;
 }
 
-/* ---- link to a simulated bench: a local socket, one request and one reply at a time -------------------- */
-enum si_verb { SI_HELLO = 1, SI_SEND, SI_START, SI_FRAME, SI_STOP };
+/* ---- connection to a simulated bench: a local socket, one request and one reply at a time ------------ */
+enum si_request_kind { SI_HELLO = 1, SI_SEND, SI_START, SI_FRAME, SI_STOP };
 
-struct si_link {
+struct si_connection {
     int fd;
 };
 
-static int si_all(int fd, void *bytes, size_t length, int out) {
+/* Send (out) or receive all bytes; 0 when the connection is lost. */
+static int si_transfer(int fd, void *bytes, size_t length, int out) {
     char *at = bytes;
     while (length) {
         ssize_t n = out ? send(fd, at, length, MSG_NOSIGNAL) : recv(fd, at, length, 0);
@@ -236,49 +258,50 @@ static int si_all(int fd, void *bytes, size_t length, int out) {
     return 1;
 }
 
-/* Ask the bench; its status (0 good, 1 nothing in time, 2 refused) or -1 when the bench has gone.
- * Up to size bytes of the reply go to out, *got says how many there were. */
-static int si_ask(struct si_link *link, uint32_t verb, const void *payload, uint32_t length, void *out,
-                  uint32_t size, uint32_t *got) {
-    uint32_t head[2] = {verb, length};
-    int32_t answer[2];
-    if (link->fd < 0) return -1;
-    if (!si_all(link->fd, head, sizeof head, 1) || !si_all(link->fd, (void *)payload, length, 1) ||
-        !si_all(link->fd, answer, sizeof answer, 0) || (uint32_t)answer[1] > size ||
-        !si_all(link->fd, out, (uint32_t)answer[1], 0)) {
-        close(link->fd);
-        link->fd = -1;
+/* Send a request; returns its status (0 success, 1 time-out, 2 refused), or -1 when the connection is lost.
+ * Up to size bytes of the reply are copied to out; *got is their number. */
+static int si_request(struct si_connection *connection, uint32_t kind, const void *payload, uint32_t length,
+                      void *out, uint32_t size, uint32_t *got) {
+    uint32_t head[2] = {kind, length};
+    int32_t reply[2];
+    if (connection->fd < 0) return -1;
+    int fd = connection->fd;
+    if (!si_transfer(fd, head, sizeof head, 1) || !si_transfer(fd, (void *)payload, length, 1) ||
+        !si_transfer(fd, reply, sizeof reply, 0) || (uint32_t)reply[1] > size ||
+        !si_transfer(connection->fd, out, (uint32_t)reply[1], 0)) {
+        close(connection->fd);
+        connection->fd = -1;
         return -1;
     }
-    if (got) *got = (uint32_t)answer[1];
-    return answer[0];
+    if (got) *got = (uint32_t)reply[1];
+    return reply[0];
 }
 
-static void si_unlink_bench(struct si_link *link) {
-    if (link->fd >= 0) close(link->fd);
-    link->fd = -1;
+static void si_disconnect_bench(struct si_connection *connection) {
+    if (connection->fd >= 0) close(connection->fd);
+    connection->fd = -1;
 }
 
 /* Connect to the bench of ESCAPE_STAND_IN_BENCH as the device of this kind and serial number.
- * 0: no bench is wanted; 1: connected, its greeting is in out; -1: it refused or is not there. */
-static int si_link_bench(struct si_link *link, const char *kind, const char *serial, void *out,
+ * 0: no bench is configured; 1: connected, its greeting is in out; -1: refused or not there. */
+static int si_connect_bench(struct si_connection *connection, const char *kind, const char *serial, void *out,
                          uint32_t size) {
-    link->fd = -1;
+    connection->fd = -1;
     const char *path = getenv("ESCAPE_STAND_IN_BENCH");
     if (path == NULL || *path == 0) return 0;
     struct sockaddr_un address = {.sun_family = AF_UNIX};
     snprintf(address.sun_path, sizeof address.sun_path, "%s", path);
-    link->fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
-    if (link->fd < 0) return -1;
-    /* A bench that was stopped in its tracks must not hold a driver for ever. */
-    struct timeval patience = {.tv_sec = SI_PATIENCE_S};
-    setsockopt(link->fd, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
-    setsockopt(link->fd, SOL_SOCKET, SO_SNDTIMEO, &patience, sizeof patience);
+    connection->fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
+    if (connection->fd < 0) return -1;
+    /* A bench that hangs must not block a driver for ever. */
+    struct timeval timeout = {.tv_sec = SI_TIMEOUT_S};
+    setsockopt(connection->fd, SOL_SOCKET, SO_RCVTIMEO, &timeout, sizeof timeout);
+    setsockopt(connection->fd, SOL_SOCKET, SO_SNDTIMEO, &timeout, sizeof timeout);
     char greeting[160];
     int n = snprintf(greeting, sizeof greeting, "%s %s", kind, serial);
-    if (connect(link->fd, (struct sockaddr *)&address, sizeof address) != 0 ||
-        si_ask(link, SI_HELLO, greeting, (uint32_t)n, out, size, NULL) != 0) {
-        si_unlink_bench(link);
+    if (connect(connection->fd, (struct sockaddr *)&address, sizeof address) != 0 ||
+        si_request(connection, SI_HELLO, greeting, (uint32_t)n, out, size, NULL) != 0) {
+        si_disconnect_bench(connection);
         return -1;
     }
     return 1;

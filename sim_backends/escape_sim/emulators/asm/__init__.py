@@ -1,1 +1,1 @@
-"""Emulated adaptive secondary on ESCAPE's TCP link, written from docs/devices/asm-link.md without code of the driver."""
+"""Emulated adaptive secondary on ESCAPE's TCP link, written from docs/devices/asm-link.md."""

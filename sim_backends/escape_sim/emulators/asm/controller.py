@@ -1,4 +1,4 @@
-"""The emulated mirror behind the link: what it takes, what it refuses, and when it stops itself."""
+"""Controller of the emulated adaptive secondary: state transitions, limits, watchdog, alarms."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from escape_hw.api.adaptive_secondary import STATE_ORDER, ShellState
 from escape_sim.emulators.asm import protocol
 from escape_sim.mirror.shell import TRANSITION_S, Shell
 
-#: Alarms of the mean gap in metres and of a coil's current in amperes.
+#: Alarm limits of the mean gap in metres and of a coil's current in amperes.
 GAP_ALARMS_M, CURRENT_ALARM_A = (5e-6, 120e-6), 0.79
-#: Checks in a row that must fail before the mirror stops itself.
+#: Consecutive failed checks after which the mirror trips.
 CHECKS_TO_TRIP = 3
-#: Commands skipped in a row after which the mirror opens the loop by itself.
+#: Consecutive skipped commands after which the mirror opens the loop.
 MAX_CONSECUTIVE_SKIPS = 100
-#: Head-room for commands that arrive in single precision.
+#: Relative tolerance of the limits for commands in single precision.
 _ROUNDING_MARGIN = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class AsmLimits:
-    """The mirror's own limits in metres of surface from flat, and its patience in seconds."""
+    """The mirror's own limits in metres of surface from flat, and its time-outs in seconds."""
 
     max_command_m: float
     max_step_m: float
@@ -33,20 +33,29 @@ class AsmLimits:
 
 
 class AsmController:
-    """Shell, watchdog and limits. Times are monotonic seconds that the caller tells.
+    """Shell, watchdog and limits. Times are monotonic seconds given by the caller.
 
     Parameters
     ----------
     shell
-        What floats.
+        The shell.
     limits
-        Of the mirror itself.
+        Limits of the mirror itself.
     contaminated
-        Actuators that it has taken out of service.
+        Actuators that the mirror has taken out of service.
     speed
-        Steps of the ladder take this many times less than on the real mirror.
+        Factor by which state transitions are faster than on the real mirror.
     pass_time
-        Lets simulated seconds pass; steps of the ladder then end at once.
+        Advances simulated time by seconds; state transitions then end at once.
+
+    Attributes
+    ----------
+    present_m
+        Last shape applied ``(n_act,)``, metres from flat.
+    pending_skips
+        Number of coming commands that are skipped by a fault.
+    last_event
+        Why the mirror rested or opened the loop on its own; empty if it did not.
     """
 
     def __init__(
@@ -61,20 +70,16 @@ class AsmController:
         self.shell, self.limits, self._speed, self._pass_time = shell, limits, speed, pass_time
         n_act = shell.n_act
         self.flat_m = np.zeros(n_act)
-        #: Last shape applied ``(n_act,)``, metres from flat.
         self.present_m = np.zeros(n_act)
         self.contaminated, self.disabled = set(contaminated), set[int]()
         self.parameters = {"telemetry_hz": 10.0, "gap_alarm_m": GAP_ALARMS_M[1]}
         self.applied = self.skipped = self.consecutive_skips = 0
-        #: So many commands to come are skipped whatever they are.
         self.pending_skips = 0
         self.holding = False
-        #: Why the mirror rested or opened the loop by itself, for who sends it commands afterwards.
-        self.note = ""
+        self.last_event = ""
         self._transition: tuple[ShellState, float] | None = None
         self._failed_checks = 0
 
-    # ------------------------------------------------------------------ state
     @property
     def out_of_service(self) -> set[int]:
         """Contaminated or disabled actuators."""
@@ -82,20 +87,20 @@ class AsmController:
 
     @property
     def is_changing_state(self) -> bool:
-        """True while a step of the ladder is on its way."""
+        """Whether a state transition is in progress."""
         return self._transition is not None
 
     def request_state(self, wanted: ShellState, now: float) -> tuple[int, str]:
-        """Start a step; a result and what there is to say."""
+        """Start a state transition; returns result code and message."""
         state = self.shell.state
         if state is ShellState.FAULT:
             return protocol.PANIC, self.shell.fault
         if self._transition is not None:
-            return protocol.WRONG_STATE, f"on its way to {self._transition[0]}"
+            return protocol.WRONG_STATE, f"in transition to {self._transition[0]}"
         if wanted is state:
-            return protocol.APPLIED, "there already"
+            return protocol.APPLIED, "already there"
         if wanted is ShellState.FAULT or abs(STATE_ORDER.index(wanted) - STATE_ORDER.index(state)) != 1:
-            return protocol.WRONG_STATE, f"no step leads from {state} to {wanted}"
+            return protocol.WRONG_STATE, f"no transition from {state} to {wanted}"
         duration = TRANSITION_S[wanted]
         if self._pass_time is not None:
             self._pass_time(duration)
@@ -107,7 +112,7 @@ class AsmController:
     def _finish_transition_if_due(self, now: float) -> None:
         if self._transition is not None and now >= self._transition[1]:
             self._finish_transition(self._transition[0])
-            self.note = ""
+            self.last_event = ""
 
     def _finish_transition(self, state: ShellState) -> None:
         self._transition, self.consecutive_skips, self.holding = None, 0, False
@@ -116,28 +121,24 @@ class AsmController:
         self.shell.finish_transition(state, (self.flat_m + self.present_m) / self.shell.stroke_m)
 
     def rest_autonomously(self, reason: str) -> None:
-        """Controlled rest without anybody asking."""
-        self.note = reason
+        """Rest on the mirror's own initiative."""
+        self.last_event = reason
         self._finish_transition(ShellState.RESTED)
 
     def trip(self, reason: str) -> None:
-        """Coils off, latched."""
+        """Coils off; a latched fault."""
         self._transition, self.holding = None, False
         self.present_m = np.zeros(self.shell.n_act)
         self.shell.trip(reason)
 
     def recover(self) -> None:
-        """End a fault whose cause is gone."""
+        """End a fault whose cause has gone."""
         if self.shell.state is ShellState.FAULT and not self.shell.excess_a:
             self._failed_checks = 0
             self.shell.recover()
 
-    # ------------------------------------------------------------------ commands
     def command(self, metres: NDArray[np.float32], absolute: bool) -> tuple[int, int]:
-        """Take a shape or skip it; result and number of values that were changed.
-
-        The caller has seen to length, finiteness and state.
-        """
+        """Apply or skip a finite shape ``(n_act,)``; returns result code and number of changed values."""
         wanted = metres.astype(np.float64)
         if absolute:
             wanted -= self.flat_m
@@ -155,30 +156,24 @@ class AsmController:
         return (protocol.CLIPPED if out_of_service_moved else protocol.APPLIED), len(out_of_service_moved)
 
     def _count_skip(self) -> int:
-        """Count a skipped command; the last shape stays."""
+        """Count a skipped command; the last shape is kept."""
         self.skipped += 1
         self.consecutive_skips += 1
         if self.consecutive_skips >= MAX_CONSECUTIVE_SKIPS:
-            self.note = f"{MAX_CONSECUTIVE_SKIPS} commands skipped in a row"
+            self.last_event = f"{MAX_CONSECUTIVE_SKIPS} commands skipped in a row"
             self._finish_transition(ShellState.SET)
         return protocol.SKIPPED
 
-    # ------------------------------------------------------------------ by itself
     def tick(self, now: float, since_last_frame_s: float) -> str:
-        """Look after itself; returns the fault if this look has found one.
+        """Check watchdog and alarms; returns the fault if one was found.
 
-        Parameters
-        ----------
-        now
-            Monotonic seconds.
-        silent_s
-            Time since the owner's last sound frame.
+        ``since_last_frame_s`` is the time since the owner's last valid frame.
         """
         self._finish_transition_if_due(now)
         if self.shell.state is ShellState.RUNNING:
             self.holding = since_last_frame_s > self.limits.hold_s
             if since_last_frame_s > self.limits.rest_s:
-                self.rest_autonomously(f"the watchdog rested it: no news for {self.limits.rest_s:g} s")
+                self.rest_autonomously(f"the watchdog rested it: no frame for {self.limits.rest_s:g} s")
         return self._check_alarms()
 
     def _check_alarms(self) -> str:
@@ -198,13 +193,12 @@ class AsmController:
         self.trip(alarm)
         return alarm
 
-    # ------------------------------------------------------------------ what it tells
     def positions_m(self) -> NDArray[np.float64]:
         """Measured positions ``(n_act,)`` in metres from flat; NaN where unreadable."""
         return self.shell.measure_positions() * self.shell.stroke_m - self.flat_m
 
     def flags(self) -> NDArray[np.uint8]:
-        """A byte of flags for each actuator, see ``docs/devices/asm-link.md``."""
+        """One byte of flags per actuator, see ``docs/devices/asm-link.md``."""
         flags = np.zeros(self.shell.n_act, np.uint8)
         for bits, numbers in (
             (0b1001, self.contaminated),
@@ -216,7 +210,7 @@ class AsmController:
         return flags
 
     def set_parameter(self, key: str, value: float) -> str:
-        """Set a parameter; returns what is wrong with it, empty when it is in force."""
+        """Set a parameter; returns an error message, empty if it was set."""
         allowed = {"telemetry_hz": (0.1, 100.0), "gap_alarm_m": (60e-6, GAP_ALARMS_M[1])}
         if key not in allowed:
             return f"no parameter {key!r}; there are: {', '.join(sorted(allowed))}"

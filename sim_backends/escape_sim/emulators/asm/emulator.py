@@ -1,4 +1,4 @@
-"""``escape emulate asm``: an adaptive secondary mirror that answers on ESCAPE's own TCP link."""
+"""``escape emulate asm``: an adaptive secondary on ESCAPE's TCP link."""
 
 from __future__ import annotations
 
@@ -9,22 +9,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from escape_hw.api.emulator import Emulator, EmulatorRequest
+from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 from escape_sim.devices.twins import shared_bench
+from escape_sim.emulators.asm.connection import AsmFault, parse_fault_script
 from escape_sim.emulators.asm.controller import AsmController, AsmLimits
-from escape_sim.emulators.asm.server import AsmFault, AsmServer, parse_fault_script
+from escape_sim.emulators.asm.server import AsmServer
+from escape_sim.emulators.faults import current_word
 from escape_sim.mirror.shell import MovingActuators, RealTimeActuators, Shell
 
 if TYPE_CHECKING:
-    from escape_hw.config.system import SystemConfig
+    pass
 
-#: Port unless told otherwise; the driver's default is the same.
+#: Default port, as of the driver.
 PORT = 7336
-#: Watchdog: the shape is held after so many seconds without news, the shell rested after so many.
+#: Watchdog: times in seconds without a frame after which the shape is held and the shell is rested.
 HOLD_S, REST_S = 0.3, 1.0
-#: On the twin, whose time is not real, the computer may be busy for longer.
+#: The same on a simulated bench, whose computation may take longer than the simulated time.
 TWIN_HOLD_S, TWIN_REST_S = 5.0, 20.0
-_OPTIONS = ("system", "dust", "fault", "speed", "hold", "rest", "versions")
+_OPTIONS = ("system", "contaminated", "fault", "transition_speed", "hold_s", "rest_s", "versions")
+_RENAMED_OPTIONS = {
+    "dust": "contaminated", "speed": "transition_speed", "hold": "hold_s", "rest": "rest_s",
+}  # fmt: skip
 
 
 def make_emulator(request: EmulatorRequest) -> AsmEmulator:
@@ -33,35 +39,37 @@ def make_emulator(request: EmulatorRequest) -> AsmEmulator:
     Raises
     ------
     ConfigError
-        An option is unknown or makes no sense.
+        An option is unknown or has no valid value.
     """
-    options = dict(request.options)
-    unknown = [key for key in options if key not in _OPTIONS]
-    if unknown:
-        raise ConfigError(f"--option {unknown[0]}: unknown; the emulator 'asm' has {', '.join(_OPTIONS)}")
     if request.pty:
-        raise ConfigError("--pty: an adaptive secondary is on the network; leave it out")
+        raise ConfigError("--pty: an adaptive secondary is on the network; omit it")
     return AsmEmulator(request)
 
 
-class AsmEmulator(Emulator):
-    """The mirror of a system behind a TCP port, in a thread of its own.
+def _current_options(request: EmulatorRequest) -> dict[str, str]:
+    options = {current_word(key, _RENAMED_OPTIONS): value for key, value in request.options.items()}
+    unknown = [key for key in options if key not in _OPTIONS]
+    if unknown:
+        raise ConfigError(f"--option {unknown[0]}: unknown; the emulator 'asm' has {', '.join(_OPTIONS)}")
+    return options
 
-    Options: ``system`` (whose mirror; ``maps-nir``), ``dust`` (further contaminated actuators,
-    ``17,18``), ``fault`` (see :func:`escape_sim.emulators.asm.server.parse_fault_script`), ``speed`` (of the steps
-    between states), ``hold`` and ``rest`` (watchdog, seconds), ``versions`` (``1,1``: lowest and
-    highest that it speaks).
+
+class AsmEmulator(Emulator):
+    """The adaptive secondary of a system behind a TCP port, in its own thread.
+
+    Options: ``system`` (default ``maps-nir``), ``contaminated`` (further contaminated actuators,
+    ``17,18``), ``fault`` (see :func:`~escape_sim.emulators.asm.connection.parse_fault_script`),
+    ``transition_speed`` (factor on the speed of state transitions), ``hold_s`` and ``rest_s`` (watchdog,
+    seconds), ``versions`` (lowest and highest supported, ``1,1``).
     """
 
     def __init__(self, request: EmulatorRequest) -> None:
-        options = dict(request.options)
-        config = request.config or _load_system(options.get("system", "maps-nir"))
-        on_twin = request.shared is not None
-        hold, rest = (TWIN_HOLD_S, TWIN_REST_S) if on_twin else (HOLD_S, REST_S)
+        options = _current_options(request)
+        config = request.config or load_system(options.get("system", "maps-nir"))
         dm = config.devices.dm
-        actuators: MovingActuators
         bench = shared_bench(config, request.shared) if request.shared is not None else None
-        actuators = bench or RealTimeActuators(dm.n_act, config.twin.mirror.settling_s)
+        hold, rest = (HOLD_S, REST_S) if bench is None else (TWIN_HOLD_S, TWIN_REST_S)
+        actuators: MovingActuators = bench or RealTimeActuators(dm.n_act, config.twin.mirror.settling_s)
         noise = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(0xA5,)))
         limits = dm.limits
         slew = limits.max_slew if limits.max_slew is not None else 2.0
@@ -69,29 +77,21 @@ class AsmEmulator(Emulator):
             Shell(actuators, dm.n_act, dm.stroke_m, noise),
             AsmLimits(
                 limits.max_stroke * dm.stroke_m, slew * dm.stroke_m,
-                _positive_option(options, "hold", hold), _positive_option(options, "rest", rest),
+                _positive_option(options, "hold_s", hold), _positive_option(options, "rest_s", rest),
             ),
-            {*limits.disabled, *_actuator_option(options.get("dust", ""), dm.n_act)},
-            speed=_positive_option(options, "speed", 1.0),
+            {*limits.disabled, *_actuator_option(options.get("contaminated", ""), dm.n_act)},
+            speed=_positive_option(options, "transition_speed", 1.0),
             pass_time=None if bench is None else lambda s: bench.advance_to(bench.now_s + s),
         )  # fmt: skip
-        low, high = (int(_positive_option({"versions": v}, "versions", 1)) for v in _version_option(options))
-        self.server = AsmServer(
-            self.controller, dm.serial, parse_fault_script(options.get("fault", "")), (low, high)
-        )
+        faults, versions = parse_fault_script(options.get("fault", "")), _version_option(options)
+        self.server = AsmServer(self.controller, dm.serial, faults, versions)
         self._host, self._port = request.host, PORT if request.port is None else request.port
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._address = ""
 
     def start(self) -> str:
-        """Begin to listen; returns ``tcp HOST:PORT``.
-
-        Raises
-        ------
-        ConfigError
-            The address cannot be listened on.
-        """
+        """Listen; returns ``tcp HOST:PORT``, raises ConfigError if the address cannot be used."""
         if self._thread is not None:
             return self._address
         loop = asyncio.new_event_loop()
@@ -99,14 +99,16 @@ class AsmEmulator(Emulator):
             port = loop.run_until_complete(self.server.listen(self._host, self._port))
         except OSError as error:
             loop.close()
-            raise ConfigError(f"cannot listen on {self._host}:{self._port} ({error})") from error
+            raise ConfigError(
+                f"cannot listen on {self._host}:{self._port} ({error}); choose another --port, 0 for any"
+            ) from error
         self._loop, self._address = loop, f"tcp {self._host}:{port}"
         self._thread = threading.Thread(target=loop.run_forever, name="asm emulator", daemon=True)
         self._thread.start()
         return self._address
 
     def stop(self) -> None:
-        """Hang up and stop listening; may be repeated."""
+        """Close all connections and stop listening; may be repeated."""
         if self._thread is None or self._loop is None:
             return
         asyncio.run_coroutine_threadsafe(self.server.shut_down(), self._loop).result()
@@ -116,21 +118,21 @@ class AsmEmulator(Emulator):
         self._thread = self._loop = None
 
     def inject(self, text: str) -> None:
-        """Have a fault of the mirror happen now, such as ``dust:17``.
+        """Apply a fault of the mirror now, such as ``contaminate:17``.
 
         Raises
         ------
         ConfigError
-            No such fault.
+            The fault is unknown.
         """
         fault = AsmFault.from_text(text)
         if self._loop is not None:
             self._loop.call_soon_threadsafe(self.server.apply_mirror_fault, fault)
 
     @property
-    def complaints(self) -> tuple[str, ...]:
-        """What clients did that a careful driver would not, in order."""
-        return tuple(self.server.complaints)
+    def violations(self) -> tuple[str, ...]:
+        """Violations of the protocol by clients, in order."""
+        return tuple(self.server.violations)
 
     def report(self) -> dict[str, Any]:
         """Counters and the mirror's present state."""
@@ -138,18 +140,13 @@ class AsmEmulator(Emulator):
         return {
             "state": str(controller.shell.state),
             "fault": controller.shell.fault,
-            "note": controller.note,
+            "last_event": controller.last_event,
+            "note": controller.last_event,  # name of version 0.1.0
             "applied": controller.applied,
             "skipped": controller.skipped,
             "requests": len(server.calls),
             "damaged_frames": server.damaged,
         }
-
-
-def _load_system(name: str) -> SystemConfig:
-    from escape_hw.config.loader import load_system
-
-    return load_system(name)
 
 
 def _positive_option(options: dict[str, str], key: str, default: float) -> float:
@@ -163,15 +160,16 @@ def _positive_option(options: dict[str, str], key: str, default: float) -> float
     return value
 
 
-def _version_option(options: dict[str, str]) -> tuple[str, str]:
-    low, comma, high = options.get("versions", "1,1").partition(",")
-    if not comma:
-        raise ConfigError(f"--option versions={low}: write LOWEST,HIGHEST")
-    return low, high
+def _version_option(options: dict[str, str]) -> tuple[int, int]:
+    text = options.get("versions", "1,1")
+    low, _, high = text.partition(",")
+    if not (low.isdigit() and high.isdigit()):
+        raise ConfigError(f"--option versions={text}: write LOWEST,HIGHEST")
+    return int(low), int(high)
 
 
 def _actuator_option(text: str, n_act: int) -> set[int]:
     numbers = [part.strip() for part in text.split(",") if part.strip()]
     if not all(part.isdigit() and int(part) < n_act for part in numbers):
-        raise ConfigError(f"--option dust={text}: write numbers of actuators, 0 to {n_act - 1}")
+        raise ConfigError(f"--option contaminated={text}: write numbers of actuators, 0 to {n_act - 1}")
     return {int(part) for part in numbers}

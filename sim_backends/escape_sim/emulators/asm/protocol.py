@@ -1,7 +1,7 @@
-"""The adaptive-secondary link as the mirror's side reads and writes it.
+"""The adaptive-secondary link as the mirror's side decodes and encodes it.
 
-Written from ``docs/devices/asm-link.md`` and nothing else: driver and emulator share no code, so that
-each finds the other's mistakes.
+Written from ``docs/devices/asm-link.md`` only: driver and emulator share no code, so that errors in one
+of them show in the other.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ MAX_PAYLOAD_BYTES = 64 * 1024
 
 
 class DamagedFrame(Exception):
-    """Bytes that are no frame; the connection ends."""
+    """The received bytes are not a frame; the connection ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class AsmRequest:
-    """One whole frame from a client."""
+    """A complete frame from a client."""
 
     kind: int
     version: int
@@ -46,17 +46,17 @@ class AsmRequest:
 
     @property
     def name(self) -> str:
-        """Its type in words."""
+        """Name of its type."""
         return NAMES.get(self.kind, f"type {self.kind}")
 
 
 def decode_frame(buffer: bytearray) -> AsmRequest | None:
-    """Take the first whole frame off the buffer; ``None``: it is not whole yet.
+    """Remove the first frame from the buffer; None if it is not complete.
 
     Raises
     ------
-    Damaged
-        The buffer does not begin with a sound frame.
+    DamagedFrame
+        The buffer does not begin with a valid frame.
     """
     start = bytes(buffer[:4])
     if start != b"ASM1"[: len(start)]:
@@ -79,20 +79,19 @@ def decode_frame(buffer: bytearray) -> AsmRequest | None:
 
 
 def encode_frame(kind: int, sequence: int, now_ns: int, payload: bytes) -> bytes:
-    """A frame to a client."""
+    """Encode a frame to a client."""
     head = b"ASM1" + struct.pack("<BBHIIQ", VERSION, kind, 0, sequence & 0xFFFFFFFF, len(payload), now_ns)
     return head + zlib.crc32(head).to_bytes(4, "little") + payload + zlib.crc32(payload).to_bytes(4, "little")
 
 
-# --------------------------------------------------------------------- requests
 def read_hello(payload: bytes) -> tuple[int, int, int, int, str]:
-    """Lowest and highest version, role, token, name."""
+    """Lowest and highest version, role, token and name of the client."""
     low, high, role, _, token = struct.unpack("<BBBBQ", payload[:12])
     return low, high, role, token, read_text(payload[12:])
 
 
 def read_command(payload: bytes, n_act: int) -> tuple[int, int, NDArray[np.float32]] | None:
-    """Counter, mode and shape ``(n_act,)`` in metres; ``None``: the length is wrong."""
+    """Counter, mode and shape ``(n_act,)`` in metres; None if the length is wrong."""
     if len(payload) != 8 + 4 * n_act:
         return None
     counter, mode = struct.unpack("<IB", payload[:5])
@@ -100,32 +99,31 @@ def read_command(payload: bytes, n_act: int) -> tuple[int, int, NDArray[np.float
 
 
 def read_disabled(payload: bytes) -> tuple[set[int], str]:
-    """Actuators and reason."""
+    """Disabled actuators, and the reason."""
     size = int.from_bytes(payload[:2], "little")
     bits = payload[2 : 2 + size]
     if len(bits) != size:
-        raise ValueError("bitmap cut short")
+        raise ValueError("truncated bitmap")
     numbers = {8 * i + k for i, byte in enumerate(bits) for k in range(8) if byte >> k & 1}
     return numbers, read_text(payload[2 + size :])
 
 
 def read_text(payload: bytes) -> str:
-    """A counted text that ends the payload."""
+    """Text with its length in front, which ends the payload."""
     size = int.from_bytes(payload[:2], "little")
     if len(payload) != 2 + size:
         raise ValueError("text of the wrong length")
     return payload[2:].decode()
 
 
-# --------------------------------------------------------------------- replies
 def encode_text(string: str) -> bytes:
-    """A counted text."""
+    """Text with its length in front."""
     data = string.encode()[:65535]
     return len(data).to_bytes(2, "little") + data
 
 
 def encode_bitmap(numbers: Iterable[int], n_act: int) -> bytes:
-    """A counted bitmap over every actuator."""
+    """Bitmap over all actuators with its length in front."""
     data = bytearray((n_act + 7) // 8)
     for number in numbers:
         data[number // 8] |= 1 << number % 8
@@ -133,5 +131,5 @@ def encode_bitmap(numbers: Iterable[int], n_act: int) -> bytes:
 
 
 def encode_floats(values: NDArray[np.floating]) -> bytes:
-    """Single-precision numbers."""
+    """Numbers in single precision."""
     return np.asarray(values, dtype="<f4").tobytes()

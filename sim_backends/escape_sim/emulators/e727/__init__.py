@@ -1,1 +1,1 @@
-"""Emulated PI E-727 controller with an S-330 tip-tilt stage: GCS 2.0, servo, wave generators, data recorder, network, serial line and USB."""
+"""Emulated PI E-727 controller with an S-330 tip-tilt stage (GCS 2.0)."""

@@ -1,4 +1,4 @@
-"""The emulated PI E-727: bytes in, a reply for each command out. Knows nothing of sockets."""
+"""The emulated PI E-727: executes GCS commands and returns their replies; no sockets."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from escape_sim.emulators.e727.gcs import (
     ONE_BYTE,
     CommandFramer,
     GcsError,
+    format_items,
     format_lines,
-    items,
-    number,
     parse_integer,
+    parse_number,
     value_text,
 )
 from escape_sim.emulators.e727.motion import MotionCommands
@@ -28,8 +28,10 @@ from escape_sim.emulators.e727.wave_generator import WaveGenerators
 
 IDENTITY = "(c)2015-2018 Physik Instrumente (PI) GmbH & Co. KG, E-727.3SDA, {serial}, 14.11.01.05 emulated"
 Handler = Callable[[Sequence[str]], str | None]
-#: Points of a turn that optics are told.
+#: Points of a modulation cycle for the optics.
 _SAMPLES = 256
+#: Cycle with its cause: generators running, and trajectories of the axes.
+_CycleCache = tuple[int, list[Trajectory], tuple[float, NDArray[np.float64]] | None]
 
 
 class E727Controller:
@@ -37,10 +39,15 @@ class E727Controller:
 
     Parameters
     ----------
-    make
-        Which controller and stage to be.
+    settings
+        Properties of controller and stage.
     clock
-        Seconds, monotonic.
+        Monotonic seconds.
+
+    Attributes
+    ----------
+    received_commands
+        Every command in order.
     """
 
     def __init__(
@@ -49,76 +56,71 @@ class E727Controller:
         self.settings = settings or ControllerSettings()
         self.state = ControllerState(self.settings, clock)
         self.lock = threading.RLock()
-        #: Every command as it was understood, in order.
         self.received_commands: list[str] = []
         self._framer = CommandFramer()
         self._unread_command = ""
-        self._cycle_cache: tuple[int, list[Trajectory], tuple[float, NDArray[np.float64]] | None] | None = (
-            None
-        )
+        self._cycle_cache: _CycleCache | None = None
         self._build_handlers()
 
     def _build_handlers(self) -> None:
-        """Handlers for the present state."""
-        self.waves = WaveGenerators(self.state)
-        motion, waves, recorder = MotionCommands(self.state), self.waves, self.state.recorder
-        self._motion = motion
+        """Create the handlers for the present state."""
+        self.waves = waves = WaveGenerators(self.state)
+        self._motion = motion = MotionCommands(self.state)
+        recorder = self.state.recorder
         self._handlers: dict[str, Handler] = {
-            "*IDN?": self._identity, "CSV?": lambda _: "2.0\n", "SAI?": self._axes, "HLP?": self._help,
-            "HPA?": self._parameter_list, "VER?": lambda _: "FW_DSP: 14.11.01.05\n", "CST?": self._stages,
-            "IFC?": lambda _: "RSBAUD=115200\n",
+            **motion.queries(), **waves.queries(),
+            "*IDN?": lambda _: IDENTITY.format(serial=self.settings.serial) + "\n",
+            "CSV?": lambda _: "2.0\n", "SAI?": lambda _: format_lines(["1", "2", "3"]),
+            "HLP?": self._help, "HPA?": self._parameter_list, "VER?": lambda _: "FW_DSP: 14.11.01.05\n",
+            "CST?": self._stages, "IFC?": lambda _: "RSBAUD=115200\n",
             "CCL": self._set_level, "CCL?": lambda _: f"{self.state.level}\n",
-            "SPA": self._set_parameter, "SPA?": self._parameters, "WPA": self._save, "RBT": self._reboot,
-            "SVO": motion.servo, "SVO?": motion.servos, "SVA": motion.volts, "SVA?": motion.commanded_volts,
-            "VOL?": motion.voltages, "ATZ": motion.auto_zero, "ATZ?": motion.is_zeroed, "MOV": motion.move,
-            "MVR": motion.move_by, "MOV?": motion.targets, "POS?": motion.positions, "ONT?": motion.on_target,
-            "VEL": motion.velocity, "VEL?": motion.velocities, "TMN?": motion.lower, "TMX?": motion.upper,
-            "PUN?": motion.units, "HLT": motion.halt, "STP": motion.halt,
+            "SPA": self._set_parameter, "SPA?": self._parameters, "WPA": self._save,
+            "RBT": lambda _: self.reset(),
+            "SVO": motion.set_servo, "SVA": motion.set_volts, "ATZ": motion.auto_zero, "MOV": motion.move,
+            "MVR": motion.move_by, "VEL": motion.set_velocity, "HLT": motion.halt, "STP": motion.halt,
             "WAV": waves.define, "WAV?": waves.lengths, "GWD?": waves.read, "WCL": waves.clear,
-            "WSL": waves.select, "WSL?": waves.selections, "WGC": waves.set_cycles, "WGC?": waves.cycles,
-            "WOS": waves.set_offset, "WOS?": waves.offsets, "WTR": waves.set_rate, "WTR?": waves.rates,
-            "WGO": waves.set_modes, "WGO?": waves.modes, "WGR": self._start_recording, "STE": self._step_response,
-            "IMP": self._step_response, "TWC": waves.clear_trigger, "TWS": waves.set_trigger,
+            "WSL": waves.select, "WGC": waves.set_cycles, "WOS": waves.set_offset, "WTR": waves.set_rate,
+            "WGO": waves.set_modes, "WGR": lambda _: recorder.start(),
+            "STE": self._step_response, "IMP": self._step_response,
+            "TWC": waves.clear_trigger, "TWS": waves.set_trigger,
             "CTO": waves.set_output, "CTO?": waves.output, "DRC": recorder.configure,
-            "DRC?": recorder.configuration, "DRT": recorder.set_trigger,
-            "DRT?": lambda _: "0=0 0\n",
+            "DRC?": recorder.configuration, "DRT": recorder.set_trigger, "DRT?": lambda _: "0=0 0\n",
             "RTR": recorder.set_rate, "RTR?": lambda _: f"{recorder.rate}\n",
             "TNR?": lambda _: f"{len(recorder.sources)}\n", "DRL?": recorder.lengths, "DRR?": recorder.read,
         }  # fmt: skip
 
-    # ------------------------------------------------------------------ wire
     def receive(self, data: bytes) -> list[str | None]:
-        """Take what arrived; returns the commands that it completes, for :meth:`execute`."""
+        """Split received bytes; returns the commands that they complete, for :meth:`execute`."""
         with self.lock:
             return list(self._framer.feed(data))
 
     def execute(self, line: str | None) -> bytes:
-        """Carry out a command (``None``: a line that was too long); returns its reply, empty if none."""
+        """Execute a command (None: a line that was too long); returns its reply, empty if it has none."""
         with self.lock:
             return self._execute(line)
 
     def end_session(self) -> str:
-        """The client has gone: an unfinished line is forgotten. Returns how it left the stage."""
+        """The client has disconnected; returns the condition of the stage."""
         with self.lock:
             self._framer.clear()
-            self._check_error_was_read("hung up")
+            self._check_error_was_read("disconnected")
             return self.state.describe()
 
     def _execute(self, line: str | None) -> bytes:
         if line is None:
-            return self._refuse("a line without end", GcsError(3))
+            return self._refuse("a line that is too long", GcsError(3))
         readable = ONE_BYTE.get(line, line)
         self.received_commands.append(readable)
         try:
             return self._dispatch(line)
-        except GcsError as refusal:
-            return self._refuse(readable, refusal)
+        except GcsError as error:
+            return self._refuse(readable, error)
 
-    def _refuse(self, line: str, refusal: GcsError) -> bytes:
-        """Remember the error. A careful driver foresees every refusal; a stop is none."""
-        self.state.error = refusal.number
-        if refusal.number != 10:
-            self.state.report_violation(f"{line}: {refusal}")
+    def _refuse(self, line: str, error: GcsError) -> bytes:
+        """Set the error number; a violation unless it is a stop, since a driver can foresee the others."""
+        self.state.error = error.number
+        if error.number != 10:
+            self.state.report_violation(f"{line}: {error}")
         self._unread_command = "" if line.partition(" ")[0].endswith("?") else line
         return b""
 
@@ -142,13 +144,13 @@ class E727Controller:
         return b"" if reply is None else reply.encode("cp1252")
 
     def _check_error_was_read(self, now: str) -> None:
-        """Complain when the last set command's error was never asked for."""
+        """Report a violation if the error of the last set command was not queried."""
         if self._unread_command:
             self.state.report_violation(f"no ERR? after '{self._unread_command}' (then: '{now}')")
             self._unread_command = ""
 
     def _handle_single_byte(self, line: str) -> bytes:
-        """Commands of a single byte, as people write them."""
+        """Commands of a single byte, in their written form."""
         if line == "#24":
             self._motion.halt([])
         busy = any(self.state.is_zeroing(name) for name in self.state.axes)
@@ -156,13 +158,6 @@ class E727Controller:
         if line == "#7":
             return bytes([0xB0 if busy else 0xB1, 0x0A])
         return f"{reply[line]}\n".encode()
-
-    # ------------------------------------------------------------------ housekeeping
-    def _identity(self, args: Sequence[str]) -> str:
-        return IDENTITY.format(serial=self.settings.serial) + "\n"
-
-    def _axes(self, args: Sequence[str]) -> str:
-        return format_lines(["1", "2", "3"])
 
     def _help(self, args: Sequence[str]) -> str:
         return format_lines(
@@ -178,7 +173,7 @@ class E727Controller:
         names = {"1": "S-330.2SL", "2": "S-330.2SL", "3": "NOSTAGE"}
         if any(name not in names for name in args):
             raise GcsError(15)
-        return items({name: names[name] for name in args or names})
+        return format_items({name: names[name] for name in args or names})
 
     def _set_level(self, args: Sequence[str]) -> None:
         if not args:
@@ -195,7 +190,7 @@ class E727Controller:
             raise GcsError(26)
         if self.state.level < 1:
             raise GcsError(60)
-        item, parameter, value = args[0], parse_integer(args[1]), number(args[2])
+        item, parameter, value = args[0], parse_integer(args[1]), parse_number(args[2])
         if (item, parameter) not in self.state.parameters:
             raise GcsError(54)
         if parameter >= 0x0E000000:
@@ -208,7 +203,7 @@ class E727Controller:
         )
         if any(key not in self.state.parameters for key in keys):
             raise GcsError(54)
-        # The identifier comes back without its leading zeros.
+        # The parameter's number is returned without leading zeros.
         return format_lines(
             [f"{item} 0x{key:X}={value_text(self.state.parameters[item, key])}" for item, key in keys]
         )
@@ -217,19 +212,13 @@ class E727Controller:
         if list(args) != ["100"]:
             raise GcsError(56)
 
-    def _start_recording(self, args: Sequence[str]) -> None:
-        self.state.recorder.start()
-
     def _step_response(self, args: Sequence[str]) -> None:
-        """``STE`` and ``IMP``: recorded moves; the stage here makes the step only."""
+        """``STE`` and ``IMP``: recorded moves; only the step is simulated."""
         self.state.recorder.start()
         self._motion.move_by(args)
 
-    def _reboot(self, args: Sequence[str]) -> None:
-        self.reset()
-
     def reset(self, *, power_cut: bool = False) -> None:
-        """Start anew; a power cut forgets auto-zero as well."""
+        """Restart; a power cut also resets auto-zero."""
         with self.lock:
             zeroed = not power_cut and all(axis.zeroed for axis in self.state.axes.values())
             self.state.power_up(zeroed=zeroed)
@@ -237,23 +226,19 @@ class E727Controller:
             self._unread_command = ""
             self._build_handlers()
 
-    # ------------------------------------------------------------------ optics
     def steady_cycle(self) -> tuple[float, NDArray[np.float64]] | None:
-        """One turn of the stage once it has settled: duration in seconds, true places ``(_SAMPLES, 2)``.
+        """Modulation cycle of the settled stage: seconds, and true positions ``(_SAMPLES, 2)`` in urad.
 
-        In microradians; ``None`` while not both axes are driven by waves of one period. The same object
-        as long as nothing changes.
+        None unless both axes are driven by waves of one period. The same object until something
+        changes.
         """
         with self.lock:
-            sources = [axis.trajectory for axis in self.state.stage.axes.values()]
+            trajectories = [axis.trajectory for axis in self.state.stage.axes.values()]
             running = self.waves.running()
-            if (
-                self._cycle_cache is None
-                or self._cycle_cache[0] != running
-                or self._cycle_cache[1] != sources
-            ):
-                self._cycle_cache = (running, sources, self._compute_steady_cycle())
-            return self._cycle_cache[2]
+            cached = self._cycle_cache
+            if cached is None or cached[0] != running or cached[1] != trajectories:
+                cached = self._cycle_cache = (running, trajectories, self._compute_steady_cycle())
+            return cached[2]
 
     def _compute_steady_cycle(self) -> tuple[float, NDArray[np.float64]] | None:
         lengths, tracks = set(), []

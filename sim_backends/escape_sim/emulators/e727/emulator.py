@@ -1,8 +1,8 @@
-"""Emulator ``e727``: PI's tip-tilt controller on the network, a serial line or USB."""
+"""``escape emulate e727``: PI's tip-tilt controller on the network, a serial line or USB."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,13 @@ from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.errors import ConfigError
 from escape_sim.emulators.e727.controller import E727Controller
 from escape_sim.emulators.e727.state import ControllerSettings
-from escape_sim.emulators.e727.transports import FaultInjector, PtyServer, TcpServer, parse_fault_script
-
-if TYPE_CHECKING:
-    from escape_sim.emulators.e727.transports import E727Server
+from escape_sim.emulators.e727.transports import (
+    E727Server,
+    FaultInjector,
+    PtyServer,
+    TcpServer,
+    parse_fault_script,
+)
 
 #: Port of the real controller.
 PORT = 50000
@@ -27,75 +30,64 @@ def make_emulator(request: EmulatorRequest) -> E727Emulator:
     Raises
     ------
     ConfigError
-        An option is unknown or wrong.
+        An option is unknown or has no valid value.
     """
     return E727Emulator(request)
 
 
 class E727Emulator(Emulator):
-    """A PI E-727 with an S-330 on its wire.
+    """An emulated PI E-727 with an S-330, as ``controller``.
 
-    Options: ``serial``; ``auto-zero``, its duration in seconds; ``zeroed=1``, auto-zero was done before;
-    ``fault``, such as ``drop@12,close@40`` (see :mod:`escape_sim.emulators.e727.transports`).
-
-    Parameters
-    ----------
-    request
-        Where to answer and which controller to be.
-
-    Attributes
-    ----------
-    controller
-        What answers.
+    Options: ``serial``; ``auto-zero``, its duration in seconds; ``zeroed=1`` if auto-zero was done before;
+    ``fault``, such as ``drop_reply@12,close@40`` (see :mod:`escape_sim.emulators.e727.transports`).
     """
 
     def __init__(self, request: EmulatorRequest) -> None:
         self.controller = E727Controller(_parse_options(request))
         faults = FaultInjector(parse_fault_script(request.options.get("fault", "")))
+        port = PORT if request.port is None else request.port
         self.server: E727Server = (
             PtyServer(self.controller, faults)
             if request.pty
-            else TcpServer(
-                self.controller, faults, request.host, PORT if request.port is None else request.port
-            )
+            else TcpServer(self.controller, faults, request.host, port)
         )
         if request.shared is not None and request.config is not None:
             self._attach_to_twin(request.config, request.shared)
 
     def _attach_to_twin(self, config: Any, shared: dict[str, object]) -> None:
-        """From now on the twin's beam goes where this stage points, where there is a twin."""
-        # Imported here: an emulator that stands alone needs no optics.
+        """Let this stage move the beam of the simulated bench, if there is one."""
+        # Imported here: without a bench the emulator needs no optics.
         from escape_sim.devices.twins import existing_bench
 
         bench = existing_bench(shared)
         if bench is None:
             return
-        urad = 1e-6
         centre = self.controller.settings.travel / 2
-        section = config.devices.modulator
-        gains = np.array(section.stage.axis_gain)
+        gains = np.array(config.devices.modulator.stage.axis_gain)
 
-        def to_tilt(places: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.asarray((places - centre) * urad * gains)
+        def to_tilt(positions_urad: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray((positions_urad - centre) * 1e-6 * gains)
 
         bench.beam_path.follow_stage(self.controller.steady_cycle, to_tilt)
 
     def start(self) -> str:
-        """Begin to listen; returns where."""
+        """Start; returns the address."""
         return self.server.start()
 
     def stop(self) -> None:
-        """Hang up and stop listening."""
+        """Close the connection and stop listening; may be repeated."""
         self.server.stop()
 
     @property
-    def complaints(self) -> tuple[str, ...]:
-        """What clients did that a careful driver would not."""
-        return tuple(self.controller.state.complaints)
+    def violations(self) -> tuple[str, ...]:
+        """Violations of the protocol by clients, in order."""
+        return tuple(self.controller.state.violations)
 
     def report(self) -> dict[str, Any]:
-        """Counters and condition."""
-        return {**self.controller.report(), "left": self.server.client_session.final_condition}
+        """Counters and conditions."""
+        final = self.server.client_session.final_condition
+        # "left" is the name of version 0.1.0.
+        return {**self.controller.report(), "final_condition": final, "left": final}
 
 
 def _parse_options(request: EmulatorRequest) -> ControllerSettings:
@@ -106,9 +98,9 @@ def _parse_options(request: EmulatorRequest) -> ControllerSettings:
     try:
         seconds = float(options.get("auto-zero", defaults.auto_zero_s))
     except ValueError:
-        raise ConfigError(f"auto-zero={options['auto-zero']}: give its duration in seconds") from None
+        raise ConfigError(f"auto-zero={options['auto-zero']}: not a number of seconds") from None
     if not 0 < seconds <= 600:
-        raise ConfigError(f"auto-zero={seconds:g}: it takes between 0 and 600 seconds")
+        raise ConfigError(f"auto-zero={seconds:g}: must lie in 0..600 seconds")
     if options.get("zeroed", "0") not in ("0", "1"):
         raise ConfigError(f"zeroed={options['zeroed']}: write 0 or 1")
     return ControllerSettings(

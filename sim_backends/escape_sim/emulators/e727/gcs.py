@@ -1,7 +1,7 @@
-"""The General Command Set 2.0 as a controller reads and writes it: framing, arguments, replies.
+"""General Command Set 2.0 as a controller reads and writes it: framing, arguments, replies, errors.
 
-Facts from the manual of the E-727 (E727T0005): lines end with a line feed, a few commands are a single
-byte without one, a line has 32 arguments at most, replies of several lines end each line but the last
+Facts from the manual of the E-727 (E727T0005): lines end with a line feed; a few commands are a single
+byte without one; a line has at most 32 arguments; in replies of several lines each line but the last ends
 with a blank before the line feed.
 """
 
@@ -13,9 +13,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-#: Commands of a single byte, and how people write them: moving, ready, macro, generators, stop all.
+#: Commands of a single byte, and their written form: moving, ready, macro, generators, stop all.
 ONE_BYTE = {"\x05": "#5", "\x07": "#7", "\x08": "#8", "\x09": "#9", "\x18": "#24"}
-#: Arguments and bytes of a line at most.
+#: Largest number of arguments and of bytes of a line.
 MAX_ARGUMENTS, MAX_LINE = 32, 4096
 ENCODING = "cp1252"
 
@@ -35,7 +35,7 @@ ERRORS = {
 
 
 class GcsError(Exception):
-    """The controller refuses a command; its number is what ``ERR?`` tells."""
+    """A command is refused; ``number`` is returned by ``ERR?``."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"error {number} ({ERRORS.get(number, 'unknown')})")
@@ -43,14 +43,14 @@ class GcsError(Exception):
 
 
 class CommandFramer:
-    """Cuts what arrives into commands, however it is split up."""
+    """Splits received bytes into commands, however they are fragmented."""
 
     def __init__(self) -> None:
         self._line = bytearray()
         self._overflowed = False
 
     def feed(self, data: bytes) -> Iterator[str | None]:
-        """Commands that ``data`` completes; ``None`` stands for a line that was too long."""
+        """Commands that ``data`` completes; None for a line that is too long."""
         for byte in data:
             if byte == 0x0A:
                 line, self._line = self._line, bytearray()
@@ -67,19 +67,13 @@ class CommandFramer:
                 self._line.append(byte)
 
     def clear(self) -> None:
-        """Forget an unfinished line: whoever sent it has gone."""
+        """Discard an unfinished line."""
         self._line.clear()
         self._overflowed = False
 
 
-def number(text: str) -> float:
-    """A finite number.
-
-    Raises
-    ------
-    Refusal
-        25 when it is none.
-    """
+def parse_number(text: str) -> float:
+    """Parse a finite number; raises error 25 otherwise."""
     try:
         value = float(text)
     except ValueError:
@@ -90,18 +84,18 @@ def number(text: str) -> float:
 
 
 def parse_integer(text: str) -> int:
-    """A whole number, decimal or hexadecimal."""
+    """Parse an integer, decimal or hexadecimal; raises error 25 otherwise."""
     try:
         return int(text, 0)
     except ValueError:
-        value = number(text)
+        value = parse_number(text)
         if value != int(value):
             raise GcsError(25) from None
         return int(value)
 
 
 def group_arguments(args: Sequence[str], size: int) -> list[Sequence[str]]:
-    """Arguments in groups of ``size``; at least one group."""
+    """Split arguments into groups of ``size``, at least one; raises error 26 or 24 otherwise."""
     if not args:
         raise GcsError(26)
     if len(args) % size:
@@ -110,22 +104,22 @@ def group_arguments(args: Sequence[str], size: int) -> list[Sequence[str]]:
 
 
 def value_text(value: float | int | str) -> str:
-    """A value as the controller prints it."""
+    """Format a value as the controller does."""
     return f"{value:.9e}" if isinstance(value, float) else str(value)
 
 
 def format_lines(rows: Sequence[str]) -> str:
-    """A reply of one or more lines."""
+    """Format a reply of one or more lines."""
     return " \n".join(rows) + "\n"
 
 
-def items(values: Mapping[str, float | int | str]) -> str:
-    """A reply in the form ``1=0.000000000e+00``."""
+def format_items(values: Mapping[str, float | int | str]) -> str:
+    """Format a reply of the form ``1=0.000000000e+00``."""
     return format_lines([f"{key}={value_text(value)}" for key, value in values.items()])
 
 
-def array(columns: Mapping[str, NDArray[np.float64]], sample_s: float) -> str:
-    """An array in the form of ``DRR?`` and ``GWD?``: a header, then one row for each point."""
+def format_array(columns: Mapping[str, NDArray[np.float64]], sample_s: float) -> str:
+    """Format an array as ``DRR?`` and ``GWD?`` do: a header, then one row per point."""
     table = np.stack(list(columns.values()), axis=1)
     header = ["# TYPE = 1", "# SEPARATOR = 32", f"# DIM = {table.shape[1]}"]
     header += [f"# SAMPLE_TIME = {sample_s:.6f}", f"# NDATA = {table.shape[0]}"]

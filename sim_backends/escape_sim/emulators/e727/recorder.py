@@ -1,4 +1,4 @@
-"""The controller's data recorder: positions and targets of the axes, on the servo's clock."""
+"""Data recorder of the emulated controller: target and measured positions on the servo clock."""
 
 from __future__ import annotations
 
@@ -7,24 +7,25 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_sim.emulators.e727.gcs import GcsError, array, format_lines, group_arguments, items, parse_integer
+from escape_sim.emulators.e727.gcs import (
+    GcsError,
+    format_array,
+    format_items,
+    format_lines,
+    group_arguments,
+    parse_integer,
+)
 from escape_sim.emulators.e727.stage import SERVO_S, Stage
 
-#: Tables, and the points that they share.
+#: Number of tables, and of points that they share.
 TABLES, POINTS = 8, 262_144
-#: What can be recorded: nothing, target, position.
+#: Recording options: nothing, target, position.
 NOTHING, TARGET, POSITION = 0, 1, 2
 _NAMES = {TARGET: "Target Position of axis", POSITION: "Current Position of axis"}
 
 
 class DataRecorder:
-    """Fills its tables from a start on.
-
-    Parameters
-    ----------
-    stage
-        Whose axes are recorded.
-    """
+    """Records the axes of a stage in tables, from a start until they are full."""
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
@@ -35,17 +36,12 @@ class DataRecorder:
         self._next_step = 0
 
     @property
-    def capacity(self) -> int:
-        """Points of each table."""
-        return POINTS // TABLES
-
-    @property
     def running(self) -> bool:
-        """True between a start and full tables."""
-        return self._start_step >= 0 and self._length() < self.capacity
+        """Whether it records: started, and tables not full."""
+        return self._start_step >= 0 and self._length() < POINTS // TABLES
 
     def start(self) -> None:
-        """Begin anew, now."""
+        """Clear the tables and record from now on."""
         self._stage.advance()
         if self.running:
             self._stage.remove_listener(self._record)
@@ -61,7 +57,7 @@ class DataRecorder:
     def _record(self, first: int, tracks: dict[str, NDArray[np.float64]]) -> None:
         count = len(next(iter(tracks.values())))
         steps = np.arange(max(self._next_step, first), first + count)
-        steps = steps[(steps - self._start_step) % self.rate == 0][: self.capacity - self._length()]
+        steps = steps[(steps - self._start_step) % self.rate == 0][: POINTS // TABLES - self._length()]
         for table, chunks in self._recorded.items():
             axis, option = self.sources[table]
             track = (
@@ -74,7 +70,6 @@ class DataRecorder:
         if not self.running:
             self._stage.remove_listener(self._record)
 
-    # ------------------------------------------------------------------ commands
     def configure(self, args: Sequence[str]) -> None:
         """``DRC table trajectory option``."""
         for text, axis, option in group_arguments(args, 3):
@@ -93,7 +88,7 @@ class DataRecorder:
         )
 
     def set_rate(self, args: Sequence[str]) -> None:
-        """``RTR``: servo steps for each point."""
+        """``RTR``: servo steps per point."""
         ((text,),) = group_arguments(args, 1)[:1]
         if len(args) != 1:
             raise GcsError(24)
@@ -102,16 +97,16 @@ class DataRecorder:
         self.rate = parse_integer(text)
 
     def set_trigger(self, args: Sequence[str]) -> None:
-        """``DRT table trajectory value``: here for all tables (0) and the usual commands (0) only."""
+        """``DRT table source value``: only all tables (0) and the default source (0) are supported."""
         for text, option, _value in group_arguments(args, 3):
             if parse_integer(text) or parse_integer(option):
                 raise GcsError(59)
 
     def lengths(self, args: Sequence[str]) -> str:
-        """``DRL?``: points recorded."""
+        """``DRL?``: number of points recorded."""
         self._stage.advance()
         tables = [self._table(text) for text in args] or list(self.sources)
-        return items({str(table): sum(map(len, self._recorded.get(table, []))) for table in tables})
+        return format_items({str(table): sum(map(len, self._recorded.get(table, []))) for table in tables})
 
     def read(self, args: Sequence[str]) -> str:
         """``DRR? offset points tables``."""
@@ -128,7 +123,7 @@ class DataRecorder:
             axis, option = self.sources[table]
             data = np.concatenate(self._recorded[table])
             columns[f"{_NAMES[option]}{axis} (table {table})"] = data[first - 1 : first - 1 + count]
-        return array(columns, SERVO_S * self.rate)
+        return format_array(columns, SERVO_S * self.rate)
 
     def _table(self, text: str) -> int:
         if parse_integer(text) not in self.sources:

@@ -1,4 +1,4 @@
-"""What all parts of the emulated controller share: axes, servos, parameters, errors, complaints."""
+"""State of the emulated controller: axes, servos, parameters, error number, protocol violations."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from escape_sim.emulators.e727.gcs import GcsError
+from escape_sim.emulators.e727.gcs import GcsError, format_items
 from escape_sim.emulators.e727.recorder import POINTS, TABLES, DataRecorder
 from escape_sim.emulators.e727.stage import SERVO_S, Axis, Hold, Ramp, Stage, Wave
 
-#: Microradians per volt, and the volts that the amplifier gives.
+#: Microradians per volt, and range of the amplifier in volts.
 PER_VOLT, VOLTS = 20.0, (-30.0, 130.0)
-#: How far the sensors are off before auto-zero, in microradians.
+#: Offset of the sensors before auto-zero in microradians.
 UNZEROED_OFFSET = 30.0
 
 
 @dataclass(frozen=True)
 class ControllerSettings:
-    """Which controller and stage to be.
+    """Properties of controller and stage.
 
     Parameters
     ----------
@@ -30,9 +30,9 @@ class ControllerSettings:
     loops
         Frequency (Hz) and damping of each axis' closed loop.
     auto_zero_s
-        Duration of auto-zero; about a minute on the real one.
+        Duration of auto-zero in seconds; about a minute on the real controller.
     zeroed
-        Auto-zero was done before (it survives until power is cut).
+        Whether auto-zero was done before; it is kept until power is cut.
     """
 
     serial: str = "0123456789"
@@ -56,27 +56,19 @@ class AxisState:
 
 @dataclass
 class ControllerState:
-    """The controller's state.
-
-    Parameters
-    ----------
-    make
-        Which one it is.
-    clock
-        Seconds, monotonic.
-    """
+    """State of a controller, on a monotonic ``clock`` in seconds."""
 
     settings: ControllerSettings
     clock: Callable[[], float]
     error: int = 0
     level: int = 0
-    complaints: list[str] = field(default_factory=list)
+    violations: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.power_up(zeroed=self.settings.zeroed)
 
     def power_up(self, *, zeroed: bool) -> None:
-        """State after a reset; what auto-zero found survives one, not a power cut."""
+        """State after a reset. The result of auto-zero survives a reset but not a power cut."""
         loops = zip(("1", "2"), self.settings.loops, strict=True)
         self.stage = Stage({name: Axis(*loop) for name, loop in loops}, self.clock)
         self.recorder = DataRecorder(self.stage)
@@ -92,34 +84,32 @@ class ControllerState:
         self.parameters |= {("1", number): value for number, value in system.items()}
 
     def report_violation(self, text: str) -> None:
-        """Write down what a careful driver would not do."""
-        self.complaints.append(text)
+        """Record a violation of the protocol by a client."""
+        self.violations.append(text)
 
     def axis(self, name: str) -> Axis:
-        """A moving axis.
-
-        Raises
-        ------
-        Refusal
-            15 for an unknown axis, and for the third channel, which carries no stage.
-        """
+        """A moving axis; raises error 15 for other names and for the third channel, which has no stage."""
         if name not in self.stage.axes:
             raise GcsError(15)
         return self.stage.axes[name]
 
     def axes_of(self, args: Sequence[str]) -> list[str]:
-        """The axes that a query names; all when it names none."""
+        """The axes named by a query, by default all."""
         for name in args:
             self.axis(name)
         return list(args) or list(self.axes)
 
+    def per_axis(self, value: Callable[[str], float | int | str]) -> Callable[[Sequence[str]], str]:
+        """Handler of a query that returns ``value(axis)`` for each axis."""
+        return lambda args: format_items({name: value(name) for name in self.axes_of(args)})
+
     def travel(self, name: str) -> tuple[float, float]:
-        """Range of an axis, as its parameters have it."""
+        """Range of an axis in microradians, from its parameters."""
         low, high = (self.parameters[name, number] for number in (0x07000000, 0x07000001))
         return float(low), float(high)
 
     def is_wave_driven(self, name: str) -> bool:
-        """True while a wave generator drives the axis."""
+        """Whether a wave generator drives the axis."""
         trajectory = self.stage.axes[name].trajectory
         return (
             isinstance(trajectory, Wave)
@@ -128,7 +118,7 @@ class ControllerState:
         )
 
     def is_zeroing(self, name: str) -> bool:
-        """True while auto-zero runs; ends it when its time has come."""
+        """Whether auto-zero is running; completes it when its time is over."""
         axis = self.axes[name]
         if axis.zero_end_step is None:
             return False
@@ -142,29 +132,29 @@ class ControllerState:
         return False
 
     def require_idle(self, name: str) -> None:
-        """Refuse while auto-zero or a wave generator moves the axis."""
+        """Raise an error while auto-zero (61) or a wave generator (73) moves the axis."""
         if self.is_zeroing(name):
             raise GcsError(61)
         if self.is_wave_driven(name):
             raise GcsError(73)
 
     def position(self, name: str) -> float:
-        """What the axis' sensor says now."""
+        """Present reading of the axis' sensor in microradians."""
         self.stage.advance()
-        # A closed loop makes right what its sensor says, however far that is off.
+        # A closed loop corrects to the sensor's reading, whatever its offset.
         is_accurate = self.axes[name].zeroed or self.axes[name].servo
         offset = 0.0 if is_accurate else UNZEROED_OFFSET
         return self.stage.axes[name].position + offset
 
     def target(self, name: str) -> float:
-        """Where the axis is told to be now; of a move its end."""
+        """Present target of an axis in microradians; for a move its end."""
         trajectory = self.stage.axes[name].trajectory
         if isinstance(trajectory, Ramp):
             return trajectory.end
         return float(self.stage.axes[name].trajectory.at(np.array([self.stage.now]))[0])
 
     def describe(self) -> str:
-        """In what condition the stage is: turning, servo on, driven or at rest."""
+        """Condition of the stage: "turning", "servo on", "driven" or "at rest"."""
         if any(self.is_wave_driven(name) for name in self.axes):
             return "turning"
         if any(axis.servo for axis in self.axes.values()):

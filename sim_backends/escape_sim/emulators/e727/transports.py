@@ -1,7 +1,8 @@
-"""Transports of the emulated controller (network, serial line, USB endpoints), one client at a time, with scripted faults."""
+"""Transports of the emulated controller (network, serial line, USB), one client at a time, with faults."""
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import os
 import select
@@ -9,80 +10,69 @@ import socket
 import threading
 import time
 import tty
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Mapping
 
 from escape_hw.errors import ConfigError
 from escape_sim.emulators.e727.controller import E727Controller
+from escape_sim.emulators.faults import current_word, split_fault_script
 
-#: Lost command; lost, late, doubled, cut reply; noise before it; hang-up; reset; no answer any more.
-FAULT_KINDS = ("lose", "drop", "late", "double", "truncate", "garbage", "close", "reset", "power", "stall")
-
-
-@dataclass(frozen=True, slots=True)
-class WireFault:
-    """One fault.
-
-    Parameters
-    ----------
-    kind
-        One of :data:`FAULT_KINDS`.
-    at
-        Number of the command, counted from 0 since the emulator started.
-    """
-
-    kind: str
-    at: int
+#: Kinds of fault: lost command; lost, late, repeated or cut reply; noise before it; closed connection,
+#: without or with a reset or a power cut of the controller; no replies any more.
+FAULT_KINDS = (
+    "drop_command", "drop_reply", "delay", "double", "truncate", "garbage", "close", "reset", "power_cut",
+    "stall",
+)  # fmt: skip
+_RENAMED_FAULTS = {
+    "lose": "drop_command", "drop": "drop_reply", "late": "delay", "power": "power_cut",
+}  # fmt: skip
+_CUTS = ("close", "reset", "power_cut")
 
 
-def parse_fault_script(text: str) -> tuple[WireFault, ...]:
-    """``drop@12,late@30`` as faults.
+def parse_fault_script(script: str) -> dict[int, str]:
+    """Faults of a script such as ``drop_reply@12,delay@30``, by the number of the command.
 
     Raises
     ------
     ConfigError
-        Not of that form.
+        The script has another form.
     """
-    faults = []
-    for part in filter(None, text.split(",")):
-        kind, _, at = part.strip().partition("@")
-        if kind not in FAULT_KINDS or not at.isdigit():
-            raise ConfigError(f"fault {part!r}: write KIND@NUMBER, KIND one of {', '.join(FAULT_KINDS)}")
-        faults.append(WireFault(kind, int(at)))
-    return tuple(faults)
+    faults = {}
+    for word, number in split_fault_script(script):
+        kind = current_word(word, _RENAMED_FAULTS)
+        if kind not in FAULT_KINDS:
+            raise ConfigError(f"fault {word!r}: write KIND@NUMBER, KIND one of {', '.join(FAULT_KINDS)}")
+        faults[number] = kind
+    return faults
 
 
 class ConnectionCut(Exception):
-    """The wire is to be cut now."""
+    """A fault ends the connection."""
 
 
 class FaultInjector:
-    """Passes replies on, or not.
+    """Applies faults, given by the number of the command since the start, to replies.
 
-    Parameters
-    ----------
-    faults
-        What is to happen when.
+    ``is_stalled`` is true once no command is answered any more.
     """
 
-    def __init__(self, faults: tuple[WireFault, ...] = ()) -> None:
-        self._faults = {fault.at: fault.kind for fault in faults}
+    def __init__(self, faults: Mapping[int, str] | None = None) -> None:
+        self._faults = dict(faults or {})
         self._delayed = b""
         self._n_commands = 0
         self.is_stalled = False
 
     def next_fault(self) -> str:
-        """The fault of the next command; empty: none."""
+        """Fault of the next command; empty without one."""
         kind = self._faults.get(self._n_commands, "")
         self._n_commands += 1
         self.is_stalled = self.is_stalled or kind == "stall"
         return kind
 
     def apply(self, kind: str, reply: bytes) -> bytes:
-        """What reaches the client of a reply."""
-        if self.is_stalled or kind in ("drop", "lose"):
+        """Bytes sent for a reply; a delayed reply is sent with the next one."""
+        if self.is_stalled or kind in ("drop_reply", "drop_command"):
             return b""
-        if kind == "late":
+        if kind == "delay":
             self._delayed += reply
             return b""
         delayed, self._delayed = self._delayed, b""
@@ -95,24 +85,14 @@ class FaultInjector:
         return delayed + reply
 
 
-#: How long a server sleeps before it looks whether it should stop, in seconds.
+#: Period in seconds at which a server checks whether it should stop.
 _POLL_S = 0.05
 
 
 class ClientSession:
-    """One client's bytes through the faults to the controller and back.
+    """Passes a client's bytes to the controller and its replies back, with faults.
 
-    Parameters
-    ----------
-    controller
-        Who answers.
-    wire
-        The faults.
-
-    Attributes
-    ----------
-    left
-        In what condition the last client left the stage; empty before anybody left.
+    ``final_condition`` is the condition in which the last client left the stage; empty before.
     """
 
     def __init__(self, controller: E727Controller, faults: FaultInjector) -> None:
@@ -120,106 +100,93 @@ class ClientSession:
         self.final_condition = ""
 
     def feed(self, data: bytes) -> bytes:
-        """What goes back to the client.
-
-        Raises
-        ------
-        HangUp
-            The script cuts the wire now; what the exception carries has been sent before.
-        """
+        """Process received bytes; returns the bytes to send. Raises ConnectionCut if a fault says so."""
         outgoing = b""
         for line in self._controller.receive(data):
             kind = self._faults.next_fault()
-            reply = b"" if kind == "lose" or self._faults.is_stalled else self._controller.execute(line)
-            if kind in ("reset", "power"):
-                self._controller.reset(power_cut=kind == "power")
-            if kind in ("close", "reset", "power"):
+            is_lost = kind == "drop_command" or self._faults.is_stalled
+            reply = b"" if is_lost else self._controller.execute(line)
+            if kind in ("reset", "power_cut"):
+                self._controller.reset(power_cut=kind == "power_cut")
+            if kind in _CUTS:
                 raise ConnectionCut(kind)
             outgoing += self._faults.apply(kind, reply)
         return outgoing
 
     def finish(self) -> None:
-        """The client has gone."""
+        """The client has disconnected."""
         self.final_condition = self._controller.end_session()
 
 
-class E727Server(Protocol):
-    """Something that listens in a thread of its own.
+class E727Server(abc.ABC):
+    """A server in its own thread, with the session of its client."""
 
-    Attributes
-    ----------
-    conversation
-        With whoever is connected.
-    """
-
-    client_session: ClientSession
-
-    def start(self) -> str:
-        """Begin; returns where."""
-        ...
-
-    def stop(self) -> None:
-        """End."""
-        ...
-
-
-class TcpServer:
-    """Listens on the network; a second client is turned away while the first is connected.
-
-    Parameters
-    ----------
-    controller, wire
-        Who answers, through which faults.
-    host, port
-        Where; port 0: any that is free.
-    """
-
-    def __init__(self, controller: E727Controller, faults: FaultInjector, host: str, port: int) -> None:
-        self._controller, self._address = controller, (host, port)
+    def __init__(self, controller: E727Controller, faults: FaultInjector) -> None:
+        self._controller = controller
         self.client_session = ClientSession(controller, faults)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
+
+    @abc.abstractmethod
+    def start(self) -> str:
+        """Start; returns the address."""
+
+    def stop(self) -> None:
+        """End the connection and stop; may be repeated."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._close()
+
+    def _start_thread(self, serve: Callable[[], None]) -> None:
+        self._stop.clear()
+        self._thread = threading.Thread(target=serve, name=type(self).__name__, daemon=True)
+        self._thread.start()
+
+    @abc.abstractmethod
+    def _close(self) -> None:
+        """Close what :meth:`start` opened."""
+
+
+class TcpServer(E727Server):
+    """TCP server for one client; further clients are refused. Port 0 takes any free port."""
+
+    def __init__(self, controller: E727Controller, faults: FaultInjector, host: str, port: int) -> None:
+        super().__init__(controller, faults)
+        self._address = (host, port)
         self._listener: socket.socket | None = None
 
     def start(self) -> str:
-        """Begin to listen; returns ``tcp HOST:PORT``."""
+        """Listen; returns ``tcp HOST:PORT``, raises ConfigError if the address cannot be used."""
         host, port = self._address
         try:
-            self._listener = socket.create_server((host, port))
+            self._listener = listener = socket.create_server((host, port))
         except OSError as error:
             raise ConfigError(
                 f"cannot listen on {host}:{port} ({error.strerror or error}); choose another --port, "
                 "0 for any"
             ) from error
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._serve, name="e727-tcp", daemon=True)
-        self._thread.start()
-        return "tcp {}:{}".format(*self._listener.getsockname()[:2])
+        self._start_thread(lambda: self._serve(listener))
+        return f"tcp {listener.getsockname()[0]}:{self.port}"
 
     @property
     def port(self) -> int:
-        """The port listened on."""
+        """The port in use."""
         if self._listener is None:
             raise RuntimeError("the server has not been started")
         return int(self._listener.getsockname()[1])
 
-    def stop(self) -> None:
-        """Hang up and stop listening."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+    def _close(self) -> None:
         if self._listener is not None:
             self._listener.close()
             self._listener = None
 
-    def _serve(self) -> None:
-        listener = self._listener
-        assert listener is not None
+    def _serve(self, listener: socket.socket) -> None:
         client: socket.socket | None = None
         while not self._stop.is_set():
             ready, _, _ = select.select([listener, *([client] if client else [])], [], [], _POLL_S)
-            # Who hangs up makes room, also for one who rang at the same moment.
+            # A disconnection is processed before a new client that connects at the same time.
             if client in ready and client is not None and not self._exchange(client):
                 self._close_client(client)
                 client = None
@@ -241,7 +208,7 @@ class TcpServer:
         return new_client
 
     def _exchange(self, client: socket.socket) -> bool:
-        """One exchange; false when the client has gone or is to go."""
+        """Process received bytes; False if the connection is to be closed."""
         try:
             data = client.recv(65536)
             if data and (outgoing := self.client_session.feed(data)):
@@ -255,39 +222,23 @@ class TcpServer:
         self.client_session.finish()
 
 
-class PtyServer:
-    """Answers on a pseudo-terminal, as on a serial line or USB-serial adapter.
+class PtyServer(E727Server):
+    """Server on a pseudo-terminal, as on a serial line or USB-serial adapter."""
 
-    Parameters
-    ----------
-    controller, wire
-        Who answers, through which faults.
-    """
-
-    def __init__(self, controller: E727Controller, faults: FaultInjector) -> None:
-        self.client_session = ClientSession(controller, faults)
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._descriptors: tuple[int, int] | None = None
+    _descriptors: tuple[int, int] | None = None
 
     def start(self) -> str:
-        """Begin; returns ``pty /dev/pts/N``."""
+        """Open the terminal; returns ``pty /dev/pts/N``."""
         ours, theirs = os.openpty()
         tty.setraw(theirs)
-        # The other end stays open here too: a terminal that nobody holds reports errors for ever.
+        # The other end is kept open here, too: reading fails when nobody has opened it.
         self._descriptors = (ours, theirs)
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._serve, args=(ours,), name="e727-pty", daemon=True)
-        self._thread.start()
+        self._start_thread(lambda: self._serve(ours))
         return f"pty {os.ttyname(theirs)}"
 
     def stop(self) -> None:
-        """Pull the plug."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-        self._close()
+        """Close the terminal."""
+        super().stop()
         self.client_session.finish()
 
     def _close(self) -> None:
@@ -311,13 +262,7 @@ class PtyServer:
 
 
 class UsbPipe:
-    """The bulk endpoints of a USB controller, for a stand-in of libusb.
-
-    Parameters
-    ----------
-    controller, wire
-        Who answers, through which faults.
-    """
+    """Bulk endpoints of the controller, for a replacement of libusb."""
 
     def __init__(self, controller: E727Controller, faults: FaultInjector) -> None:
         self._controller = controller
@@ -331,18 +276,12 @@ class UsbPipe:
         return self._controller.settings.serial
 
     def write(self, data: bytes) -> None:
-        """Bulk transfer to the controller.
-
-        Raises
-        ------
-        ConnectionError
-            Unplugged.
-        """
+        """Bulk transfer to the controller; raises ConnectionError if it is unplugged."""
         if not self.is_plugged:
             raise ConnectionError
         if len(data) % 2:
             self._controller.state.report_violation(
-                f"a USB transfer of {len(data)} bytes; pad to an even number"
+                f"a USB transfer of {len(data)} bytes; pad it to an even number"
             )
         try:
             self._outgoing += self.client_session.feed(data)
@@ -351,13 +290,7 @@ class UsbPipe:
             raise ConnectionError from None
 
     def read(self, size: int, timeout_s: float) -> bytes:
-        """Bulk transfer from the controller; empty when nothing comes in time.
-
-        Raises
-        ------
-        ConnectionError
-            Unplugged.
-        """
+        """Bulk transfer from the controller; empty after ``timeout_s``. ConnectionError if unplugged."""
         deadline = time.monotonic() + timeout_s
         while not self._outgoing and time.monotonic() < deadline:
             if not self.is_plugged:

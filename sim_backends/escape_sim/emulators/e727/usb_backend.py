@@ -1,4 +1,6 @@
-"""The emulated controller on USB: stands in for libusb below pyusb, for a driver in the same process."""
+"""A pyusb backend with the emulated controller on its bus, for a driver in the same process."""
+
+# ruff: noqa: D102 - the methods are those of pyusb's IBackend
 
 from __future__ import annotations
 
@@ -11,22 +13,17 @@ import usb.core
 
 from escape_sim.emulators.e727.transports import UsbPipe
 
-#: Vendor's number, and one for a product whose own is not public.
+#: PI's vendor number, and a product number in place of one that is not public.
 VENDOR, PRODUCT = 0x1A72, 0x1000
 _OUT, _IN, _BULK, _PACKET = 0x02, 0x81, 0x02, 64
-#: Request of a string descriptor, and the number of the serial number's string.
+#: Request for a string descriptor, and index of the serial number's string.
 _GET_DESCRIPTOR, _STRING, _SERIAL = 0x06, 0x03, 3
 
 
 class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
-    """A bus with one controller on it; hand it to pyusb as ``backend``.
+    """A bus with one controller, to be passed to pyusb as ``backend``.
 
-    Parameters
-    ----------
-    pipe
-        The controller's endpoints.
-    busy
-        A driver of the kernel holds the interface until it is detached.
+    ``kernel_driver_active``: a kernel driver holds the interface until it is detached.
     """
 
     def __init__(self, pipe: UsbPipe, *, kernel_driver_active: bool = False) -> None:
@@ -35,11 +32,9 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         self.claimed = False
 
     def enumerate_devices(self) -> Any:
-        """The one device, unless it is unplugged."""
         return iter([self] if self._pipe.is_plugged else [])
 
     def get_device_descriptor(self, dev: Any) -> Any:
-        """Numbers of the device."""
         return SimpleNamespace(
             bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0xFF, bDeviceSubClass=0,
             bDeviceProtocol=0, bMaxPacketSize0=_PACKET, idVendor=VENDOR, idProduct=PRODUCT, bcdDevice=0x0100,
@@ -48,7 +43,6 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: Any, config: int) -> Any:
-        """Its only configuration."""
         if config:
             raise IndexError(config)
         return SimpleNamespace(
@@ -57,7 +51,6 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_interface_descriptor(self, dev: Any, intf: int, alt: int, config: int) -> Any:
-        """Its only interface."""
         if intf or alt:
             raise IndexError(intf)
         return SimpleNamespace(
@@ -67,51 +60,41 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_endpoint_descriptor(self, dev: Any, ep: int, intf: int, alt: int, config: int) -> Any:
-        """Bulk out, bulk in."""
         return SimpleNamespace(
             bLength=7, bDescriptorType=5, bEndpointAddress=(_OUT, _IN)[ep], bmAttributes=_BULK,
             wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
         )  # fmt: skip
 
     def open_device(self, dev: Any) -> Any:
-        """A handle."""
         return self
 
     def close_device(self, dev_handle: Any) -> None:
-        """The client has gone."""
         self._pipe.client_session.finish()
 
     def get_configuration(self, dev_handle: Any) -> int:
-        """The only one."""
         return 1
 
     def set_configuration(self, dev_handle: Any, config_value: int) -> None:
-        """The only one."""
+        pass
 
     def claim_interface(self, dev_handle: Any, intf: int) -> None:
-        """For one owner, once the kernel's driver has let go."""
         if self.kernel_driver or self.claimed:
             raise usb.core.USBError("Resource busy", -6, errno.EBUSY)
         self.claimed = True
 
     def release_interface(self, dev_handle: Any, intf: int) -> None:
-        """Let go."""
         self.claimed = False
 
     def is_kernel_driver_active(self, dev_handle: Any, intf: int) -> bool:
-        """Whether the kernel holds it."""
         return self.kernel_driver
 
     def detach_kernel_driver(self, dev_handle: Any, intf: int) -> None:
-        """Take it from the kernel."""
         self.kernel_driver = False
 
     def attach_kernel_driver(self, dev_handle: Any, intf: int) -> None:
-        """Give it back."""
         self.kernel_driver = True
 
     def bulk_write(self, dev_handle: Any, ep: int, intf: int, data: Any, timeout: int) -> int:
-        """To the controller."""
         try:
             self._pipe.write(bytes(data))
         except ConnectionError:
@@ -119,7 +102,6 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         return len(data)
 
     def bulk_read(self, dev_handle: Any, ep: int, intf: int, buff: Any, timeout: int) -> int:
-        """From the controller."""
         try:
             data = self._pipe.read(len(buff), timeout / 1000)
         except ConnectionError:
@@ -139,15 +121,14 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
         data: Any,
         timeout: int,
     ) -> int:
-        """String descriptors only."""
         kind, number = divmod(wValue, 256)
         if bRequest != _GET_DESCRIPTOR or kind != _STRING:
             raise usb.core.USBError("Pipe error", -9, errno.EPIPE)
         text = {1: "PI", 2: "E-727", _SERIAL: self._pipe.serial}.get(number, "")
         body = text.encode("utf-16-le") if number else b"\x09\x04"
-        answer = bytes([len(body) + 2, _STRING]) + body
-        data[: len(answer)] = type(data)(data.typecode, answer)
-        return len(answer)
+        reply = bytes([len(body) + 2, _STRING]) + body
+        data[: len(reply)] = type(data)(data.typecode, reply)
+        return len(reply)
 
 
 def _no_device_error() -> Any:

@@ -1,8 +1,8 @@
-"""Wave tables, wave generators and the generator's trigger of the emulated controller."""
+"""Wave tables, wave generators and trigger outputs of the emulated controller."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,19 +10,21 @@ from numpy.typing import NDArray
 
 from escape_sim.emulators.e727.gcs import (
     GcsError,
-    array,
+    format_array,
     format_lines,
     group_arguments,
-    items,
-    number,
     parse_integer,
+    parse_number,
 )
 from escape_sim.emulators.e727.stage import SERVO_S, Hold, Wave
 from escape_sim.emulators.e727.state import ControllerState
 
-#: Tables, points of all together, and the largest jump at a start that counts as none.
+#: Number of tables, and of points that they share.
 TABLES, POINTS = 120, 262_144
+#: Largest jump at a start that is accepted, relative to the wave's range.
 MAX_START_JUMP = 0.02
+#: Trigger lines, parameters of ``CTO``, and its parameter for the mode with the accepted modes.
+_LINES, _OUTPUT_PARAMETERS, _MODE, _MODES = (1, 2, 3), (1, 2, 3, 5, 6, 7, 8, 9), 3, (0, 2, 3, 4)
 
 
 @dataclass
@@ -38,19 +40,20 @@ class GeneratorSettings:
 
 
 class WaveGenerators:
-    """Tables and generators.
+    """Wave tables, generators and trigger of a controller, and the handlers of their commands.
 
-    Parameters
+    Attributes
     ----------
-    state
-        The controller's.
+    levels
+        Trigger level by line and point of the wave.
+    outputs
+        Parameters of the trigger lines, set by ``CTO``.
     """
 
     def __init__(self, state: ControllerState) -> None:
         self._state = state
         self.tables: dict[int, NDArray[np.float64]] = {}
         self.generators = {name: GeneratorSettings() for name in state.axes}
-        #: Trigger: level of the outputs at points of the wave, and the outputs that carry it.
         self.levels: dict[int, dict[int, int]] = {}
         self.outputs: dict[tuple[int, int], float] = {}
 
@@ -60,8 +63,7 @@ class WaveGenerators:
         if len(args) < 4:
             raise GcsError(26)
         table, how, kind = self._table_number(args[0]), args[1].upper(), args[2].upper()
-        if any(g.table == table and self._state.is_wave_driven(a) for a, g in self.generators.items()):
-            raise GcsError(73)
+        self._require_unused(table)
         if kind not in ("SIN_P", "PNT"):
             raise GcsError(402)
         segment = _sine(args[3:]) if kind == "SIN_P" else _points(args[3:])
@@ -84,20 +86,20 @@ class WaveGenerators:
         """``WCL table``."""
         for (text,) in group_arguments(args, 1):
             table = self._table_number(text)
-            if any(g.table == table and self._state.is_wave_driven(a) for a, g in self.generators.items()):
-                raise GcsError(73)
+            self._require_unused(table)
             self.tables.pop(table, None)
 
+    def _require_unused(self, table: int) -> None:
+        if any(g.table == table and self._state.is_wave_driven(a) for a, g in self.generators.items()):
+            raise GcsError(73)
+
     def lengths(self, args: Sequence[str]) -> str:
-        """``WAV? table 1``: points of each table."""
-        wanted = (
-            [self._table_number(table) for table, what in group_arguments(args, 2) if _require_value(what, 1)]
-            if args
-            else []
-        )
-        return format_lines(
-            [f"{t} 1={len(self.tables.get(t, ())):.9e}" for t in wanted or sorted(self.tables) or [1]]
-        )
+        """``WAV? table 1``: number of points of each table."""
+        groups = group_arguments(args, 2) if args else []
+        if any(parse_integer(parameter) != 1 for _, parameter in groups):
+            raise GcsError(17)
+        numbers = [self._table_number(table) for table, _ in groups] or sorted(self.tables) or [1]
+        return format_lines([f"{t} 1={len(self.tables.get(t, ())):.9e}" for t in numbers])
 
     def read(self, args: Sequence[str]) -> str:
         """``GWD? first points tables``."""
@@ -110,9 +112,8 @@ class WaveGenerators:
         shortest = min(len(self.tables[table]) for table in tables)
         if first < 1 or count < 1 or first + count - 1 > shortest:
             raise GcsError(17)
-        return array(
-            {f"Wave Table {t}": self.tables[t][first - 1 : first - 1 + count] for t in tables}, SERVO_S
-        )
+        columns = {f"Wave Table {t}": self.tables[t][first - 1 : first - 1 + count] for t in tables}
+        return format_array(columns, SERVO_S)
 
     # ------------------------------------------------------------------ generators
     def select(self, args: Sequence[str]) -> None:
@@ -136,22 +137,20 @@ class WaveGenerators:
         """``WOS generator offset``."""
         for name, text in group_arguments(args, 2):
             self._require_not_running(name)
-            self.generators[name].offset = number(text)
+            self.generators[name].offset = parse_number(text)
 
     def set_rate(self, args: Sequence[str]) -> None:
-        """``WTR generator rate interpolation``; generator 0: all."""
-        for name, text, how in group_arguments(args, 3):
-            if not 1 <= parse_integer(text) <= 1_000_000 or parse_integer(how) not in (0, 1):
+        """``WTR generator rate interpolation``; generator 0 is all."""
+        for name, text, interpolation in group_arguments(args, 3):
+            rate, interpolate = parse_integer(text), parse_integer(interpolation)
+            if not 1 <= rate <= 1_000_000 or interpolate not in (0, 1):
                 raise GcsError(17)
-            for one in self.generators if name == "0" else [name]:
-                self._require_not_running(one)
-                self.generators[one].rate, self.generators[one].interpolate = (
-                    parse_integer(text),
-                    bool(parse_integer(how)),
-                )
+            for axis in self.generators if name == "0" else [name]:
+                self._require_not_running(axis)
+                self.generators[axis].rate, self.generators[axis].interpolate = rate, bool(interpolate)
 
     def set_modes(self, args: Sequence[str]) -> None:
-        """``WGO generator mode``: bit 0 starts, 0 stops; all of one line in the same cycle."""
+        """``WGO generator mode``: bit 0 starts, 0 stops; generators of one line start together."""
         state = self._state
         pairs = [(name, parse_integer(text)) for name, text in group_arguments(args, 2)]
         waves = {name: self._prepare_wave(name, mode) for name, mode in pairs if mode}
@@ -173,7 +172,7 @@ class WaveGenerators:
             state.recorder.start()
 
     def _prepare_wave(self, name: str, mode: int) -> NDArray[np.float64]:
-        """The targets that a generator is about to play."""
+        """Targets of a generator that is to start."""
         state = self._state
         state.axis(name)
         if mode not in (1, 0x101):
@@ -198,36 +197,28 @@ class WaveGenerators:
             self._state.report_violation(f"WGO {name} starts with a jump of {jump:.1f} urad; MOV there first")
         if running:
             self._state.report_violation(
-                f"WGO {name} starts while {' and '.join(running)} turns already: the phase between "
-                "the axes is lost"
+                f"WGO {name} starts while {' and '.join(running)} runs: their phase is undefined"
             )
 
-    def modes(self, args: Sequence[str]) -> str:
-        """``WGO?``."""
-        for name in self.generators:
-            if not self._state.is_wave_driven(name):
-                self.generators[name].mode = 0
-        return items({name: f"0x{self.generators[name].mode:x}" for name in self._axes_of(args)})
+    def queries(self) -> dict[str, Callable[[Sequence[str]], str]]:
+        """Handlers of the queries that return settings per generator."""
+        generators = self.generators
+        values: dict[str, Callable[[str], float | int | str]] = {
+            "WSL?": lambda name: generators[name].table,
+            "WGC?": lambda name: generators[name].cycles,
+            "WOS?": lambda name: generators[name].offset,
+            "WTR?": lambda name: f"{generators[name].rate} {int(generators[name].interpolate)}",
+            "WGO?": self._mode_text,
+        }
+        return {command: self._state.per_axis(value) for command, value in values.items()}
 
-    def selections(self, args: Sequence[str]) -> str:
-        """``WSL?``."""
-        return items({name: self.generators[name].table for name in self._axes_of(args)})
-
-    def cycles(self, args: Sequence[str]) -> str:
-        """``WGC?``."""
-        return items({name: self.generators[name].cycles for name in self._axes_of(args)})
-
-    def offsets(self, args: Sequence[str]) -> str:
-        """``WOS?``."""
-        return items({name: self.generators[name].offset for name in self._axes_of(args)})
-
-    def rates(self, args: Sequence[str]) -> str:
-        """``WTR?``."""
-        rows = [(n, self.generators[n]) for n in self._axes_of(args)]
-        return format_lines([f"{name}={g.rate} {int(g.interpolate)}" for name, g in rows])
+    def _mode_text(self, name: str) -> str:
+        if not self._state.is_wave_driven(name):
+            self.generators[name].mode = 0
+        return f"0x{self.generators[name].mode:x}"
 
     def running(self) -> int:
-        """``#9``: a bit for each generator that runs."""
+        """``#9``: one bit for each generator that runs."""
         return sum(self._state.is_wave_driven(name) << bit for bit, name in enumerate(self._state.axes))
 
     # ------------------------------------------------------------------ trigger
@@ -240,31 +231,20 @@ class WaveGenerators:
     def set_trigger(self, args: Sequence[str]) -> None:
         """``TWS line point level``."""
         for text, point, level in group_arguments(args, 3):
-            if (
-                parse_integer(text) not in (1, 2, 3)
-                or parse_integer(point) < 1
-                or parse_integer(level) not in (0, 1)
-            ):
+            line, number, value = parse_integer(text), parse_integer(point), parse_integer(level)
+            if line not in _LINES or number < 1 or value not in (0, 1):
                 raise GcsError(17)
-            self.levels.setdefault(parse_integer(text), {})[parse_integer(point)] = parse_integer(level)
+            self.levels.setdefault(line, {})[number] = value
 
     def set_output(self, args: Sequence[str]) -> None:
-        """``CTO line parameter value``; parameter 3 is the mode, 4 of it the generator's trigger."""
+        """``CTO line parameter value``; parameter 3 is the mode, whose value 4 is the generator's trigger."""
         for text, parameter, value in group_arguments(args, 3):
-            if parse_integer(text) not in (1, 2, 3) or parse_integer(parameter) not in (
-                1,
-                2,
-                3,
-                5,
-                6,
-                7,
-                8,
-                9,
-            ):
+            line, number = parse_integer(text), parse_integer(parameter)
+            if line not in _LINES or number not in _OUTPUT_PARAMETERS:
                 raise GcsError(17)
-            if parse_integer(parameter) == 3 and parse_integer(value) not in (0, 2, 3, 4):
+            if number == _MODE and parse_integer(value) not in _MODES:
                 raise GcsError(17)
-            self.outputs[parse_integer(text), parse_integer(parameter)] = number(value)
+            self.outputs[line, number] = parse_number(value)
 
     def output(self, args: Sequence[str]) -> str:
         """``CTO?``."""
@@ -280,7 +260,7 @@ class WaveGenerators:
         )
 
     def pulses_s(self, output: int, name: str) -> NDArray[np.float64]:
-        """Moments of rising edges within one turn ``(n,)``, seconds from its start; empty: no pulses."""
+        """Times of rising edges within one cycle ``(n,)`` in seconds; empty without trigger."""
         levels, wave = self.levels.get(output, {}), self._state.stage.axes[name].trajectory
         if self.outputs.get((output, 3)) != 4 or not levels or not isinstance(wave, Wave):
             return np.empty(0)
@@ -298,27 +278,18 @@ class WaveGenerators:
         if self._state.is_wave_driven(name):
             raise GcsError(73)
 
-    def _axes_of(self, args: Sequence[str]) -> list[str]:
-        return self._state.axes_of(args)
-
     def _table_number(self, text: str) -> int:
         if not 1 <= parse_integer(text) <= TABLES:
             raise GcsError(400)
         return parse_integer(text)
 
 
-def _require_value(text: str, value: int) -> bool:
-    if parse_integer(text) != value:
-        raise GcsError(17)
-    return True
-
-
 def _sine(args: Sequence[str]) -> NDArray[np.float64]:
-    """``N A O L S C``: from the offset to offset plus amplitude at the centre, and back; starts at ``S``."""
+    """``n A O L S C``: from offset to offset plus amplitude at the centre and back, starting at ``S``."""
     if len(args) != 6:
         raise GcsError(404)
     segment, length, start, centre = (parse_integer(args[k]) for k in (0, 3, 4, 5))
-    amplitude, offset = number(args[1]), number(args[2])
+    amplitude, offset = parse_number(args[1]), parse_number(args[2])
     if segment < 1 or length < 2 or length > segment:
         raise GcsError(403)
     if not 0 <= start < segment or not 0 < centre < length:
@@ -336,4 +307,4 @@ def _points(args: Sequence[str]) -> NDArray[np.float64]:
         raise GcsError(405)
     if count < 1 or len(args) - 2 != count:
         raise GcsError(404)
-    return np.array([number(text) for text in args[2:]])
+    return np.array([parse_number(text) for text in args[2:]])

@@ -1,4 +1,4 @@
-"""The guardian beside an adaptive secondary: a floating shell is rested, a resting one let lie."""
+"""The fail-safe process with an adaptive secondary: a floating shell is rested, a rested one is not lifted."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from asm_bench import emulator, port_of, wait_for
 from escape_hw.api.adaptive_secondary import ShellState
 from escape_hw.config.loader import load_system
 from escape_hw.server.safety.failsafe import FailsafeSettings, IncidentReport
-from escape_hw.streams.segments import process_start
+from escape_hw.supervision import process_start
 
-#: What an engine does, as far as its guardian is concerned: holds the mirror and the pipe, and a shape.
+#: An engine as the fail-safe process sees it: it holds the mirror and the pipe, and commands a shape.
 _ENGINE = """
 import sys, time
 import numpy as np
@@ -30,16 +30,16 @@ print("shaped", flush=True)
 sys.stdin.readline()
 mirror.close()
 import os
-os.write(int(sys.argv[2]), b"bye")
+os.write(int(sys.argv[2]), b"clean")
 """
 
 
 def guarded(
     tmp_path: Path, port: int, end: str, meanwhile: Callable[[], object] = lambda: None
 ) -> IncidentReport | None:
-    """Run an engine of that kind until it is killed or says goodbye; what its guardian wrote.
+    """Run such an engine until it is killed or ends cleanly; returns the report of its fail-safe process.
 
-    ``meanwhile`` runs when the engine has ended, before the guardian looks.
+    ``meanwhile`` runs when the engine has ended, before the fail-safe process acts.
     """
     words = [
         "devices.dm.mode=hardware", f"devices.dm.options.port={port}", "devices.dm.options.reply_s=10",
@@ -58,11 +58,11 @@ def guarded(
             config_text=config.read_text(), incidents=str(tmp_path), pid=engine.pid,
             started=process_start(engine.pid) or 0,
         )  # fmt: skip
-        guardian = subprocess.Popen(
+        failsafe = subprocess.Popen(
             [sys.executable, "-m", "escape_hw.server.safety.failsafe", str(watched)],
             stdin=subprocess.PIPE, text=True, pass_fds=(watched,),
         )  # fmt: skip
-        ends.callback(finished, guardian)
+        ends.callback(finished, failsafe)
         os.close(held)
         os.close(watched)
         assert engine.stdout is not None
@@ -73,8 +73,8 @@ def guarded(
         else:
             engine.communicate("\n", timeout=60)
         meanwhile()
-        guardian.communicate(watch.model_dump_json(), timeout=120)
-        assert guardian.returncode == 0
+        failsafe.communicate(watch.model_dump_json(), timeout=120)
+        assert failsafe.returncode == 0
     found = list(tmp_path.glob("*.incident.json"))
     return IncidentReport.model_validate_json(found[0].read_bytes()) if found else None
 
@@ -111,6 +111,6 @@ def test_a_shell_that_went_to_rest_by_itself_is_not_lifted(tmp_path: Path) -> No
     assert ShellState.RUNNING not in states[lifted + 1 :]
 
 
-def test_after_a_goodbye_it_does_nothing(tmp_path: Path) -> None:
+def test_after_a_clean_exit_it_does_nothing(tmp_path: Path) -> None:
     with emulator(hold=60, rest=120) as made:
-        assert guarded(tmp_path, port_of(made), "goodbye") is None
+        assert guarded(tmp_path, port_of(made), "clean exit") is None

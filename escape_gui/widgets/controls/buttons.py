@@ -1,26 +1,51 @@
-"""A button for what is dangerous to switch on: it must be held, and shows for how much longer."""
+"""A row of exclusive buttons, and a button that must be held."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from PySide6.QtCore import QElapsedTimer, QRectF, QTimer, Signal
 from PySide6.QtGui import QKeyEvent, QPainter, QPaintEvent, Qt
-from PySide6.QtWidgets import QPushButton
+from PySide6.QtWidgets import QButtonGroup, QPushButton, QSizePolicy, QToolButton, QWidget
 
 from escape_gui.theme import Theme
+from escape_gui.widgets.layouts import flat_button, row
 
 HOLD_MS = 800
 _STEP_MS = 40
 
 
-class HoldButton(QPushButton):
-    """Emits :attr:`confirmed` after it was pressed for :data:`HOLD_MS`, by mouse, Space or Return.
+class SegmentedButton(QWidget):
+    """A row of buttons of which exactly one is pressed, at the start the first."""
 
-    Parameters
-    ----------
-    text
-        What happens; "hold to" is put before it.
-    theme
-        Colours.
+    chosen = Signal(str)
+
+    def __init__(self, name: str, choices: Sequence[str], tips: Sequence[str]) -> None:
+        super().__init__()
+        self.setAccessibleName(name)
+        group = QButtonGroup(self)
+        self.buttons: dict[str, QToolButton] = {}
+        for text, tip in zip(choices, tips, strict=True):
+            button = flat_button(text, tip, checkable=True, checked=not self.buttons)
+            button.setAccessibleName(f"{name}: {text}")
+            button.clicked.connect(lambda _=False, text=text: self.chosen.emit(text))
+            group.addButton(button)
+            self.buttons[text] = button
+        row(*self.buttons.values(), parent=self, spacing=2)
+        self.setSizePolicy(QSizePolicy.Policy.Maximum, QSizePolicy.Policy.Fixed)
+
+    @property
+    def selected(self) -> str:
+        return next(text for text, button in self.buttons.items() if button.isChecked())
+
+    def choose(self, text: str) -> None:
+        self.buttons[text].click()
+
+
+class HoldButton(QPushButton):
+    """A button for hazardous actions: emits :attr:`confirmed` after it was held for :data:`HOLD_MS`.
+
+    It can be held with the mouse, Space or Return; a growing bar shows the time.
     """
 
     confirmed = Signal()
@@ -51,7 +76,7 @@ class HoldButton(QPushButton):
         self.update()
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Return presses as Space does, and a key that repeats by itself is still the same press."""
+        """Treat Return like Space; a key that repeats automatically is one press."""
         if event.key() in (Qt.Key.Key_Return, Qt.Key.Key_Enter):
             if not event.isAutoRepeat() and not self.isDown():
                 self.setDown(True)
@@ -60,7 +85,6 @@ class HoldButton(QPushButton):
         super().keyPressEvent(event)
 
     def keyReleaseEvent(self, event: QKeyEvent) -> None:
-        """Letting go too early does nothing."""
         if event.key() in (Qt.Key.Key_Return, Qt.Key.Key_Enter):
             if not event.isAutoRepeat() and self.isDown():
                 self.setDown(False)
@@ -69,10 +93,8 @@ class HoldButton(QPushButton):
         super().keyReleaseEvent(event)
 
     def paintEvent(self, event: QPaintEvent) -> None:
-        """The button with a bar along its foot that grows while it is held."""
         super().paintEvent(event)
         if self._timer.isActive():
-            painter = QPainter(self)
             share = min(self._clock.elapsed() / HOLD_MS, 1.0)
-            foot = QRectF(0, self.height() - 4, self.width() * share, 4)
-            painter.fillRect(foot, self._theme.colour("warn"))
+            bar = QRectF(0, self.height() - 4, self.width() * share, 4)
+            QPainter(self).fillRect(bar, self._theme.colour("warn"))

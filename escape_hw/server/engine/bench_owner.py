@@ -1,0 +1,212 @@
+"""Main thread of the engine: devices, safe state of the mirror, and a queue of jobs."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from escape_hw.api.procedure import Progress
+from escape_hw.api.sensor import SlopeFunction
+from escape_hw.bench import Bench
+from escape_hw.calibration.acquisition.frames import ramp_to
+from escape_hw.calibration.acquisition.sensor_setup import build_slope_function
+from escape_hw.errors import DeviceError, EscapeError, FrameTimeout
+from escape_hw.remote.state import Phase
+from escape_hw.server.engine.publisher import StreamPublisher
+from escape_hw.server.engine.state import EngineState
+from escape_hw.server.engine.state_publisher import StatePublisher
+
+log = logging.getLogger(__name__)
+
+#: Frames per second that are read while nothing runs.
+IDLE_FRAME_RATE_HZ = 25.0
+#: Longest wait for one of them, which delays a job.
+_IDLE_TIMEOUT_S = 0.5
+REOPEN_REMEDY = "Fix the device, then clear the fault to open the devices again."
+_DEFECT_REMEDY = "See the log."
+
+Job = Callable[[], object]
+
+
+class BenchOwner:
+    """Owns the devices. All methods but those of the first group belong to the main thread."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        state: EngineState,
+        publisher: StreamPublisher,
+        state_publisher: StatePublisher,
+        send: Callable[[Mapping[str, Any]], object],
+    ) -> None:
+        self.bench, self._state, self._publisher = bench, state, publisher
+        self._state_publisher, self._send = state_publisher, send
+        self._jobs: SimpleQueue[Job] = SimpleQueue()
+        self._flat_replies: list[Callable[[object], object]] = []
+        self._flat_replies_lock = threading.Lock()
+        self._slopes: tuple[object, SlopeFunction | None] = (None, None)
+
+    # ------------------------------------------------------------ any thread
+    def post(self, job: Job) -> None:
+        """Queue a job for the main thread."""
+        self._jobs.put(job)
+
+    def reply_when_flat(self, reply: Callable[[object], object]) -> None:
+        """Flatten the mirror after the present job, then call ``reply`` with the answer."""
+        with self._flat_replies_lock:
+            self._flat_replies.append(reply)
+        self.post(self.flatten)
+
+    def request_safe_state(self, reason: str, remedy: str = "Look at the log, then clear the fault.") -> None:
+        """Latch a fault, stop what runs, and make the mirror safe."""
+        log.error("FAULT: %s", reason)
+        self._state.latch_fault(reason, remedy)
+        self.post(lambda: self.make_safe(reason, remedy))
+
+    # ------------------------------------------------------------ jobs
+    def run_next_job(self) -> None:
+        """Run the next job, or read a frame when there is none. A defect in a job makes the mirror safe."""
+        try:
+            job = self._jobs.get(timeout=1 / IDLE_FRAME_RATE_HZ)
+        except Empty:
+            self._read_idle_frame()
+            return
+        try:
+            job()
+        except Exception as error:
+            self.report_defect(error)
+
+    def report_defect(self, error: Exception) -> None:
+        """Log an unexpected exception with its traceback and make the mirror safe."""
+        log.error("unexpected exception", exc_info=error)
+        self.make_safe(f"{type(error).__name__}: {error} (this is a defect of ESCAPE)", _DEFECT_REMEDY)
+
+    def _read_idle_frame(self) -> None:
+        """Read a frame, and compute its slopes when the sensor's geometry is known."""
+        bench = self.bench
+        if not bench.wfs.is_open:
+            return
+        try:
+            frame = bench.wfs.next_frame(_IDLE_TIMEOUT_S)
+            self._state.set_device_message("wfs")
+            if bench.science is not None:
+                bench.science.poll()
+        except FrameTimeout as error:
+            self._state.set_device_message("wfs", str(error))
+            return
+        except DeviceError as error:
+            if self._state.snapshot.fault is None:
+                self.make_safe(str(error), REOPEN_REMEDY)
+            return
+        grid = self._publisher.grid
+        if grid is not None:
+            if self._slopes[0] is not grid:
+                self._slopes = (grid, build_slope_function(bench, grid))
+            if self._slopes[1] is not None:
+                self._slopes[1](frame.data)
+
+    # ------------------------------------------------------------ devices
+    def open(self) -> None:
+        """Open the devices and flatten the mirror; a failure is latched as a fault."""
+        self._state.set_phase(Phase.STARTING)
+        bench = self.bench
+        try:
+            bench.open()
+            self._publisher.set_full_scale(bench.wfs.info.full_scale)
+            bench.callbacks = self._publisher.callbacks
+            bench.dm.flatten()
+        except EscapeError as error:
+            self.make_safe(str(error), REOPEN_REMEDY)
+            return
+        self._state.set_phase(Phase.IDLE)
+        log.info("%s: %d devices open, mirror flat", bench.config.system.name, len(bench.devices))
+
+    def close(self) -> None:
+        """Close the devices; the mirror is flat then.
+
+        An exception passes: without a clean exit, the fail-safe process flattens the mirror.
+        """
+        try:
+            self.bench.close()
+            log.info("mirror flat, devices closed")
+        except Exception as error:
+            log.error("the devices did not close cleanly: %s", error)
+            raise
+        finally:
+            self._state.set_phase(Phase.STOPPED)
+            self.send_flat_replies()
+
+    def clear_fault(self) -> None:
+        """Release the fault and open the devices again."""
+        self._state.clear_fault()
+        with contextlib.suppress(EscapeError):
+            # A device that does not close cleanly now was the fault itself.
+            self.bench.close()
+        self.open()
+
+    def flatten(self) -> None:
+        """Ramp the mirror flat and answer those who wait for it."""
+        if self.bench.dm.is_open:
+            try:
+                self.bench.dm.flatten()
+            except DeviceError as error:
+                self.make_safe(
+                    str(error), "The mirror cannot be flattened from here. If in doubt, switch its power off."
+                )
+        self.send_flat_replies()
+
+    def send_flat_replies(self) -> None:
+        """Answer those who wait for a flat mirror: the fault's reason, or ``None`` when it is flat."""
+        with self._flat_replies_lock:
+            waiting, self._flat_replies = self._flat_replies, []
+        if waiting:
+            self._state_publisher.publish()
+        fault = self._state.snapshot.fault
+        for reply in waiting:
+            reply({"fault": None if fault is None else fault.reason})
+
+    def make_safe(self, reason: str, remedy: str) -> None:
+        """Latch a fault, flatten the mirror as far as possible, and close the device that failed."""
+        self._state.enter_fault(reason, remedy)
+        log.error("FAULT: %s", reason)
+        dm = self.bench.dm
+        with contextlib.suppress(EscapeError):
+            # The reason is latched already, and the mirror itself may have failed.
+            if dm.is_open:
+                dm.flatten()
+        # A failed device is closed, so that it can be opened again.
+        for device in self.bench.devices:
+            if device.is_open and device is not dm and reason.startswith(f"{device.name}:"):
+                with contextlib.suppress(Exception):
+                    device.close()
+                self._state.set_device_message(device.name, reason)
+
+    # ------------------------------------------------------------ while a procedure or the loop runs
+    def observe(self, progress: Progress) -> None:
+        """Publish the progress of what runs, and pause when requested."""
+        run = self._state.update_progress(progress)
+        if run is not None:
+            self._send({"progress": run.model_dump(mode="json")})
+        if progress.arrays:
+            self._publisher.publish_arrays(progress.arrays, stage=progress.stage, done=float(progress.done))
+        if self._state.snapshot.paused:
+            self._pause_until_resumed()
+
+    def _pause_until_resumed(self) -> None:
+        """Wait with a flat mirror until the procedure may resume; then restore the mirror's shape."""
+        dm = self.bench.dm
+        shape = dm.shape
+        dm.flatten()
+        log.info("paused, mirror flat")
+        self._state.mark_run_paused(True)
+        while self._state.snapshot.paused and not self._state.stop_requested:
+            time.sleep(0.02)
+        self._state.mark_run_paused(False)
+        if not self._state.stop_requested:
+            ramp_to(dm, shape)
+            log.info("resumed")
