@@ -143,7 +143,7 @@ def track(
     registration: RegistrationEstimate | None = None,
     response: TemporalResponse | None = None,
     poke: float | None = None,
-    memory_s: float | None = None,
+    forgetting_time_s: float | None = None,
     exchange: bool = True,
     gain: float | None = None,
     model_psf: NDArray[np.float32] | None = None,
@@ -164,7 +164,7 @@ def track(
         Temporal response, where it is known.
     poke
         Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke; as configured.
-    memory_s
+    forgetting_time_s
         Time in which old frames fade; as configured by default.
     exchange
         Whether a new matrix may be taken into use without asking, within the configured limits; false:
@@ -188,10 +188,10 @@ def track(
     """
     t = bench.config.tracking
     poke = t.poke if poke is None else poke
-    memory = t.memory_s if memory_s is None else memory_s
+    memory = t.forgetting_time_s if forgetting_time_s is None else forgetting_time_s
     if not (STEP_S <= seconds < math.inf and 0 < poke < math.inf and 0 < memory < math.inf):
         raise ConfigError(
-            f"seconds is {seconds}, poke {poke} and memory_s {memory}; the first must be at least "
+            f"seconds is {seconds}, poke {poke} and forgetting_time_s {memory}; the first must be at least "
             f"{STEP_S:g}, the others positive"
         )
     tracker = _Tracker(bench, matrix, grid, registration, response, poke, memory, exchange, gain, model_psf)
@@ -209,7 +209,7 @@ class _Tracker:
         registration: RegistrationEstimate | None,
         response: TemporalResponse | None,
         poke: float,
-        memory_s: float,
+        forgetting_time_s: float,
         exchange: bool,
         gain: float | None,
         model_psf: NDArray[np.float32] | None,
@@ -221,7 +221,7 @@ class _Tracker:
         if not start.converged:
             raise CalibrationError(f"no registration to begin with: {'; '.join(start.warnings)}")
         self.amplitude = compute_poke_amplitudes(bench, matrix.m2c, poke)
-        self.response, self.memory = response, memory_s / STEP_S
+        self.response, self.memory = response, forgetting_time_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
         self.in_use = ActiveReconstructor(matrix, invert_matrix(matrix, self.dropped), start, 1.0)
         self.alarm_monitor = AlarmMonitor(start.registration, t.max_shift, response)

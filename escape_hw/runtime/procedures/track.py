@@ -41,7 +41,7 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
     )  # fmt: skip
     forgetting_time_s: float | None = parameter(
         default=None, help="Time in which the weight of a frame falls to 1/e.", unit="s", low=1, high=1e5,
-        config_key="tracking.memory_s", sets_config=True, deprecated=("memory", "memory_s"),
+        config_key="tracking.forgetting_time_s", sets_config=True, deprecated=("memory", "memory_s"),
         label="Forgetting time",
     )  # fmt: skip
     gain: float | None = parameter(
