@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from escape_hw.calibration.docrime.closed_loop import docrime_closed_loop
     from escape_hw.calibration.docrime.open_loop import docrime
     from escape_hw.calibration.escape.method import escape
-    from escape_hw.calibration.loop.gain_search import best_gain
+    from escape_hw.calibration.loop.gain_search import find_best_gain
     from escape_hw.calibration.loop.performance import close_loop
     from escape_hw.calibration.push_pull.procedure import push_pull
     from escape_hw.calibration.sprint.fit import sprint
@@ -72,7 +72,7 @@ _NAMES = {
     "escape_hw.calibration.docrime.closed_loop": "docrime_closed_loop",
     "escape_hw.calibration.docrime.open_loop": "docrime",
     "escape_hw.calibration.escape.method": "escape",
-    "escape_hw.calibration.loop.gain_search": "best_gain",
+    "escape_hw.calibration.loop.gain_search": "find_best_gain",
     "escape_hw.calibration.loop.performance": "close_loop",
     "escape_hw.calibration.push_pull.procedure": "push_pull",
     "escape_hw.calibration.sprint.fit": "sprint",
@@ -97,15 +97,15 @@ __all__ = [
     "MirrorLimits", "Modulation", "ModulatorInfo", "ModulatorStatus", "PhaseScreen", "Procedure",
     "Progress", "PyramidPupils", "Region", "Registration", "RegistrationEstimate", "Reporter", "ScreenInfo",
     "ScreenState", "SendReport", "SensorGeometry", "ShellHealth", "ShellState", "SubApertureGrid", "System",
-    "Target", "TipTiltModulator", "__version__", "best_gain", "bundled_systems", "close_loop", "connect",
-    "docrime", "docrime_closed_loop", "errors", "escape", "find_sensor", "load_matrix", "load_system",
+    "Target", "TipTiltModulator", "__version__", "bundled_systems", "close_loop", "connect",
+    "docrime", "docrime_closed_loop", "errors", "escape", "find_best_gain", "find_sensor", "load_matrix", "load_system",
     "measure_dark", "measure_model_psf", "open_system", "push_pull", "register_device", "run",
     "save_matrix", "sprint", "testing",
 ]  # fmt: skip
 
 
 #: Names of version 0.1.0 -> present names.
-_RENAMED = {"Measured": "Estimate", "closed_loop": "close_loop"}
+_RENAMED = {"Measured": "Estimate", "best_gain": "find_best_gain", "closed_loop": "close_loop"}
 
 
 def __getattr__(name: str) -> Any:

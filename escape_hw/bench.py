@@ -1,4 +1,4 @@
-"""The devices of one system, opened and closed together."""
+"""The devices of a system, opened and closed together."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ D = TypeVar("D", bound=Device)
 
 @renamed_members(taps="callbacks")
 class Bench:
-    """The devices of a system and its configuration; usable as a context manager.
+    """The devices and the configuration of a system; a context manager.
 
-    Nothing is connected before :meth:`open`. Devices open in the order mirror, sensor camera,
-    modulator, science camera, screen, and close in reverse, so that the mirror is flattened last.
+    Nothing is connected before :meth:`open`. Devices open in the order mirror, sensor camera, modulator,
+    science camera, screen, and close in reverse, so that the mirror is flattened last.
 
     Parameters
     ----------
@@ -47,17 +47,17 @@ class Bench:
     dm, wfs
         Deformable mirror and camera of the wavefront sensor.
     science, screen, modulator
-        Science camera, phase screens and a pyramid's modulator, or ``None`` on a system without.
+        Science camera, phase screens and modulator of a pyramid; ``None`` if the system has none.
 
     Attributes
     ----------
     rng
-        Random generator of the procedures, seeded from ``system.seed`` and independent of every
-        stream that a twin derives from the same seed.
+        Random generator of the procedures, seeded from ``system.seed`` and independent of the generators that
+        a twin derives from the same seed.
     dark
-        Dark frame of the sensor's camera in counts, once it was measured or set.
+        Dark frame of the sensor's camera in counts ``(rows, columns)``, or ``None``.
     flat
-        Relative response of its pixels (mean 1), once it was set.
+        Relative response of its pixels ``(rows, columns)``, of mean 1, or ``None``.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Bench:
 
     @classmethod
     def from_config(cls, config: SystemConfig) -> Self:
-        """Build every device from the registry; opens nothing.
+        """Build all devices from the registry; opens nothing.
 
         Raises
         ------
@@ -98,7 +98,7 @@ class Bench:
         if dm is None or wfs is None:
             name, mode = ("dm", devices.dm.mode) if dm is None else ("wfs", devices.wfs.mode)
             key = "sim_driver" if (mode or config.system.mode) == "sim" else "driver"
-            raise ConfigError(f"devices.{name}.{key}: ''  names no driver, and no system works without one")
+            raise ConfigError(f"devices.{name}.{key}: ''  names no driver; every system needs this device")
         return cls(config, dm, wfs, science, screen, modulator)
 
     def __repr__(self) -> str:
@@ -108,10 +108,10 @@ class Bench:
 
     @property
     def callbacks(self) -> Callbacks:
-        """Who is told of frames, slopes and commands; nobody unless set.
+        """Callbacks for frames, slopes and commands; none by default.
 
-        One that raises is dropped, and the log says so. Set them before anything runs: slopes and loops
-        look for theirs when they are made.
+        A callback that raises an exception is removed and the exception logged. Set callbacks before a
+        procedure starts: slope functions and loops read them at construction.
         """
         return self._callbacks
 
@@ -132,8 +132,8 @@ class Bench:
     @property
     def devices(self) -> tuple[Device, ...]:
         """The devices present, in the order of opening."""
-        every = (self.dm, self.wfs, self.modulator, self.science, self.screen)
-        return tuple(device for device in every if device is not None)
+        order = (self.dm, self.wfs, self.modulator, self.science, self.screen)
+        return tuple(device for device in order if device is not None)
 
     @property
     def is_open(self) -> bool:
@@ -142,30 +142,20 @@ class Bench:
 
     @property
     def simulated(self) -> bool:
-        """True when any device is a twin: by the configuration, or by its own word once open."""
-        sections = self.config.devices
-        chosen = {
-            resolve_mode(section, self.config)
-            for section, device in (
-                (sections.dm, self.dm),
-                (sections.wfs, self.wfs),
-                (sections.science, self.science),
-                (sections.screen, self.screen),
-                (sections.modulator, self.modulator),
-            )
-            if section is not None and device is not None
-        }
-        opened_devices = (self.dm, self.wfs, self.science, self.screen, self.modulator)
-        reported_simulated = [d.info.simulated for d in opened_devices if d is not None and d.is_open]
-        return "sim" in chosen or any(reported_simulated)
+        """True when any device is a twin, by its configured mode or, once open, by its own information."""
+        names = ("dm", "wfs", "science", "screen", "modulator")
+        present = [(name, getattr(self, name)) for name in names if getattr(self, name) is not None]
+        sections = [getattr(self.config.devices, name) for name, _ in present]
+        modes = {resolve_mode(section, self.config) for section in sections if section is not None}
+        return "sim" in modes or any(device.info.simulated for _, device in present if device.is_open)
 
     def open(self) -> Self:
-        """Open every device; does nothing to those already open.
+        """Open all devices that are not open yet.
 
         Raises
         ------
         DeviceError
-            A device cannot be reached; those opened before it are closed again.
+            A device cannot be reached; all devices are closed again.
         """
         if self._threads is None:
             self._threads = limit_to_one_thread()
@@ -178,12 +168,12 @@ class Bench:
         return self
 
     def close(self) -> None:
-        """Close every device, the mirror last, whatever happens on the way.
+        """Close all devices, the mirror last, also when some of them fail.
 
         Raises
         ------
         Exception
-            The first failure, once everything has been closed; later ones are noted on it.
+            The first failure, after all devices were closed; later ones are added as notes.
         """
         first = self._close_all(None)
         if first is not None:
@@ -201,12 +191,12 @@ class Bench:
             self._close_all(error)
 
     def model(self, grid: SensorGeometry | None = None) -> SyntheticModel:
-        """The synthetic model that ``calibration.model`` names.
+        """Build the synthetic model that ``calibration.model`` names.
 
         Parameters
         ----------
         grid
-            The sensor's geometry found on the camera; ``None``: the nominal one.
+            Geometry of the sensor as found on the camera; ``None`` for the nominal one.
 
         Raises
         ------
@@ -216,7 +206,7 @@ class Bench:
         return model_factory(self.config.calibration.model)(self.config, grid)
 
     def _close_all(self, cause: BaseException | None) -> BaseException | None:
-        """Close in reverse; failures become notes on the cause or on the first failure."""
+        """Close in reverse order; add failures as notes to the cause or to the first failure."""
         if self._threads is not None:
             self._threads.restore_original_limits()
             self._threads = None
@@ -233,27 +223,23 @@ class Bench:
         return first
 
 
-def build_bench(config: SystemConfig) -> Bench:
-    """Build a bench from its configuration; see :meth:`Bench.from_config`."""
-    return Bench.from_config(config)
-
-
 def build_device(name: str, config: SystemConfig, kind: type[D]) -> D:
-    """Build one device of a system alone; opens nothing.
+    """Build one device of a system; opens nothing.
 
     Parameters
     ----------
     name
-        Its key in ``[devices]``.
+        Key of the device in ``[devices]``.
     config
         The whole configuration.
     kind
-        What it has to be.
+        Required class of the device.
 
     Raises
     ------
     ConfigError
-        The system has none in this mode, or its driver is unknown, not installed or of another kind.
+        The system has no such device in this mode, or its driver is unknown, not installed or of another
+        class.
     """
     device = _build(name, getattr(config.devices, name, None), config, {}, kind)
     if device is None:
@@ -262,14 +248,14 @@ def build_device(name: str, config: SystemConfig, kind: type[D]) -> D:
 
 
 def resolve_mode(section: DeviceConfig, config: SystemConfig) -> str:
-    """The mode of one device: its own, or else the system's."""
+    """Mode of a device: its own, or the system's if it has none."""
     return section.mode or config.system.mode
 
 
 def _build(
     name: str, section: DeviceConfig | None, config: SystemConfig, shared: dict[str, object], kind: type[D]
 ) -> D | None:
-    """Build one device, or ``None`` when the system has none in this mode."""
+    """Build one device; ``None`` if the system has none in this mode."""
     if section is None:
         return None
     twin = resolve_mode(section, config) == "sim"

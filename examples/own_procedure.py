@@ -9,7 +9,7 @@ Run it with: python examples/own_procedure.py
 import numpy as np
 
 import escape_hw
-from escape_hw.calibration.acquisition.sensor_setup import build_modal_basis
+from escape_hw.calibration.modes.bases import build_modal_basis
 
 
 def linear_range(

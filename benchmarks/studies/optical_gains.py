@@ -12,14 +12,19 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from typing import Any
 
 import numpy as np
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
-from escape_hw.calibration.acquisition.pokes import noise_gain, scale_to_strehl_budget, strehl_loss
-from escape_hw.calibration.acquisition.sensor_setup import compute_poke_amplitudes
+from escape_hw.calibration.acquisition.pokes import (
+    compute_poke_amplitudes,
+    noise_gain,
+    scale_to_strehl_budget,
+    strehl_loss,
+)
 from escape_hw.calibration.optical_gain.estimator import GainMeasurementLoop
 from escape_hw.calibration.optical_gain.matrix_comparison import projector, slope_weights
 from escape_hw.calibration.optical_gain.smoothing import smooth_over_modes
@@ -46,17 +51,13 @@ def gains(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     loop = GainMeasurementLoop(bench, baseline, {})
     loop.control.set_gain(bench.config.loop.gain)
     amplitude = compute_poke_amplitudes(bench, baseline.matrix.m2c, options.poke)
-    frozen_wavefronts = None
-    try:
-        loop.start()
+    with loop.closed():
         bench.run(loop.measure(400, amplitude, "settling"))
-        frozen_wavefronts = WavefrontRecorder(twin, max(1, options.frames // options.wavefronts))
-        segment = bench.run(loop.measure(options.frames, amplitude, "gains"))
-    finally:
-        loop.open_loop()
-        if frozen_wavefronts is not None:
-            frozen_wavefronts.close()
-    if segment.gains is None or frozen_wavefronts is None:
+        with closing(
+            WavefrontRecorder(twin, max(1, options.frames // options.wavefronts))
+        ) as frozen_wavefronts:
+            segment = bench.run(loop.measure(options.frames, amplitude, "gains"))
+    if segment.gains is None:
         raise SystemExit(f"no gains: {segment.reason}")
     rows = projector(baseline.matrix, slope_weights(baseline.matrix))
     every = range(0, baseline.matrix.n_modes, options.every)
@@ -110,11 +111,8 @@ def pokes(bench: System, options: argparse.Namespace) -> dict[str, Any]:
         with open_system(options.system, seed=bench.config.system.seed, set=options.set) as fresh:
             poked = GainMeasurementLoop(fresh, baseline, {}, science=True)
             poked.control.set_gain(loop.gain)
-            try:
-                poked.start()
+            with poked.closed():
                 segment = fresh.run(poked.measure(options.frames, amplitude, name))
-            finally:
-                poked.open_loop()
         one = strehl(segment.record.science.images(), psf).peak
         document[name] |= {"strehl": [one.value, one.sigma], "poke": float(amplitude.max())}
     return document

@@ -31,7 +31,7 @@ from escape_hw.api.procedure import Progress
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, prepare_sensor
-from escape_hw.calibration.loop.performance import build_integrator
+from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.runner import RunningLoop
 from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_matrix
 from escape_hw.calibration.tracking.tracker import track

@@ -33,7 +33,7 @@ from pyrtc.wavefront_sensor import WavefrontSensor
 
 from escape_hw.api.camera import Camera
 from escape_hw.api.mirror import DeformableMirror
-from escape_hw.bench import Bench, build_bench
+from escape_hw.bench import Bench
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, FrameTimeout
 
@@ -61,7 +61,7 @@ def shared_bench(conf: dict[str, Any]) -> Bench:
     with _lock:
         key = (system, str(mode), *overrides)
         if key not in _benches:
-            _benches[key] = build_bench(load_system(system, overrides=overrides, mode=mode))
+            _benches[key] = Bench.from_config(load_system(system, overrides=overrides, mode=mode))
         return _benches[key]
 
 

@@ -214,6 +214,7 @@ class LoopResult:
     ``psf`` and ``model_psf`` are dark-subtracted images of the science camera with the same
     integration; ``latency_us`` holds wall-clock p50, p99 and max of the frame-to-command path.
     ``residual_nm`` is a decimated record of the residual wavefront rms seen by the sensor.
+    ``gain_sigma`` is the standard error of a gain that was found by a search, else ``None``.
     """
 
     method: str
@@ -234,10 +235,12 @@ class LoopResult:
     last_frame: NDArray[np.uint16] | None = None
     partial: bool = False
     notes: tuple[str, ...] = ()
+    gain_sigma: float | None = None
 
     def __repr__(self) -> str:
+        error = f" ± {self.gain_sigma:.1g}" if self.gain_sigma is not None else ""
         words = [
-            f"{self.method} at gain {self.gain:.3g}",
+            f"{self.method} at gain {self.gain:.3g}{error}",
             f"{self.frames} frames at {self.rate_hz:.4g} Hz, {self.lost_frames} lost",
             "stable" if self.stable else "UNSTABLE",
             f"residual {self.residual_rms_nm:.3g} nm rms",

@@ -121,6 +121,7 @@ def loop_document(result: LoopResult) -> dict[str, Any]:
     return {
         "method": result.method,
         "gain": result.gain,
+        "gain_sigma": result.gain_sigma,
         "leak": result.leak,
         "dropped_modes": result.dropped_modes,
         "frames": result.frames,

@@ -8,29 +8,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-#: Fewer values do not tell how they are correlated.
+#: Fewest values from which a correlation is estimated.
 MIN_SAMPLES = 10
 #: Statistical error of the window over its systematic one (Wolff 2004, S).
 _WOLFF_S = 1.5
-#: The window spans at least the root of so many times the length: the values of short series seem less
-#: correlated than they are. Found on loops of known scatter (docs/decisions/0013-strehl-errors.md).
+#: The window is at least the root of this times the length, because the correlation of short series is
+#: underestimated. Found on loops of known scatter (docs/decisions/0013-strehl-errors.md).
 _MIN_WINDOW_FACTOR = 3.0
-#: The error is not stated below the root of this share of that of uncorrelated values.
+#: Lower limit of the variance, as a share of that of uncorrelated values.
 _MIN_VARIANCE_FRACTION = 0.5
 
 
 def standard_error(series: NDArray[np.floating]) -> float:
     """Standard error of the mean of a stationary series.
 
-    ``sigma^2 = (C_0 + 2 sum over k up to W of (1 - k/n) C_k) / n`` with the autocovariances ``C_k``.
-    The window W is chosen so that what it cuts off and what it adds in noise are balanced (Wolff 2004,
-    Comput. Phys. Commun. 156, 143, eq. 52). About the series' own mean, every autocovariance comes out
-    too small by ``sigma^2``, which is solved for.
+    ``sigma^2 = (C_0 + 2 sum over k up to W of (1 - k/n) C_k) / n`` with the autocovariances ``C_k``. The
+    window W balances truncation and statistical error (Wolff 2004, Comput. Phys. Commun. 156, 143, eq. 52).
+    The bias of the autocovariances about the series' own mean, ``-sigma^2``, is corrected.
 
     Parameters
     ----------
     series
-        Values in their order ``(n,)``.
+        Values in order ``(n,)``.
 
     Returns
     -------
@@ -47,7 +46,7 @@ def standard_error(series: NDArray[np.floating]) -> float:
     k = np.arange(1, window + 1)
     total = float(covariance[0] + 2 * ((1 - k / n) * covariance[1 : window + 1]).sum())
     degrees_of_freedom = n - (2 * window + 1) + window * (window + 1) / n
-    # That the sum comes out near zero or below is chance; values that alternate so well are none of ours.
+    # A sum near zero or below is a statistical fluctuation.
     return math.sqrt(max(total, _MIN_VARIANCE_FRACTION * float(covariance[0])) / degrees_of_freedom)
 
 
@@ -70,9 +69,9 @@ def _truncation_lag(covariance: NDArray[np.float64]) -> int:
     return n // 3
 
 
-#: Fewer pairs know too little of their own scatter.
+#: Fewest pairs, for an estimate of their scatter.
 MIN_PAIRS = 6
-#: Confidence of every statement.
+#: Confidence level of all statements.
 CONFIDENCE = 0.95
 _RESAMPLES = 20_000
 
@@ -88,10 +87,10 @@ class PairedComparison:
     low, high
         Confidence interval of the mean, at :data:`CONFIDENCE`.
     equivalence
-        Smallest margin x within which A and B are equivalent at :data:`CONFIDENCE`: two one-sided tests
-        (Schuirmann 1987), that is, the interval of twice the error probability lies within -x..x.
+        Smallest margin x within which A and B are equivalent at :data:`CONFIDENCE` by two one-sided tests
+        (Schuirmann 1987): the interval of twice the error probability lies within -x..x.
     pairs
-        How many.
+        Number of pairs.
     """
 
     mean: float
@@ -103,11 +102,11 @@ class PairedComparison:
 
     @property
     def is_different(self) -> bool:
-        """Whether the interval leaves zero out."""
+        """Whether the interval excludes zero."""
         return self.low > 0 or self.high < 0
 
     def is_equivalent(self, margin: float) -> bool:
-        """Whether A and B are shown to be equivalent within a margin."""
+        """Whether A and B are equivalent within a margin."""
         return self.equivalence <= margin
 
 
@@ -116,20 +115,20 @@ def compare_pairs(
 ) -> PairedComparison:
     """Compare two series pair by pair, by the studentised bootstrap (Efron & Tibshirani 1993, ch. 12.5).
 
-    Resampled means are divided by their own standard errors, so that the intervals hold for few pairs,
-    where plain percentiles are too narrow.
+    Resampled means are divided by their own standard errors, so that the intervals hold also for few pairs,
+    for which plain percentiles are too narrow.
 
     Parameters
     ----------
     first, second
-        Values of A and B on the same air ``(n,)``.
+        Values of A and B for the same turbulence ``(n,)``.
     seed
-        Of the resampling.
+        Seed of the resampling.
 
     Raises
     ------
     ValueError
-        Not as many of one as of the other, or fewer than :data:`MIN_PAIRS`.
+        The series differ in length, or have fewer than :data:`MIN_PAIRS` values.
     """
     if first.shape != second.shape or first.ndim != 1 or first.size < MIN_PAIRS:
         raise ValueError(f"{first.shape} and {second.shape}: at least {MIN_PAIRS} pairs are needed")
@@ -140,7 +139,7 @@ def compare_pairs(
         return PairedComparison(mean, 0.0, mean, mean, abs(mean), n)
     drawn = d[np.random.default_rng(seed).integers(0, n, (_RESAMPLES, n))]
     errors = drawn.std(axis=1, ddof=1) / np.sqrt(n)
-    # A resample of one value alone knows no error of its own; with six pairs that is one in ten thousand.
+    # A resample of equal values has no error of its own; with six pairs that is one in ten thousand.
     usable = errors > 1e-3 * sigma
     t = (drawn.mean(axis=1)[usable] - mean) / errors[usable]
     half, whole = (1 - CONFIDENCE) / 2, 1 - CONFIDENCE
@@ -151,33 +150,32 @@ def compare_pairs(
 
 
 def describe_comparison(first: str, second: str, comparison: PairedComparison, margin: float) -> str:
-    """What may be said of two arms, in percent of the Strehl ratio.
+    """Describe a comparison of Strehl ratios in a sentence, in percent.
 
     Parameters
     ----------
     first, second
         Names of A and B.
-    found
+    comparison
         Their comparison.
     margin
-        Difference in the Strehl ratio that does not matter.
+        Difference of the Strehl ratio within which they count as equivalent.
     """
     confidence = f"{100 * CONFIDENCE:.0f} %"
-    size = f"{100 * abs(comparison.mean):.2f} ± {100 * comparison.sigma:.2f} % Strehl"
+    mean, sigma, equivalence = 100 * comparison.mean, 100 * comparison.sigma, 100 * comparison.equivalence
     if comparison.is_equivalent(margin):
-        text = (
-            f"{first} and {second} equivalent within {100 * comparison.equivalence:.2f} % Strehl at {confidence} "
-            f"(difference {100 * comparison.mean:+.2f} ± {100 * comparison.sigma:.2f} %)"
+        return (
+            f"{first} and {second} equivalent within {equivalence:.2f} % Strehl at {confidence} "
+            f"(difference {mean:+.2f} ± {sigma:.2f} %)"
         )
-    elif comparison.is_different:
-        better, worse = (first, second) if comparison.mean > 0 else (second, first)
-        text = f"{better} better than {worse} by {size} ({confidence}: {_interval(comparison)})"
-    else:
-        text = (
-            f"{first} against {second} undecided: {100 * comparison.mean:+.2f} ± {100 * comparison.sigma:.2f} % "
-            f"Strehl, equivalent only within {100 * comparison.equivalence:.2f} %; more pairs decide"
-        )
-    return text
+    if comparison.is_different:
+        better, worse = (first, second) if mean > 0 else (second, first)
+        size = f"{abs(mean):.2f} ± {sigma:.2f} % Strehl"
+        return f"{better} better than {worse} by {size} ({confidence}: {_interval(comparison)})"
+    return (
+        f"{first} against {second} undecided: {mean:+.2f} ± {sigma:.2f} % Strehl, equivalent only within "
+        f"{equivalence:.2f} %; use more pairs"
+    )
 
 
 def _interval(comparison: PairedComparison) -> str:

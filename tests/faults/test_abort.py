@@ -15,7 +15,7 @@ from escape_hw.calibration.acquisition.model_psf import measure_model_psf
 from escape_hw.calibration.acquisition.sensor_setup import find_sensor, measure_dark
 from escape_hw.calibration.docrime.open_loop import docrime
 from escape_hw.calibration.escape.method import escape
-from escape_hw.calibration.loop.gain_search import best_gain
+from escape_hw.calibration.loop.gain_search import find_best_gain
 from escape_hw.calibration.loop.performance import close_loop
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.errors import Aborted
@@ -44,7 +44,7 @@ PLACES = {
     "ESCAPE, model": (lambda b, g: escape(b, frames=400), "synthetic model", 0.0),
     "ESCAPE, SPRINT": (lambda b, g: escape(b, frames=400), "SPRINT", 0.05),
     "model PSF": (lambda b, g: model_psf(b, frames=500), "model PSF", 0.01),
-    "best gain": (lambda b, g: best_gain(b, g.matrix, g.grid, frames=50_000), "loop at gain", 0.006),
+    "best gain": (lambda b, g: find_best_gain(b, g.matrix, g.grid, frames=50_000), "loop at gain", 0.006),
     "closed loop": (lambda b, g: close_loop(b, g.matrix, g.grid, frames=100_000), "closed loop", 0.003),
     "closed loop with Strehl": (
         lambda b, g: close_loop(b, g.matrix, g.grid, frames=100_000, model_psf=g.psf),

@@ -13,7 +13,7 @@ from escape_hw.calibration.acquisition.model_psf import measure_model_psf
 from escape_hw.calibration.acquisition.sensor_setup import find_sensor, measure_dark
 from escape_hw.calibration.docrime.open_loop import docrime
 from escape_hw.calibration.escape.method import escape
-from escape_hw.calibration.loop.gain_search import best_gain
+from escape_hw.calibration.loop.gain_search import find_best_gain
 from escape_hw.calibration.loop.performance import close_loop
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.errors import (
@@ -93,7 +93,7 @@ def test_loop_settings_that_mean_nothing(shared, good, options, error, match):
 
 
 def test_a_gain_that_means_nothing_in_the_search(shared, good):
-    refuse(shared, best_gain(shared, good.matrix, good.grid, gains=(0.0, 0.3)), ConfigError, "gain is 0")
+    refuse(shared, find_best_gain(shared, good.matrix, good.grid, gains=(0.0, 0.3)), ConfigError, "gain is 0")
 
 
 @pytest.mark.parametrize(

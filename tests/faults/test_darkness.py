@@ -10,7 +10,7 @@ from escape_hw.calibration.acquisition.model_psf import measure_model_psf
 from escape_hw.calibration.acquisition.sensor_setup import find_sensor
 from escape_hw.calibration.docrime.open_loop import docrime
 from escape_hw.calibration.escape.method import escape
-from escape_hw.calibration.loop.gain_search import best_gain
+from escape_hw.calibration.loop.gain_search import find_best_gain
 from escape_hw.calibration.loop.performance import close_loop
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.errors import CalibrationError
@@ -34,7 +34,7 @@ BLOCKED = {
     "docrime on a grid": (lambda bench, good: docrime(bench, frames=400, grid=good.grid), NO_LIGHT),
     "escape on a grid": (lambda bench, good: escape(bench, frames=400, grid=good.grid), NO_LIGHT),
     "closed_loop": (lambda bench, good: close_loop(bench, good.matrix, good.grid, frames=300), NO_LIGHT),
-    "best_gain": (lambda bench, good: best_gain(bench, good.matrix, good.grid, frames=100), NO_LIGHT),
+    "best_gain": (lambda bench, good: find_best_gain(bench, good.matrix, good.grid, frames=100), NO_LIGHT),
     "model PSF": (lambda bench, good: measure_model_psf(bench), r"^science: no light"),
 }
 

@@ -32,7 +32,7 @@ class Operator:
         while self.steps and progress.done >= self.steps[0][0]:
             self.steps.pop(0)[1](self.loop_control)
         if progress.done >= self.end:
-            self.loop_control.open()
+            self.loop_control.request_open()
 
 
 @pytest.fixture(autouse=True)
@@ -84,9 +84,9 @@ def test_the_strehl_ratio_is_followed(bench, good):
 def test_settings_change_without_a_bump(bench, good):
     other = replace(good.run.result, matrix=replace(good.matrix, data=good.matrix.data * 1.02))
     steps = (
-        (400, lambda loop_control: loop_control.change(gain=0.2)),
-        (600, lambda loop_control: loop_control.change(leak=0.05)),
-        (800, lambda loop_control: loop_control.change(calibration=other, gain=0.3)),
+        (400, lambda loop_control: loop_control.request_change(gain=0.2)),
+        (600, lambda loop_control: loop_control.request_change(leak=0.05)),
+        (800, lambda loop_control: loop_control.request_change(calibration=other, gain=0.3)),
     )
     found, operator, sent = kept(bench, good, *steps, end=1000)
     assert found.settings.calibration is other
@@ -101,7 +101,7 @@ def test_dropped_modes_fade_from_the_mirror(bench, good):
     found, _, sent = kept(
         bench,
         good,
-        (500, lambda loop_control: loop_control.change(dropped_modes=12)),
+        (500, lambda loop_control: loop_control.request_change(dropped_modes=12)),
         end=1000,
         leak=0.0,
         gain=0.3,
@@ -110,10 +110,10 @@ def test_dropped_modes_fade_from_the_mirror(bench, good):
     steps_of = largest_step(sent)
     assert steps_of[480:].max() < 1.5 * steps_of[150:480].max()
     # What twelve eigenmodes span is empty in the end, also without a leak.
-    control = LoopControl(bench, good.run.result, dropped_modes=12).take()
+    control = LoopControl(bench, good.run.result, dropped_modes=12).take_change()
     modes = np.linalg.lstsq(good.matrix.m2c, sent[-40 - 20], rcond=None)[0]
     before = np.linalg.lstsq(good.matrix.m2c, sent[480], rcond=None)[0]
-    idle = control.outside.T
+    idle = control.undriven.T
     assert idle.shape[0] == 12
     assert np.linalg.norm(idle @ modes) < 0.02 * np.linalg.norm(idle @ before)
     assert np.linalg.norm(modes) > 0.3 * np.linalg.norm(before)
@@ -121,16 +121,16 @@ def test_dropped_modes_fade_from_the_mirror(bench, good):
 
 def test_what_makes_no_sense_is_refused_and_changes_nothing(bench, good):
     loop_control = LoopControl(bench, good.run.result)
-    first = loop_control.take()
+    first = loop_control.take_change()
     with pytest.raises(ConfigError, match="gain is -1"):
-        loop_control.change(gain=-1)
+        loop_control.request_change(gain=-1)
     with pytest.raises(ConfigError, match="leak 2"):
-        loop_control.change(leak=2.0)
+        loop_control.request_change(leak=2.0)
     fewer = replace(good.matrix, data=good.matrix.data[:, :9], sigma=good.matrix.sigma[:, :9],
                     m2c=good.matrix.m2c[:, :9])  # fmt: skip
     with pytest.raises(ConfigError, match="open the loop"):
-        loop_control.change(calibration=replace(good.run.result, matrix=fewer))
-    assert loop_control.take() is None
+        loop_control.request_change(calibration=replace(good.run.result, matrix=fewer))
+    assert loop_control.take_change() is None
     assert loop_control.settings == first.settings
     with pytest.raises(IncompatibleProduct):
         LoopControl(bench, replace(good.run.result, matrix=replace(good.matrix, m2c=good.matrix.m2c[:9])))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from small_bench import PLANTED, assert_flat, faulty, small
 
-from escape_hw.calibration.acquisition.sensor_setup import build_modal_basis
 from escape_hw.calibration.docrime.open_loop import docrime_run
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.errors import CalibrationError, ConfigError, ProductError
@@ -86,7 +86,7 @@ def test_disabled_actuators(disabled):
 def test_more_modes_than_working_actuators_make():
     disabled = list(range(7))
     with small(f"devices.dm.limits.disabled={disabled}") as bench:
-        with pytest.raises(CalibrationError, match="30 modes asked for; this mirror of 30 actuators"):
+        with pytest.raises(CalibrationError, match="30 modes requested; this mirror of 30 actuators"):
             bench.run(docrime_run(bench, frames=400))
         assert bench.dm.sent_count == 0
 

@@ -140,6 +140,6 @@ def test_pictures_take_a_small_share_of_the_time(monkeypatch):
     pictures = MatrixPreview(3, lambda: None)
     for _ in range(100_000):
         clock[0] += 0.001
-        if pictures.due():
+        if pictures.is_due():
             assert pictures(slow)["matrix"].shape == (4, 3)
     assert 0.02 < sum(spent) / clock[0] < 0.05

@@ -7,7 +7,7 @@ from small_bench import assert_flat, small
 
 from escape_hw.api.callbacks import Callbacks
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function
-from escape_hw.calibration.loop.performance import build_integrator
+from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.runner import RunningLoop
 
 

@@ -89,7 +89,7 @@ def test_a_delay_beyond_the_lags_is_told(closed, lags):
         planted.N_SLOPES, planted.N_MODES, order=planted.ORDER, lags=lags, closed=closed, correlations=False
     )
     with pytest.raises(
-        CalibrationError, match=r"answers pokes [23] frames after .* calibration.lags to at least [56]"
+        CalibrationError, match=r"responds to pokes [23] frames after .* calibration.lags to at least [56]"
     ):
         blind.extend(run.index, run.slopes, excitation).solve()
 

@@ -10,7 +10,7 @@ from escape_hw.calibration.push_pull.demodulation import (
     compute_matrix,
     estimate_delay,
     fit_lines,
-    response_at,
+    frequency_response,
 )
 from escape_hw.errors import TooFewFrames
 
@@ -43,9 +43,9 @@ def test_lines_fill_the_band_and_stand_apart():
 
 
 def test_too_few_frames_for_a_line():
-    with pytest.raises(TooFewFrames, match="hold no line"):
+    with pytest.raises(TooFewFrames, match="resolve no line"):
         choose_line_frequencies(3, 12, (0.1, 0.4))
-    with pytest.raises(TooFewFrames, match="cannot tell"):
+    with pytest.raises(TooFewFrames, match="too few for"):
         fit_lines(np.arange(20), np.zeros((20, 3)), np.linspace(0.7, 2, 12), np.ones(12), 20)
 
 
@@ -83,5 +83,5 @@ def test_noise_alone_has_unit_pulls():
 
 def test_response_is_a_pure_delay_for_whole_frames():
     w = np.linspace(0.1, 3, 7)
-    np.testing.assert_allclose(response_at(w, 3.0), np.exp(-3j * w), atol=1e-12)
-    assert (np.abs(response_at(w, 2.5)) < 1).all()
+    np.testing.assert_allclose(frequency_response(w, 3.0), np.exp(-3j * w), atol=1e-12)
+    assert (np.abs(frequency_response(w, 2.5)) < 1).all()

@@ -158,14 +158,14 @@ def test_numbers_that_are_not_finite_are_refused(bad):
         estimator.partial_fit(0, slopes[0], np.full(N_MODES, bad))
 
 
-def test_an_index_that_does_not_rise_is_refused():
+def test_an_index_that_does_not_increase_is_refused():
     slopes, pokes, _ = make(50)
     estimator = DocrimeEstimator(N_SLOPES, N_MODES).partial_fit(7, slopes[0], pokes[0])
     with pytest.raises(ValueError, match="from 7 to 7"):
         estimator.partial_fit(7, slopes[1], pokes[1])
-    with pytest.raises(ValueError, match="must rise"):
+    with pytest.raises(ValueError, match="must increase"):
         estimator.extend(np.array([8, 8]), slopes[:2], pokes[:2])
-    with pytest.raises(ValueError, match="must rise"):
+    with pytest.raises(ValueError, match="must increase"):
         estimator.extend(np.array([6, 8]), slopes[:2], pokes[:2])
 
 

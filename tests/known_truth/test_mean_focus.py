@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.sensor import SubApertureGrid
-from escape_hw.calibration.acquisition.frames import SlopeStatistics
-from escape_hw.calibration.acquisition.mean_focus import StaticFocusEstimator
+from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics, StaticFocusEstimator
 from escape_sim.atmosphere.phase_plates import von_karman_screen
 
 N_SUB, RATE_HZ, SIZE = 16, 500.0, 1024

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,15 +63,11 @@ def measured(
     loop, matrix = GainMeasurementLoop(bench, result, {}), result.matrix
     loop.control.set_gain(bench.config.loop.gain)
     watching = WavefrontRecorder(get_simulated_bench(bench), frames // wavefronts)
-    try:
-        loop.start()
+    with loop.closed(), closing(watching):
         watching.recording = False
         bench.run(loop.measure(300, np.full(matrix.n_modes, POKE), "settling"))
         watching.recording = True
         segment = bench.run(loop.measure(frames, np.full(matrix.n_modes, POKE), "gains"))
-    finally:
-        watching.close()
-        loop.open_loop()
     rows = projector(matrix, slope_weights(matrix))
     modes = list(range(0, matrix.n_modes, every))
     return segment, true_optical_gains(
@@ -113,13 +110,10 @@ def test_small_pokes_go_on_with_the_response_that_larger_ones_told(
     loop = GainMeasurementLoop(bench, baseline, {})
     loop.control.set_gain(bench.config.loop.gain)
     modes = baseline.matrix.n_modes
-    try:
-        loop.start()
+    with loop.closed():
         large, small = (
             bench.run(loop.measure(600, np.full(modes, poke), "gains")).gains for poke in (POKE, POKE / 6)
         )
-    finally:
-        loop.open_loop()
     assert large is not None
     assert small is not None
     # By themselves they tell the common scale to 5.6 %.

@@ -15,7 +15,7 @@ from small_system import SMALL
 import escape_hw
 from escape_hw.api.procedure import run
 from escape_hw.api.results import CalibrationResult
-from escape_hw.bench import build_bench
+from escape_hw.bench import Bench
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.cli import main
 from escape_hw.config.loader import load_system
@@ -136,7 +136,7 @@ def test_a_matrix_measured_by_pyrtc_is_improved_by_sprint(
     tmp_path: Path, command: Callable[..., dict[str, Any]], seed: int
 ) -> None:
     overrides = [*TWIN, f"system.seed={seed}"]
-    with build_bench(load_system("razor-shwfs", overrides=[*overrides, "twin.paced=false"])) as bench:
+    with Bench.from_config(load_system("razor-shwfs", overrides=[*overrides, "twin.paced=false"])) as bench:
         assert bench.screen is not None
         bench.screen.set(inserted=False)
         calm = run(push_pull(bench, frames=20))

@@ -14,7 +14,7 @@ from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.phase_screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.api.procedure import Procedure, Progress
-from escape_hw.bench import Bench, build_bench
+from escape_hw.bench import Bench
 from escape_hw.config.loader import load_system
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import Aborted, ConfigError, DeviceError, DeviceLost
@@ -154,9 +154,9 @@ def diary(monkeypatch: pytest.MonkeyPatch) -> Diary:
 
 
 def test_devices_of_one_bench_share_one_dictionary_and_benches_none(diary: Diary) -> None:
-    build_bench(load_system("razor-shwfs"))
+    Bench.from_config(load_system("razor-shwfs"))
     first = diary.members
-    build_bench(load_system("razor-shwfs"))
+    Bench.from_config(load_system("razor-shwfs"))
     assert first == diary.members == ["dm", "wfs", "science", "screen"]
     assert first is not diary.members
 
@@ -166,7 +166,7 @@ CLOSED = ["close screen", "close science", "close wfs", "close dm"]
 
 
 def test_opens_in_order_and_closes_in_reverse(diary: Diary) -> None:
-    bench = build_bench(load_system("razor-shwfs"))
+    bench = Bench.from_config(load_system("razor-shwfs"))
     assert diary == []
     assert not bench.is_open
     with bench:
@@ -181,7 +181,7 @@ def test_opens_in_order_and_closes_in_reverse(diary: Diary) -> None:
 
 @pytest.mark.usefixtures("diary")
 def test_mirror_is_flat_and_cameras_stopped_after_an_error_inside() -> None:
-    bench = build_bench(load_system("razor-shwfs"))
+    bench = Bench.from_config(load_system("razor-shwfs"))
     mirror = bench.dm
     assert isinstance(mirror, FakeMirror)
 
@@ -202,7 +202,7 @@ def test_mirror_is_flat_and_cameras_stopped_after_an_error_inside() -> None:
 @pytest.mark.parametrize("failing", ["wfs", "science", "screen"])
 def test_a_device_that_does_not_open_leaves_nothing_open(diary: Diary, failing: str) -> None:
     diary.failing[f"open {failing}"] = DeviceLost(failing, "unplugged")
-    bench = build_bench(load_system("razor-shwfs"))
+    bench = Bench.from_config(load_system("razor-shwfs"))
     with pytest.raises(DeviceLost, match=f"{failing}: unplugged"):
         bench.open()
     opened = [event.split()[1] for event in diary if event.startswith("open")][:-1]
@@ -214,7 +214,7 @@ def test_a_device_that_does_not_open_leaves_nothing_open(diary: Diary, failing: 
 def test_one_device_that_does_not_close_keeps_no_other_open(diary: Diary, error: BaseException) -> None:
     diary.failing["close wfs"] = error
     diary.failing["close dm"] = DeviceError("dm", "stuck too")
-    bench = build_bench(load_system("razor-shwfs")).open()
+    bench = Bench.from_config(load_system("razor-shwfs")).open()
     with pytest.raises(type(error)) as caught:
         bench.close()
     assert diary[4:] == CLOSED
@@ -224,7 +224,7 @@ def test_one_device_that_does_not_close_keeps_no_other_open(diary: Diary, error:
 
 def test_the_error_inside_wins_over_errors_of_closing(diary: Diary) -> None:
     diary.failing["close wfs"] = DeviceError("wfs", "stuck")
-    with pytest.raises(ValueError, match="mine") as caught, build_bench(load_system("razor-shwfs")):
+    with pytest.raises(ValueError, match="mine") as caught, Bench.from_config(load_system("razor-shwfs")):
         raise ValueError("mine")
     assert any("stuck" in note for note in caught.value.__notes__)
     assert diary[4:] == CLOSED
@@ -232,18 +232,18 @@ def test_the_error_inside_wins_over_errors_of_closing(diary: Diary) -> None:
 
 @pytest.mark.usefixtures("diary")
 def test_mode_chooses_driver_or_twin() -> None:
-    twins = build_bench(load_system("razor-shwfs"))
+    twins = Bench.from_config(load_system("razor-shwfs"))
     assert twins.simulated
     assert twins.screen is not None
 
-    metal = build_bench(load_system("razor-shwfs", mode="hardware"))
+    metal = Bench.from_config(load_system("razor-shwfs", mode="hardware"))
     assert not metal.simulated
     assert metal.screen is None, "the real screen is moved by hand"
     with metal:
         assert not metal.simulated
         assert not metal.dm.info.simulated
 
-    mixed = build_bench(load_system("razor-shwfs", mode="hardware", overrides=["devices.wfs.mode=sim"]))
+    mixed = Bench.from_config(load_system("razor-shwfs", mode="hardware", overrides=["devices.wfs.mode=sim"]))
     assert mixed.simulated
     with mixed:
         assert mixed.wfs.info.simulated
@@ -253,7 +253,7 @@ def test_mode_chooses_driver_or_twin() -> None:
 @pytest.mark.usefixtures("diary")
 @pytest.mark.parametrize("driver", ["devices.dm.driver=sim-alpao", "devices.screen.driver=sim-screen"])
 def test_a_driver_that_says_it_is_simulated_is_believed(driver: str) -> None:
-    bench = build_bench(load_system("razor-shwfs", mode="hardware", overrides=[driver]))
+    bench = Bench.from_config(load_system("razor-shwfs", mode="hardware", overrides=[driver]))
     with bench:
         assert bench.simulated
 
@@ -273,13 +273,13 @@ def test_a_driver_that_says_it_is_simulated_is_believed(driver: str) -> None:
 )
 def test_wrong_drivers_are_configuration_errors(override: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        build_bench(load_system("razor-shwfs", overrides=[override]))
+        Bench.from_config(load_system("razor-shwfs", overrides=[override]))
     assert str(caught.value).startswith(message)
 
 
 @pytest.mark.usefixtures("diary")
 def test_the_random_stream_follows_the_seed_and_is_not_the_plain_one() -> None:
-    draws = [build_bench(load_system("razor-shwfs", seed=seed)).rng.random(4) for seed in (1, 1, 2)]
+    draws = [Bench.from_config(load_system("razor-shwfs", seed=seed)).rng.random(4) for seed in (1, 1, 2)]
     assert np.array_equal(draws[0], draws[1])
     assert not np.array_equal(draws[0], draws[2])
     assert not np.array_equal(draws[0], np.random.default_rng(1).random(4))
@@ -294,7 +294,7 @@ def test_the_model_comes_from_the_registry(monkeypatch: pytest.MonkeyPatch) -> N
         return lambda config, grid: SimpleNamespace(config=config, grid=grid)
 
     monkeypatch.setattr(escape_hw.bench, "model_factory", model_factory)
-    bench = build_bench(load_system("razor-shwfs", overrides=["calibration.model=oopao"]))
+    bench = Bench.from_config(load_system("razor-shwfs", overrides=["calibration.model=oopao"]))
     model = bench.model()
     assert isinstance(model, SimpleNamespace)
     assert (model.config, model.grid) == (bench.config, None)
@@ -340,6 +340,6 @@ def test_run_drives_a_procedure_and_stops_it() -> None:
 
 @pytest.mark.usefixtures("diary")
 def test_a_bench_says_what_it_is() -> None:
-    with build_bench(load_system("razor-shwfs", mode="hardware")) as bench:
+    with Bench.from_config(load_system("razor-shwfs", mode="hardware")) as bench:
         assert repr(bench) == "<Bench razor-shwfs, hardware, open>"
-    assert repr(build_bench(load_system("razor-shwfs"))) == "<Bench razor-shwfs, simulated, closed>"
+    assert repr(Bench.from_config(load_system("razor-shwfs"))) == "<Bench razor-shwfs, simulated, closed>"

@@ -8,7 +8,7 @@ from pathlib import Path
 import fake_results as fake
 import numpy as np
 import pytest
-from made_up_sweep import SWEPT, made_up
+from synthetic_sweep import SWEPT, synthetic_run
 
 import escape_hw
 from escape_hw.api.camera import CameraSettings, Frame, Region
@@ -55,7 +55,7 @@ RESULTS = {
     "GainsResult": (fake.gains_result, 1, ("of escape: 2 rounds", "converged")),
     "GainsRun": (lambda: GainsRun(fake.gains_result(), fake.calibration()), 2, ("rescaled",)),
     "SweepResult": (
-        lambda: analyse_sweep(SWEPT, made_up(0.05), 0.01), 6, ("128 loops", "ESCAPE better", "at its best"),
+        lambda: analyse_sweep(SWEPT, synthetic_run(0.05), 0.01), 6, ("128 loops", "ESCAPE better", "at its best"),
     ),
     "SensorSetup": (lambda: SensorSetup(fake.grid(), np.zeros((400, 400), np.float32)), 1, ("400",)),
     "SubApertureGrid": (fake.grid, 1, ("pitch_px=15.55", "bool[24, 24]")),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from escape_hw.bench import build_bench
+from escape_hw.bench import Bench
 from escape_hw.config import registry
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
@@ -114,7 +114,7 @@ def test_what_cannot_be_loaded_says_what_to_do(name: str, message: str) -> None:
 )
 def test_what_makes_no_mirror_is_named_with_what_is_expected(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        build_bench(load_system("razor-shwfs", overrides=[f"devices.dm.sim_driver={name}"]))
+        Bench.from_config(load_system("razor-shwfs", overrides=[f"devices.dm.sim_driver={name}"]))
     assert str(caught.value).startswith("devices.dm: driver")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
-from escape_hw.calibration.docrime.forgetting_sums import ForgettingSums
+from escape_hw.calibration.docrime.regression import ForgettingSums
 
 N_SLOPES, N_MODES = 24, 6
 
@@ -36,7 +36,7 @@ def closed_loop(rng, truth, frames, poke=0.1, gain=0.5):
 def solved(sums, matrix, rounds=5):
     """The plain matrix that the sums hold: least squares on the turned columns, again and again."""
     for _ in range(rounds):
-        columns = sums.columns(frame_of(matrix), matrix)
+        columns = sums.build_columns(frame_of(matrix), matrix)
         matrix = columns.data.astype(float) @ np.linalg.pinv(columns.m2c)
     return matrix
 
@@ -71,7 +71,7 @@ def test_errors_of_faded_sums_are_honest(truth):
             y = (y + z @ truth.T).astype(np.float32)
             sums.forget(0.7)
             sums.add(y, z.astype(np.float32), z.astype(np.float32), truth.astype(np.float32))
-        columns = sums.columns(frame_of(truth), truth)
+        columns = sums.build_columns(frame_of(truth), truth)
         left = (columns.data - truth @ columns.m2c) / columns.sigma
         chi2.append(np.mean(np.square(left)))
     assert np.mean(chi2) == pytest.approx(1.0, abs=0.05)

@@ -13,6 +13,7 @@ import pytest
 from escape_hw.io.fits.gains import load_gains
 from escape_hw.io.fits.loop import load_loop
 from escape_hw.io.fits.matrix import load_matrix
+from escape_hw.io.run_folder import read_result
 from escape_hw.streams.recording.block_file import read_recording
 
 OLD = Path(__file__).parents[1] / "data" / "0.1.0"
@@ -108,3 +109,10 @@ def test_a_tracked_run_keeps_its_course(document):
     code, found, _ = document("show", OLD / "track")
     assert code == 0
     assert found["track"]["seconds"] == reported("track")["track"]["seconds"]
+
+
+def test_a_result_is_read_with_the_present_names_of_its_keys():
+    found, stored = read_result(OLD / "escape"), reported("escape")
+    assert found["injected"] == stored["planted"]
+    assert "planted" not in found
+    assert read_result(OLD / "track")["injected_end"] == reported("track")["planted_end"]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.procedure import run
+from escape_hw.api.results import Estimate, StrehlEstimate
 from escape_hw.calibration.loop import gain_search
 from escape_hw.errors import CalibrationError
 
@@ -28,7 +29,7 @@ def test_a_best_gain_at_the_edge_of_the_scan_is_none(monkeypatch, top, limit):
         yield
 
     monkeypatch.setattr(gain_search, "close_loop", loop)
-    found, runs = run(gain_search.best_gain(None, fake_results.matrix(), None))
+    found, runs = run(gain_search.find_best_gain(None, fake_results.matrix(), None))
     assert len(runs) <= len(gain_search.GAIN_FRACTIONS) + 4
     assert min(tried) <= found <= max(tried)
     if top < limit:
@@ -43,4 +44,56 @@ def test_a_loop_that_closes_at_no_gain_says_so(monkeypatch):
 
     monkeypatch.setattr(gain_search, "close_loop", loop)
     with pytest.raises(CalibrationError, match=r"none of the gains .*0\.05"):
-        run(gain_search.best_gain(None, fake_results.matrix(), None))
+        run(gain_search.find_best_gain(None, fake_results.matrix(), None))
+
+
+#: Gains of a scan, and Strehl ratios that rise steadily and fall steeply near the limit of stability.
+GAINS = np.array([0.228, 0.319, 0.41, 0.501, 0.592, 0.683])
+
+
+def strehl_at(gain):
+    return 0.2 + 0.5 * gain - 0.02 * np.logaddexp(0, (gain - 0.63) / 0.02)
+
+
+BEST = 0.63
+
+
+def fitted(sigma, rng=None, gains=GAINS):
+    """Gain and standard error from runs with Strehl ratios of a standard error."""
+    runs = []
+    for gain in gains:
+        value = strehl_at(gain) + (0.0 if rng is None else sigma * rng.standard_normal())
+        ratio = Estimate(float(value), sigma)
+        runs.append(
+            replace(fake_results.loop(), gain=float(gain), strehl=StrehlEstimate(ratio, ratio, ratio))
+        )
+    return gain_search._fit_peak(runs)
+
+
+def test_an_asymmetric_curve_does_not_move_the_best_gain_to_the_edge_of_the_scan():
+    trial = np.linspace(0.2, 0.7, 5001)
+    assert trial[np.argmax(strehl_at(trial))] == pytest.approx(BEST, abs=1e-3)
+    gain, sigma = fitted(0.003)
+    assert abs(gain - BEST) < 0.02
+    assert strehl_at(gain) > strehl_at(BEST) - 0.002
+    assert 0.003 < sigma < 0.03
+
+
+@pytest.mark.parametrize("strehl_sigma", [0.003, 0.01])
+def test_the_error_of_the_best_gain_is_honest(strehl_sigma):
+    results = np.array([fitted(strehl_sigma, np.random.default_rng(k)) for k in range(200)])
+    pulls = (results[:, 0] - BEST) / results[:, 1]
+    assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.5
+
+
+def test_few_runs_give_the_best_of_them_and_the_distance_of_its_neighbours():
+    gain, sigma = fitted(0.003, gains=GAINS[1:4])
+    assert gain == GAINS[3]
+    assert sigma == pytest.approx((GAINS[3] - GAINS[2]) / np.sqrt(12))
+    assert np.isnan(fitted(0.003, gains=GAINS[:1])[1])
+
+
+def test_the_result_unpacks_as_gain_and_runs():
+    search = gain_search.GainSearch(0.4, 0.02, [fake_results.loop()])
+    gain, runs = search
+    assert (gain, runs) == (search.gain, search.runs)

@@ -151,7 +151,7 @@ def test_fewer_modes_reach_the_same_low_orders(modes, mirror):
 def test_too_many_modes_are_an_error(mirror):
     n_act = mirror[0].shape[0]
     karhunen_loeve(*mirror, PIXEL, n_act - 1, OUTER_SCALE)
-    with pytest.raises(CalibrationError, match=rf"{n_act} modes asked for.*at most {n_act - 1}"):
+    with pytest.raises(CalibrationError, match=rf"{n_act} modes requested.*at most {n_act - 1}"):
         karhunen_loeve(*mirror, PIXEL, n_act, OUTER_SCALE)
     with pytest.raises(CalibrationError, match=f"has {n_act} actuators"):
         zonal(*mirror, n_act + 1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.pyramid import PyramidPupils
-from escape_hw.calibration.acquisition.frames import SlopeStatistics
+from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 
 
 def pupils() -> PyramidPupils:

@@ -9,8 +9,8 @@ import pytest
 from small_system import SMALL
 
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.pokes import RandomPokes
-from escape_hw.calibration.acquisition.sensor_setup import build_modal_basis, compute_poke_amplitudes
+from escape_hw.calibration.acquisition.pokes import RandomPokes, compute_poke_amplitudes
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.config.loader import load_system
 from escape_hw.server.engine.planning import ProcedurePlanner
 

@@ -9,7 +9,6 @@ from escape_hw.calibration.acquisition.pokes import (
     ANTICORRELATION,
     RandomPokes,
     equal_snr_amplitudes,
-    information_gain,
     select_random_pokes,
 )
 
@@ -40,20 +39,6 @@ def test_shaped_pokes_alternate():
     pokes = drawn("anticorrelated") / AMPLITUDE
     by_lag = [np.mean(pokes[k:] * pokes[: len(pokes) - k]) / np.mean(pokes**2) for k in (1, 2)]
     assert by_lag == pytest.approx([-ANTICORRELATION, ANTICORRELATION**2], abs=0.03)
-
-
-def test_information_gain_is_the_power_of_the_whitened_pokes():
-    whitener, response = np.array([1.0, -1.4, 0.4]), np.array([0.0, 0.8, 0.2])
-
-    def power(pokes: np.ndarray) -> float:
-        seen = np.apply_along_axis(np.convolve, 0, pokes / AMPLITUDE, np.convolve(whitener, response))
-        return float(np.square(seen).mean())
-
-    found = power(drawn("anticorrelated")) / power(drawn("white"))
-    assert information_gain(whitener, response, ANTICORRELATION) == pytest.approx(found, rel=0.05)
-    assert information_gain(whitener, response, 0.0) == 1.0
-    # Without turbulence to whiten, a spectrum only loses what the response swallows.
-    assert information_gain(np.ones(1), response, 0.5) < 1
 
 
 def test_equal_snr_is_equal_and_keeps_the_budget():

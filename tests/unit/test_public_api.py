@@ -60,7 +60,7 @@ def test_errors_and_configuration_do_not_load_the_numerics() -> None:
     ("method", "procedure"),
     [
         ("close_loop", "close_loop"),
-        ("find_best_gain", "best_gain"),
+        ("find_best_gain", "find_best_gain"),
         ("take_model_psf", "measure_model_psf"),
         ("find_sensor", "find_sensor"),
     ],

@@ -60,8 +60,8 @@ def test_many_frames_at_once_are_many_single_ones():
     one, many = AlignedBuffer(3, 2, 3), AlignedBuffer(3, 2, 3)
     assert [one.append_one(s, p) for s, p in zip(slopes[:3], pokes[:3], strict=True)] == [2, 1, 0]
     assert many.append(slopes, pokes) == 3
-    assert one.full
-    assert many.full
+    assert one.is_full
+    assert many.is_full
     assert np.array_equal(one.telemetry().rows, many.telemetry().rows)
     assert np.array_equal(many.telemetry().pokes, pokes[:3])
 
@@ -83,7 +83,7 @@ def test_what_is_kept_is_the_past_of_what_follows():
     r = recorder(index, rows=6)
     assert r.n_new == 4
     r.retain_last(3)
-    assert (r.n_filled, r.kept, r.n_new) == (3, 3, 0)
+    assert (r.n_filled, r.n_retained, r.n_new) == (3, 3, 0)
     for i in (5, 6, 7):
         assert r.append_one(np.full(3, i, np.float32), np.full(2, 10.0 * i)) == 7 - i
     assert r.n_new == 3
@@ -105,7 +105,7 @@ def test_another_size_changes_nothing_that_is_there(rows):
     assert np.array_equal(after.rows, before.rows)
     assert np.array_equal(after.present, before.present)
     room = rows - 4
-    assert r.full == (room == 0)
+    assert r.is_full == (room == 0)
     for k in range(room):
         assert r.append_one(np.ones(3, np.float32), np.ones(2)) == room - k - 1
     assert r.telemetry().present.tolist() == [True, True, False, True] + [True] * room

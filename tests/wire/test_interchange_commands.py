@@ -13,7 +13,7 @@ from small_system import SMALL
 from streams import published
 
 from escape_hw.api.procedure import run
-from escape_hw.bench import build_bench
+from escape_hw.bench import Bench
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.cli import main
 from escape_hw.config.loader import load_system
@@ -43,7 +43,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
 def im(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A matrix of the small bench."""
     config = load_system("razor-shwfs", overrides=SMALL)
-    with build_bench(config) as bench:
+    with Bench.from_config(config) as bench:
         assert bench.screen is not None
         bench.screen.set(inserted=False)
         result = run(push_pull(bench, frames=4))

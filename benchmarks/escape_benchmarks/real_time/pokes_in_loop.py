@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 from escape_hw.api.benchmark import BenchmarkRow
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.pokes import RandomPokes
-from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, compute_poke_amplitudes
+from escape_hw.calibration.acquisition.pokes import RandomPokes, compute_poke_amplitudes
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 from escape_hw.calibration.docrime.estimator_thread import EstimatorThread
 from escape_hw.calibration.docrime.open_loop import docrime
-from escape_hw.calibration.loop.performance import build_integrator
+from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.runner import RunningLoop
 from escape_hw.config.loader import load_system
 
@@ -41,27 +40,23 @@ def _measure_latencies(bench: Bench) -> tuple[NDArray[np.float64], NDArray[np.fl
     """Microseconds from frame to command with and without pokes, and frames the estimate skipped."""
     start_calibration = run_procedure(docrime(bench, frames=1000))
     matrix, grid = start_calibration.matrix, start_calibration.grid
-    control = build_integrator(bench, matrix, grid)
-    loop = RunningLoop(bench, matrix.m2c, build_slope_function(bench, grid), control)
+    loop = RunningLoop.prepare(bench, matrix, grid, build_integrator(bench, matrix, grid))
     pokes = RandomPokes(compute_poke_amplitudes(bench, matrix.m2c, POKE), bench.rng)
     estimator = DocrimeEstimator(matrix.n_slopes, matrix.n_modes, correlations=False, closed=True)
     poked: list[int] = []
     unpoked: list[int] = []
-    try:
-        with EstimatorThread(estimator, blocking=False) as background_estimator:
-            # The first stretch compiles, closes the loop, and fits the filter.
-            run_procedure(loop.run(2 * FRAMES, inject=pokes, observe=(background_estimator,)))
-            run_procedure(loop.run(2 * FRAMES, inject=pokes, observe=(background_estimator,)))
-            for _ in range(ROUNDS):
-                for which, options in (
-                    (unpoked, {}),
-                    (poked, {"inject": pokes, "observe": (background_estimator,)}),
-                ):
-                    before = loop.record.frames
-                    run_procedure(loop.run(FRAMES, **options))  # type: ignore[arg-type]
-                    which += loop.record.latency[before:]
-            background_estimator.finish()
-            skipped = background_estimator.skipped
-    finally:
-        bench.dm.flatten()
+    with loop.closed(), EstimatorThread(estimator, blocking=False) as background_estimator:
+        # The first stretches compile, close the loop, and fit the filter.
+        run_procedure(loop.run(2 * FRAMES, inject=pokes, observe=(background_estimator,)))
+        run_procedure(loop.run(2 * FRAMES, inject=pokes, observe=(background_estimator,)))
+        for _ in range(ROUNDS):
+            for which, options in (
+                (unpoked, {}),
+                (poked, {"inject": pokes, "observe": (background_estimator,)}),
+            ):
+                before = loop.record.frames
+                run_procedure(loop.run(FRAMES, **options))  # type: ignore[arg-type]
+                which += loop.record.latency[before:]
+        background_estimator.finish()
+        skipped = background_estimator.skipped
     return np.array(poked) / 1e3, np.array(unpoked) / 1e3, skipped

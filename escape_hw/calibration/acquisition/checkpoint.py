@@ -1,4 +1,4 @@
-"""Keeping the state of a calibration while it runs, and going on with a kept one."""
+"""Saving the state of a running calibration, and resuming from a saved state."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from escape_hw.config.system import SystemConfig
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.io.fits.run_state import RunState, load_state, save_state
 
-#: Differences that a refusal names.
+#: Differing configuration keys that an error message names.
 _MAX_LISTED = 5
 
 
 class Checkpoint:
-    """Where a run keeps its state, and the state it goes on from.
+    """File in which a run saves its state, and the state from which it is resumed.
 
     Parameters
     ----------
     path
-        File to keep the state in.
+        File for the state.
     resume
-        File with the state to go on from; ``None`` for a run from the beginning.
+        File with the state to resume from; ``None`` for a new run.
     request
-        Plain values kept beside the state for whoever goes on with it: how the run was asked for.
+        Plain values saved with the state: the request that started the run.
     """
 
     def __init__(
@@ -49,9 +49,9 @@ class Checkpoint:
     def begin(
         self, bench: Bench, method: str, m2c: NDArray[np.float64], settings: Mapping[str, Any]
     ) -> RunState | None:
-        """Say what the run is; the state to go on from, if there is one.
+        """Register the run, and return the state to resume from if there is one.
 
-        The random stream of the procedures continues where it was.
+        The random generator of the bench is set to its saved state.
 
         Parameters
         ----------
@@ -60,16 +60,17 @@ class Checkpoint:
         method
             Name of the method.
         m2c
-            The basis ``(n_act, n_modes)``.
+            Mode-to-command matrix ``(n_act, n_modes)``.
         settings
-            What else must be the same, plain values.
+            Further plain values that must be the same when the run is resumed.
 
         Raises
         ------
         IncompatibleProduct
-            The kept state is of another system, method, basis, configuration or setting; says which.
+            The saved state is of another system, method, basis, configuration or setting; the message names
+            the difference.
         ProductError
-            It cannot be read.
+            The saved state cannot be read.
         """
         self._bench, self._period_s = bench, bench.config.calibration.checkpoint_s
         self._next_save = time.monotonic() + self._period_s
@@ -88,19 +89,19 @@ class Checkpoint:
         bench.rng.bit_generator.state = state.values["rng"]
         return state
 
-    def due(self) -> bool:
-        """Whether it is time for another state; cheap enough for every frame."""
+    def is_due(self) -> bool:
+        """Whether it is time to save the state; fast enough for every frame."""
         return time.monotonic() >= self._next_save
 
     def save(
         self, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], grid: SensorGeometry | None
     ) -> None:
-        """Keep a state.
+        """Save a state.
 
         Raises
         ------
         StorageError
-            It cannot be written; the one before it stays.
+            It cannot be written; the previous one stays.
         """
         if self._bench is None:
             raise RuntimeError("a checkpoint was saved before its run began")
@@ -109,35 +110,35 @@ class Checkpoint:
         save_state(self.path, state, self._bench.config.system.name, self._bench.simulated)
         self._next_save = time.monotonic() + self._period_s
 
-    def done(self) -> None:
-        """The run has its result: nobody needs the state any more."""
+    def remove(self) -> None:
+        """Delete the state after the run has finished."""
         self.path.unlink(missing_ok=True)
 
 
 def fingerprint(array: NDArray[Any]) -> str:
-    """A short text that tells whether two arrays are equal."""
-    # Adding zero makes negative zeros positive, which compare equal and look different.
+    """Hash of an array's values."""
+    # Adding zero turns negative zeros, which compare equal, into positive ones.
     return hashlib.sha256(np.ascontiguousarray(array + 0.0).tobytes()).hexdigest()[:16]
 
 
 def _require_same_run(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise :class:`IncompatibleProduct` unless a kept state is of the same run."""
+    """Raise :class:`IncompatibleProduct` unless a saved state is of the same run."""
     names = {"simulated": "mode (simulated or hardware)"}
     for key in ("system", "simulated", "method", "settings"):
         if saved.get(key) != now[key]:
             raise IncompatibleProduct(
                 f"{path}: its {names.get(key, key)} is {saved.get(key)!r}, this run's is {now[key]!r}; "
-                "resume it as it was begun, or begin anew"
+                "resume with the original settings, or start a new run"
             )
     changed = sorted(_changed_keys(path, str(saved.get("configuration", "")), now["configuration"]))
     if changed:
         more = f" and {len(changed) - _MAX_LISTED} more" if len(changed) > _MAX_LISTED else ""
         raise IncompatibleProduct(
             f"{path}: its configuration differs from this run's in {', '.join(changed[:_MAX_LISTED])}{more}; "
-            "resume it with the configuration it was begun with"
+            "resume with the original configuration"
         )
     if saved.get("basis") != now["basis"]:
-        raise IncompatibleProduct(f"{path}: its modal basis is not this system's; begin anew")
+        raise IncompatibleProduct(f"{path}: its modal basis is not this system's; start a new run")
 
 
 def _changed_keys(path: Path, saved: str, now: str) -> set[str]:

@@ -1,4 +1,4 @@
-"""The image of the science camera without turbulence, which Strehl ratios are measured against."""
+"""Reference PSF of the science camera without turbulence, for Strehl ratios."""
 
 from __future__ import annotations
 
@@ -13,34 +13,36 @@ from escape_hw.pipeline.psf.strehl import diffraction_psf, has_light, is_peak_sa
 
 
 def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32]]:
-    """Mean PSF with a flat mirror and no turbulence in the beam (paper: the empirical model).
+    """Mean PSF ``(rows, columns)`` with a flat mirror and no turbulence in the beam (paper: empirical model).
 
-    Under a sky that cannot be switched off (``devices.science.model_psf = "design"``) it is the
-    diffraction image of the design's pupil, and no frame is taken.
+    With ``devices.science.model_psf = "design"``, for systems on the sky, it is the diffraction image of the
+    design's pupil, and no frame is taken.
 
     Raises
     ------
+    ConfigError
+        The number of frames is not at least 1.
     CalibrationError
         The system has no science camera, it sees no light, or the image's peak is saturated.
     """
     validate_frame_count(frames)
-    science = bench.science
+    science, config = bench.science, bench.config.devices.science
     if science is None:
         raise CalibrationError("this system has no science camera to take a PSF with")
-    config = bench.config.devices.science
     if config is not None and config.model_psf == "design":
         _, pupil, pixel_m = bench.model().influence_functions()
         across = bench.config.system.pupil_m / pixel_m
         return diffraction_psf(pupil, across, config.psf_px, (config.region[3], config.region[2]))
     bench.dm.flatten()
     science.stop()
-    wait = bench.config.devices.science.timeout_s if bench.config.devices.science else 1.0
+    timeout_s = config.timeout_s if config else 1.0
     report = Reporter("model PSF", frames)
-    science.next_frame(wait)
+    # The exposure of the first frame may have begun before the mirror was flat.
+    science.next_frame(timeout_s)
     total, clipped = np.zeros((), np.float64), 0
     try:
         for done in range(frames):
-            frame = science.next_frame(wait)
+            frame = science.next_frame(timeout_s)
             clipped += is_peak_saturated(frame)
             total = total + frame.data
             if report.due():

@@ -1,4 +1,4 @@
-"""What a measurement has so far, for those who watch, at a small share of its time."""
+"""Intermediate interaction matrices for display, at a bounded share of the run time."""
 
 from __future__ import annotations
 
@@ -10,36 +10,35 @@ from numpy.typing import NDArray
 
 from escape_hw.api.sensor import SensorGeometry
 
-#: Seconds between two pictures at least ...
+#: Least seconds between two previews, and the share of the run time that they may take.
 PERIOD_S = 1.0
-#: ... and share of the time that making them may take.
 MAX_TIME_FRACTION = 0.04
 
-#: Matrix and its standard errors ``(n_slopes, n)``; ``None``: nothing to show yet.
+#: Matrix and its standard errors ``(n_slopes, n)``; ``None`` if there is no estimate yet.
 MatrixEstimate = tuple[NDArray[np.floating], NDArray[np.floating]] | None
 
 
 class MatrixPreview:
-    """Makes pictures of an estimate now and then.
+    """Limits how often an estimate is previewed, and arranges it for display.
 
     Parameters
     ----------
     n_modes
-        Modes of the whole matrix; those not measured yet are shown as NaN.
+        Modes of the complete matrix; those not measured yet are NaN.
     grid
-        Tells the geometry that the slopes belong to, once it is known.
+        Returns the geometry of the slopes, or ``None`` while it is not known.
     """
 
     def __init__(self, n_modes: int, grid: Callable[[], SensorGeometry | None]) -> None:
         self._n_modes, self._grid = n_modes, grid
         self._next = time.monotonic() + PERIOD_S
 
-    def due(self) -> bool:
-        """Whether the next picture may be made; cheap enough to be asked for every frame."""
+    def is_due(self) -> bool:
+        """Whether the next preview is allowed; fast enough for every frame."""
         return time.monotonic() >= self._next
 
     def __call__(self, estimate: Callable[[], MatrixEstimate]) -> Mapping[str, NDArray[np.float32]]:
-        """The arrays to show, made by ``estimate``; empty when there are none."""
+        """Arrays ``matrix``, ``matrix_sigma`` and ``valid`` of an estimate; empty if it is ``None``."""
         began = time.monotonic()
         result = estimate()
         arrays = {} if result is None else self._arrays(*result)
@@ -55,7 +54,6 @@ class MatrixPreview:
         return {**mask, "matrix": self._pad_modes(matrix), "matrix_sigma": self._pad_modes(sigma)}
 
     def _pad_modes(self, columns: NDArray[np.floating]) -> NDArray[np.float32]:
-        """All modes, also those not measured yet."""
         if columns.shape[1] == self._n_modes:
             return columns.astype(np.float32)
         padded = np.full((columns.shape[0], self._n_modes), np.nan, np.float32)

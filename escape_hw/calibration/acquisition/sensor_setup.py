@@ -1,4 +1,4 @@
-"""Set-up of the wavefront sensor from its own frames: dark frame, geometry, references and slope function, for each kind of sensor."""
+"""Set-up of the wavefront sensor from its frames: dark frame, geometry, references, slope function."""
 
 from __future__ import annotations
 
@@ -13,37 +13,35 @@ from escape_hw.api.camera import Camera
 from escape_hw.api.modulator import Modulation
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.pyramid import PyramidPupils
-from escape_hw.api.registration import Registration
 from escape_hw.api.representation import short_repr
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction, SubApertureGrid, require_kind
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.frames import validate_frame_count
-from escape_hw.calibration.acquisition.pokes import equal_snr_amplitudes
-from escape_hw.calibration.modes.bases import build_basis
-from escape_hw.calibration.modes.derivatives import modal_matrix
+from escape_hw.calibration.acquisition.frames import next_frame, validate_frame_count
 from escape_hw.config.sensor import PyramidSection, ShackHartmannSection
-from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
+from escape_hw.errors import CalibrationError, IncompatibleProduct
 from escape_hw.pipeline.geometry.lenslet_grid import find_lenslet_grid
 from escape_hw.pipeline.geometry.obscuration import build_shadow
 from escape_hw.pipeline.geometry.pupil_images import find_pupil_images, refine_pupil_images
 from escape_hw.pipeline.slopes.pyramid import PyramidSlopes
 from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
 
-#: A geometry's modulation and the one in force may differ by this share.
+#: Frames whose mean the geometry is found on.
+SETUP_FRAMES = 200
+#: Relative difference allowed between the modulation of a geometry and the one in force.
 _MODULATION_TOLERANCE = 0.01
 
 
 class SensorKind(Protocol):
-    """A kind of sensor.
+    """What differs between kinds of wavefront sensors.
 
     Attributes
     ----------
-    sought
-        What is looked for on its frames, for progress reports.
+    search_target
+        What is found on the sensor's frames, for progress reports.
     source_references
-        ``"mean"`` or ``"design"``: the references to take on a calibration source.
-    long_look
-        True when the mean frame of a whole run tells more of the geometry than its first frames do.
+        References on a calibration source, ``"mean"`` or ``"design"``.
+    uses_run_mean
+        Whether the mean frame of a whole run improves the geometry found on its first frames.
     """
 
     search_target: str
@@ -51,27 +49,23 @@ class SensorKind(Protocol):
     uses_run_mean: bool
 
     def prepare(self, bench: Bench) -> None:
-        """Make the sensor ready for frames that mean something."""
-        ...
-
-    def background(self, mean_frame: NDArray[np.float32]) -> float:
-        """Level of the pixels that no light reaches, in counts."""
+        """Set the sensor up for a measurement."""
         ...
 
     def find(self, bench: Bench, mean_frame: NDArray[np.float32], references: str) -> SensorGeometry:
-        """The geometry on a calibrated mean frame; ``references`` is ``"design"`` or ``"mean"``."""
+        """Find the geometry on a calibrated mean frame; ``references`` is ``"design"`` or ``"mean"``."""
         ...
 
     def refine_geometry(
         self, bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]
     ) -> SensorGeometry:
-        """The geometry, better known by calibrated mean frames of a run's parts; its slopes stay the same."""
+        """Improve the geometry by calibrated mean frames of a run's parts; its slopes stay the same."""
         ...
 
     def build_slope_function(
         self, bench: Bench, grid: SensorGeometry, shape: tuple[int, int], dark: NDArray[np.float32]
     ) -> SlopeFunction:
-        """What turns this camera's frames into slopes."""
+        """Build the slope function of this camera region ``shape`` (rows, columns)."""
         ...
 
 
@@ -79,7 +73,7 @@ class _ShackHartmann:
     """Lenslets: spots on a lattice."""
 
     search_target = "lenslet grid"
-    # Lenslets stand regularly; what their spots lack of it is the aberration that a loop should take out.
+    # The lenslets are regular; deviations of their spots are aberrations, which a loop should correct.
     source_references = "design"
     uses_run_mean = False
 
@@ -88,10 +82,6 @@ class _ShackHartmann:
 
     def prepare(self, bench: Bench) -> None:
         """Nothing moves in a Shack-Hartmann sensor."""
-
-    def background(self, mean_frame: NDArray[np.float32]) -> float:
-        """Median of the darkest fifth: between the spots and outside the pupil a frame is dark."""
-        return _estimate_dark_level(mean_frame)
 
     def find(self, bench: Bench, mean_frame: NDArray[np.float32], references: str) -> SubApertureGrid:
         return find_lenslet_grid(
@@ -106,7 +96,7 @@ class _ShackHartmann:
     def refine_geometry(
         self, bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]
     ) -> SensorGeometry:
-        """As it is: the mean slopes of the run already tell all that its mean frame does."""
+        """Return the geometry as it is: the mean slopes contain all that the mean frames do."""
         return grid
 
     def build_slope_function(
@@ -115,7 +105,7 @@ class _ShackHartmann:
         lenslets = require_kind(grid, SubApertureGrid)
         centres, half = lenslets.centres_px(), lenslets.pitch_px / 2
         if (centres < half - 1).any() or (centres > np.array(shape[::-1]) - half).any():
-            raise IncompatibleProduct(_region_message("lenslet grid reaches", shape))
+            raise IncompatibleProduct(_region_message("lenslet grid extends", shape))
         return ShackHartmannSlopes(
             lenslets, shape, dark=dark, flat=bench.flat, threshold=self._threshold(bench)
         )
@@ -126,10 +116,10 @@ class _ShackHartmann:
 
 
 class _Pyramid:
-    """A pyramid: four pupil images, and a modulator that has to turn."""
+    """A pyramid: four pupil images, and a modulator."""
 
     search_target = "pupil images"
-    # A pyramid has no lattice to go by; on a source, what the sensor shows is the flat wavefront.
+    # A pyramid has no lattice; on a source its slopes are those of the flat wavefront.
     source_references = "mean"
     uses_run_mean = True
 
@@ -137,7 +127,7 @@ class _Pyramid:
         self._section = section
 
     def prepare(self, bench: Bench) -> None:
-        """Modulate as configured, unless that is what the modulator does already."""
+        """Modulate as configured, unless the modulator does so already."""
         modulator, modulator_section = bench.modulator, bench.config.devices.modulator
         if modulator is None or modulator_section is None:
             return
@@ -149,10 +139,6 @@ class _Pyramid:
         if modulator.modulation != requested:
             modulator.modulate(requested)
 
-    def background(self, mean_frame: NDArray[np.float32]) -> float:
-        """Median of the darkest fifth: the corners between and beside the images."""
-        return _estimate_dark_level(mean_frame)
-
     def find(self, bench: Bench, mean_frame: NDArray[np.float32], references: str) -> PyramidPupils:
         return find_pupil_images(
             mean_frame,
@@ -160,14 +146,14 @@ class _Pyramid:
             nominal_px=np.array(self._section.pupils_px),
             min_flux=self._section.min_flux,
             normalisation=self._section.normalisation,
-            modulation=current_modulation(bench),
+            modulation=_current_modulation(bench),
             references=references,
         )
 
     def refine_geometry(
         self, bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]
     ) -> PyramidPupils:
-        """Rims and shadow on the mean of the whole run: turbulence averages out."""
+        """Fit rims and shadow on the mean of the whole run, in which turbulence averages out."""
         shadow = build_shadow(bench.config.telescope, bench.config.system.pupil_m)
         return refine_pupil_images(means, require_kind(grid, PyramidPupils), shadow)
 
@@ -177,8 +163,8 @@ class _Pyramid:
         pupils = require_kind(grid, PyramidPupils)
         corners, n = pupils.corners_px, pupils.valid.shape[0]
         if (corners < 0).any() or (corners + n > np.array(shape[::-1])).any():
-            raise IncompatibleProduct(_region_message("pupil images reach", shape))
-        now = current_modulation(bench)
+            raise IncompatibleProduct(_region_message("pupil images extend", shape))
+        now = _current_modulation(bench)
         if abs(now - pupils.modulation) > _MODULATION_TOLERANCE * max(now, pupils.modulation):
             raise IncompatibleProduct(
                 f"the pupil images were measured with a modulation of {pupils.modulation:.4g} lambda/D, "
@@ -187,7 +173,7 @@ class _Pyramid:
         return PyramidSlopes(pupils, shape, dark=dark, flat=bench.flat)
 
 
-def current_modulation(bench: Bench) -> float:
+def _current_modulation(bench: Bench) -> float:
     """Radius of the modulation as the modulator reports it, in lambda/D; 0 when it is parked."""
     section = bench.config.devices.modulator
     now = None if bench.modulator is None else bench.modulator.modulation
@@ -201,7 +187,10 @@ def get_sensor_kind(bench: Bench) -> SensorKind:
 
 
 def _estimate_dark_level(mean_frame: NDArray[np.float32]) -> float:
-    """Median of the darkest fifth of the pixels, which leaves out the wings of what is bright."""
+    """Level of the pixels without light, in counts: median of the darkest fifth.
+
+    These are the pixels between the spots and outside the pupil, without the wings of bright spots.
+    """
     darkest = np.sort(mean_frame.ravel())[: max(1, mean_frame.size // 5)]
     return float(np.median(darkest))
 
@@ -213,13 +202,9 @@ def _region_message(what: str, shape: tuple[int, int]) -> str:
     )
 
 
-#: Frames whose mean the grid is found on.
-SETUP_FRAMES = 200
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorSetup:
-    """What the sensor's frames say about it: its geometry, and the mean frame that was found on."""
+    """Geometry of the sensor, and the mean frame in counts ``(rows, columns)`` that it was found on."""
 
     grid: SensorGeometry
     mean_frame: NDArray[np.float32]
@@ -227,12 +212,12 @@ class SensorSetup:
 
 
 def prepare_sensor(bench: Bench) -> None:
-    """Make the sensor ready for a measurement: a pyramid's modulator turns as configured.
+    """Set the sensor up for a measurement: start or park a pyramid's modulator as configured.
 
     Raises
     ------
     SettingRejected, DeviceError
-        The modulator cannot do that, or did not start.
+        The modulator cannot do what the configuration asks for, or did not start.
     """
     get_sensor_kind(bench).prepare(bench)
 
@@ -245,40 +230,46 @@ def build_sensor_setup(
     Parameters
     ----------
     bench
-        Gives the design of the sensor and, when it was measured, the dark frame.
+        Bench with the design of the sensor and, if it was measured, the dark frame. Without one the
+        background is estimated from the darkest pixels.
     mean_frame
         Mean of raw frames in counts ``(rows, columns)``.
     references
-        See :func:`find_sensor`.
+        As for :func:`find_sensor`.
+
+    Raises
+    ------
+    CalibrationError
+        No spots or pupil images where the design says there should be.
     """
-    kind = get_sensor_kind(bench)
-    background = kind.background(mean_frame) if bench.dark is None else 0.0
-    grid = kind.find(bench, _calibrate_frame(bench, mean_frame, background), references)
+    background = _estimate_dark_level(mean_frame) if bench.dark is None else 0.0
+    calibrated = _calibrate_frame(bench, mean_frame, background)
+    grid = get_sensor_kind(bench).find(bench, calibrated, references)
     return SensorSetup(grid.with_background(background), mean_frame)
 
 
 def refine_geometry(
     bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]
 ) -> SensorGeometry:
-    """A geometry, better known by the mean raw frames of a run's parts."""
+    """Improve a geometry by the mean raw frames of a run's parts."""
     return get_sensor_kind(bench).refine_geometry(
         bench, grid, [_calibrate_frame(bench, mean, grid.background) for mean in means]
     )
 
 
 def _calibrate_frame(bench: Bench, frame: NDArray[np.float32], background: float) -> NDArray[np.float32]:
-    """A raw frame without dark and flat."""
+    """Subtract the dark frame, or the background without one, and divide by the flat."""
     clean = frame - (background if bench.dark is None else bench.dark)
     return np.asarray(clean if bench.flat is None else clean / bench.flat, np.float32)
 
 
 def build_slope_function(bench: Bench, grid: SensorGeometry) -> SlopeFunction:
-    """Slopes of this bench's camera on a geometry.
+    """Build the slope function of this bench's camera for a geometry.
 
     Raises
     ------
     IncompatibleProduct
-        The geometry leaves the camera's region, or is that of another kind of sensor.
+        The geometry extends beyond the camera's region, or is that of another kind of sensor or modulation.
     CalibrationError
         The dark frame is of another region.
     """
@@ -290,17 +281,16 @@ def build_slope_function(bench: Bench, grid: SensorGeometry) -> SlopeFunction:
         )
     dark = bench.dark if bench.dark is not None else np.full(shape, grid.background, np.float32)
     slopes_of = get_sensor_kind(bench).build_slope_function(bench, grid, shape, dark)
-    if bench.callbacks.geometry is not None:
-        bench.callbacks.geometry(grid)
-    return (
-        slopes_of
-        if bench.callbacks.slopes is None
-        else _ObservedSlopeFunction(slopes_of, bench.wfs, bench.callbacks.slopes)
-    )
+    callbacks = bench.callbacks
+    if callbacks.geometry is not None:
+        callbacks.geometry(grid)
+    if callbacks.slopes is None:
+        return slopes_of
+    return _ObservedSlopeFunction(slopes_of, bench.wfs, callbacks.slopes)
 
 
 class _ObservedSlopeFunction:
-    """Slopes that somebody looks at as they pass."""
+    """Slope function with a callback."""
 
     def __init__(
         self, slopes_of: SlopeFunction, camera: Camera, callback: Callable[[int, NDArray[np.float32]], object]
@@ -326,45 +316,51 @@ class _ObservedSlopeFunction:
 def find_sensor(
     bench: Bench, *, frames: int = SETUP_FRAMES, references: str = "design"
 ) -> Procedure[SensorSetup]:
-    """Watch the sensor for a while and find its geometry.
+    """Average frames of the sensor and find its geometry on the mean.
 
     Parameters
     ----------
     bench
         An open bench.
     frames
-        Frames to average.
+        Number of frames to average.
     references
-        ``"design"``: what a flat wavefront shows on a sensor as designed (the choice under
-        turbulence); ``"mean"``: what the frames show (for a source whose wavefront is flat).
+        ``"design"``: slopes of a flat wavefront on a sensor as designed (under turbulence); ``"mean"``: the
+        slopes of the frames (on a source with a flat wavefront).
 
     Raises
     ------
+    ConfigError
+        The number of frames is not at least 1.
     CalibrationError
         No spots or pupil images where the design says there should be.
     """
     validate_frame_count(frames)
     prepare_sensor(bench)
-    total = np.zeros((), np.float64)
-    report = Reporter(f"find the {get_sensor_kind(bench).search_target}", frames)
+    mean = yield from _average_frames(bench, frames, f"find the {get_sensor_kind(bench).search_target}")
+    return build_sensor_setup(bench, mean, references)
+
+
+def _average_frames(bench: Bench, frames: int, stage: str) -> Procedure[NDArray[np.float32]]:
+    total, report = np.zeros((), np.float64), Reporter(stage, frames)
     for done in range(frames):
-        total = total + bench.wfs.next_frame(bench.config.devices.wfs.timeout_s).data
+        total = total + next_frame(bench).data
         if report.due():
             yield report(done + 1)
-    return build_sensor_setup(bench, (total / frames).astype(np.float32), references)
+    return (total / frames).astype(np.float32)
 
 
 def ensure_sensor_ready(
     bench: Bench, grid: SensorGeometry | None, references: str = "design"
 ) -> Procedure[tuple[SensorGeometry, NDArray[np.float32] | None]]:
-    """Flatten the mirror, make the sensor ready, and find its geometry unless it is known.
+    """Flatten the mirror, prepare the sensor, and find its geometry unless it is given.
 
     Parameters
     ----------
     bench
         An open bench.
     grid
-        The geometry, when it is known.
+        The geometry, if it is known.
     references
         As for :func:`find_sensor`.
 
@@ -372,7 +368,7 @@ def ensure_sensor_ready(
     -------
     grid : SensorGeometry
     mean_frame : ndarray or None
-        The mean frame it was found on; ``None`` if it was known.
+        Mean frame that the geometry was found on; ``None`` if it was given.
 
     Raises
     ------
@@ -388,82 +384,32 @@ def ensure_sensor_ready(
 
 
 def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.float32]]:
-    """Mean dark frame, with the beam stop in; kept as ``bench.dark``.
+    """Measure the mean dark frame with the beam stop in, and set it as ``bench.dark``.
+
+    Returns
+    -------
+    ndarray of float32, ``(rows, columns)``
+        In counts.
 
     Raises
     ------
+    ConfigError
+        The number of frames is not at least 1.
     CalibrationError
-        The system has no beam stop that can be moved by command.
+        The system has no beam stop under remote control.
     """
     if bench.screen is None:
         raise CalibrationError(
-            "this system has no beam stop under control; block the beam by hand and set bench.dark"
+            "this system has no beam stop under remote control; block the beam by hand and set bench.dark"
         )
     validate_frame_count(frames)
-    total = np.zeros((), np.float64)
-    report = Reporter("dark frame", frames)
     before = bench.screen.state.blocked
     bench.screen.set(blocked=True)
     try:
         for _ in range(3):
-            # Frames that began before the stop was in.
-            bench.wfs.next_frame(bench.config.devices.wfs.timeout_s)
-        for done in range(frames):
-            total = total + bench.wfs.next_frame(bench.config.devices.wfs.timeout_s).data
-            if report.due():
-                yield report(done + 1)
+            # Frames whose exposure began before the beam was blocked.
+            next_frame(bench)
+        bench.dark = yield from _average_frames(bench, frames, "dark frame")
     finally:
         bench.screen.set(blocked=before)
-    bench.dark = (total / frames).astype(np.float32)
     return bench.dark
-
-
-def build_modal_basis(bench: Bench) -> NDArray[np.float64]:
-    """Mode-to-command matrix ``(n_act, n_modes)`` that the configuration asks for.
-
-    Raises
-    ------
-    ConfigError
-        The basis does not fit the mirror, or moves disabled actuators.
-    CalibrationError
-        More modes than the actuators that work can make.
-    """
-    surfaces, pupil, pixel = bench.model().influence_functions()
-    if surfaces.shape[0] != bench.dm.info.n_act:
-        raise ConfigError(f"the model has {surfaces.shape[0]} actuators, the mirror {bench.dm.info.n_act}")
-    return build_basis(bench.config, surfaces, pupil, pixel, bench.dm.limits.disabled)
-
-
-def compute_poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDArray[np.float64]:
-    """Amplitude of each mode's poke ``(n_modes,)``, rms surface as fraction of full stroke.
-
-    Modes that the mirror makes with large commands (those that live at the pupil's rim) are poked
-    less, so that no single mode takes more than ``calibration.poke_command`` of any actuator.
-
-    Raises
-    ------
-    ConfigError
-        The poke is not in (0, 1].
-    """
-    if not 0 < poke <= 1:
-        raise ConfigError(f"poke is {poke}; it must lie in (0, 1], rms surface as fraction of full stroke")
-    return np.asarray(np.minimum(poke, _max_amplitudes(bench, m2c)))
-
-
-def compute_random_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDArray[np.float64]:
-    """As :func:`compute_poke_amplitudes`, for random pokes on all modes at once.
-
-    With ``calibration.pokes = "equal-snr"`` the modes share the same Strehl budget by what is seen of
-    them (:func:`~.pokes.equal_snr_amplitudes`).
-    """
-    amplitudes = compute_poke_amplitudes(bench, m2c, poke)
-    if bench.config.calibration.pokes != "equal-snr":
-        return amplitudes
-    return equal_snr_amplitudes(
-        modal_matrix(bench.model(), Registration(), m2c), _max_amplitudes(bench, m2c), poke
-    )
-
-
-def _max_amplitudes(bench: Bench, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Amplitude of each mode at which an actuator takes ``calibration.poke_command``."""
-    return np.asarray(bench.config.calibration.poke_command / np.abs(m2c).max(axis=0))

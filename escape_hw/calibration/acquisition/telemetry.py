@@ -16,16 +16,16 @@ class AlignedTelemetry:
     Parameters
     ----------
     rows
-        ``(n_times, n_slopes + n_modes)``: the slopes, and the command that was sent after the frame of
-        that row. Slopes of lost frames are zero; while a frame is lost, the previous command stays on
-        the mirror. Side by side, one pass filters both. In closed loop, where a command holds more
-        than a poke, the poke in it follows: ``(n_times, n_slopes + 2 n_modes)``.
+        ``(n_times, n_slopes + n_modes)``: the slopes, and the command that was sent after the frame of that
+        row. Slopes of lost frames are zero; while a frame is lost, the previous command stays on the mirror.
+        Side by side, one pass filters both. In closed loop, where a command is the sum of the controller's
+        command and a poke, the poke follows: ``(n_times, n_slopes + 2 n_modes)``.
     present
         ``(n_times,)``, false where the frame was lost.
     n_slopes
-        How many columns are slopes.
+        Number of columns with slopes.
     closed
-        Whether the pokes stand beside the commands.
+        Whether the rows are of a closed loop.
     """
 
     rows: NDArray[np.float32]
@@ -45,7 +45,7 @@ class AlignedTelemetry:
 
     @property
     def commands(self) -> NDArray[np.float32]:
-        """``(n_times, n_modes)``; in closed loop the controller's part and the poke together."""
+        """``(n_times, n_modes)``; in closed loop the sum of controller and poke."""
         return self.rows[:, self.n_slopes : self.n_slopes + self.n_modes]
 
     @property
@@ -54,7 +54,7 @@ class AlignedTelemetry:
         return self.rows[:, self.rows.shape[1] - self.n_modes :]
 
     def find_complete_rows(self, past: int, lags: int) -> NDArray[np.intp]:
-        """Rows whose last ``past`` slopes are all there and whose poke history is known."""
+        """Rows with ``past`` present slopes before them, and with known commands of ``past + lags`` rows."""
         n = self.present.size
         first = past + lags - 1
         if n <= first or self.present.all():
@@ -65,7 +65,7 @@ class AlignedTelemetry:
         return np.flatnonzero(is_complete) + first
 
     def select_slopes(self, n_slopes: int) -> AlignedTelemetry:
-        """At most ``n_slopes`` of the slopes, evenly spread."""
+        """Telemetry of at most ``n_slopes`` evenly spaced slopes."""
         step = max(1, -(-self.n_slopes // n_slopes))
         selected = self.slopes[:, ::step]
         rows = np.concatenate([selected, self.rows[:, self.n_slopes :]], axis=1)
@@ -73,16 +73,16 @@ class AlignedTelemetry:
 
 
 class AlignedBuffer:
-    """Gathers the frames of a run on its time line, in a buffer that is used again and again.
+    """Preallocated rows of :class:`AlignedTelemetry` that are filled, processed and reused.
 
     Parameters
     ----------
     n_slopes, n_modes
-        Sizes.
+        Number of slopes and of modes.
     rows
         Rows of the buffer.
     closed
-        Whether frames come with the poke beside the command.
+        Whether frames are of a closed loop, with the poke beside the command.
     """
 
     def __init__(self, n_slopes: int, n_modes: int, rows: int, *, closed: bool = False) -> None:
@@ -90,26 +90,27 @@ class AlignedBuffer:
         self._rows = np.zeros((rows, n_slopes + (2 if closed else 1) * n_modes), np.float32)
         self._present = np.ones(rows, np.bool_)
         self._row_views: list[tuple[NDArray[np.float32], ...]] = []
-        #: Rows in use, and those of them that were there at the last :meth:`retain_last`.
-        self.n_filled = self.kept = 0
+        #: Rows in use, and those of them retained by the last :meth:`retain_last`.
+        self.n_filled = self.n_retained = 0
 
     @property
-    def full(self) -> bool:
+    def is_full(self) -> bool:
         """Whether there is no room for another frame."""
         return self.n_filled == len(self._present)
 
     @property
     def n_new(self) -> int:
         """Frames that arrived since the last :meth:`retain_last`."""
-        return int(np.count_nonzero(self._present[self.kept : self.n_filled]))
+        return int(np.count_nonzero(self._present[self.n_retained : self.n_filled]))
 
     def append(self, slopes: NDArray[np.floating], excitation: NDArray[np.floating]) -> int:
-        """Put in consecutive frames ``(n, n_slopes)``, ``(n, n_modes)``; twice the modes in closed loop.
+        """Append as many of some consecutive frames as there is room for, and return their number.
 
-        Returns
-        -------
-        int
-            How many there was room for.
+        Parameters
+        ----------
+        slopes, excitation
+            ``(n, n_slopes)``, and commands ``(n, n_modes)``, in closed loop with the pokes beside them
+            ``(n, 2 n_modes)``.
         """
         k, n = self.n_filled, min(len(slopes), len(self._present) - self.n_filled)
         self._rows[k : k + n, : self.n_slopes] = slopes[:n]
@@ -118,12 +119,12 @@ class AlignedBuffer:
         return n
 
     def append_one(self, slopes: NDArray[np.floating], excitation: NDArray[np.floating]) -> int:
-        """Put in one frame, as for :meth:`append`, for which there must be room.
+        """Append one frame; the buffer must not be full.
 
         Returns
         -------
         int
-            How many more there is room for; -1 if the frame is not finite, and so was not taken.
+            Remaining room in frames; -1 if the frame is not finite, in which case it is not appended.
         """
         if not self._row_views:
             rows = self._rows
@@ -132,30 +133,23 @@ class AlignedBuffer:
         row, row_slopes, row_excitation = self._row_views[k]
         row_slopes[...] = slopes
         row_excitation[...] = excitation
-        # A sum of squares is finite when all numbers are, and takes a tenth of the time to ask.
+        # A sum of squares is finite if all numbers are, and ten times faster than isfinite of all.
         if not isfinite(row.dot(row)):
             return -1
         self.n_filled = k = k + 1
         return len(self._row_views) - k
 
     def mark_unusable(self, n_taken: int, frames: int) -> int:
-        """Count the slopes of the first of the ``n_taken`` frames put in last as lost, up to ``frames`` of them.
-
-        Returns
-        -------
-        int
-            How many were.
-        """
+        """Mark up to ``frames`` of the last ``n_taken`` frames as lost, the first ones; returns how many."""
         n, first = min(n_taken, frames), self.n_filled - n_taken
         self._rows[first : first + n, : self.n_slopes] = 0
         self._present[first : first + n] = False
         return n
 
     def append_lost(self, *, flat: bool = False) -> None:
-        """Put in a lost frame, for which there must be room.
+        """Append a lost frame; the buffer must not be full.
 
-        The last command stays on the mirror, for which something must stand before, unless the mirror
-        is ``flat``.
+        The last command stays on the mirror, so a row must precede it, unless the mirror is ``flat``.
         """
         k = self.n_filled
         self._rows[k] = 0
@@ -165,23 +159,23 @@ class AlignedBuffer:
         self.n_filled = k + 1
 
     def telemetry(self) -> AlignedTelemetry:
-        """All rows in use; a view, good until more is put in."""
+        """All rows in use, as a view that is valid until the next row is appended."""
         return AlignedTelemetry(
             self._rows[: self.n_filled], self._present[: self.n_filled], self.n_slopes, self.closed
         )
 
     def retain_last(self, rows: int) -> None:
-        """Forget all but the last ``rows`` rows, the past of what follows."""
+        """Discard all but the last ``rows`` rows, the past of the next ones."""
         start = max(0, self.n_filled - rows)
         n = self.n_filled - start
         if start:
             self._rows[:n] = self._rows[start : self.n_filled]
             self._present[:n] = self._present[start : self.n_filled]
             self._present[n:] = True
-        self.n_filled = self.kept = n
+        self.n_filled = self.n_retained = n
 
     def resize(self, rows: int) -> None:
-        """Give the buffer another number of rows, at least those in use."""
+        """Change the number of rows, at least to those in use."""
         old, used, self._row_views = self.telemetry(), self.n_filled, []
         self._rows = np.zeros((rows, old.rows.shape[1]), np.float32)
         self._present = np.ones(rows, np.bool_)
@@ -189,16 +183,21 @@ class AlignedBuffer:
 
 
 class TelemetryBuffer:
-    """Observer of a running loop.
+    """Collects the telemetry of a running loop in blocks; an observer of the loop.
 
     Parameters
     ----------
     n_slopes, n_modes
-        Sizes.
+        Number of slopes and of modes.
     rows
         Frames of a block.
-    past
-        Rows that each block repeats of the one before it: the past of its first frames.
+    history_rows
+        Rows that each block repeats of the previous one: the past of its first frames.
+
+    Attributes
+    ----------
+    frames, lost
+        Number of frames collected, and of frames missing between them.
     """
 
     def __init__(self, n_slopes: int, n_modes: int, rows: int, history_rows: int) -> None:
@@ -210,12 +209,12 @@ class TelemetryBuffer:
     def __call__(
         self, index: int, slopes: NDArray[np.float32], command: NDArray[np.float64], poke: NDArray[np.float64]
     ) -> None:
-        """Take a frame; see :data:`~escape_hw.calibration.loop.runner.LoopObserver`.
+        """Add a frame; see :data:`~escape_hw.calibration.loop.runner.LoopObserver`.
 
         Raises
         ------
         ValueError
-            The slopes are not finite.
+            The slopes or commands are not finite.
         """
         gap = 0 if self._next_index is None else index - self._next_index
         self._next_index = index + 1
@@ -230,18 +229,13 @@ class TelemetryBuffer:
         self.frames += 1
 
     def _ensure_room(self) -> None:
-        if self._buffer.full:
-            # Whoever works the blocks off is late.
+        if self._buffer.is_full:
+            # The blocks are being processed more slowly than frames arrive.
             self._buffer.resize(2 * self._buffer.n_filled)
 
     def take_block(self) -> tuple[AlignedTelemetry, int]:
-        """A copy of the rows gathered, and the first of them that was not handed over before."""
-        data, start = self._buffer.telemetry(), self._buffer.kept
+        """A copy of the rows collected, and how many rows at its start an earlier block contained."""
+        data, start = self._buffer.telemetry(), self._buffer.n_retained
         block = AlignedTelemetry(data.rows.copy(), data.present.copy(), data.n_slopes, data.closed)
         self._buffer.retain_last(self._history_rows)
         return block, start
-
-    def rewind(self) -> None:
-        """Forget what was gathered."""
-        self._buffer.retain_last(0)
-        self._next_index = None

@@ -1,4 +1,4 @@
-"""Pokes, one per frame, and the slopes that they make."""
+"""Open-loop acquisition of pokes and slopes for DO-CRIME, with sensor set-up on the first frames."""
 
 from __future__ import annotations
 
@@ -13,13 +13,7 @@ from escape_hw.api.camera import Frame
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction, SubApertureGrid
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.frames import (
-    FluxMonitor,
-    SlopeStatistics,
-    limit_to_reachable,
-    next_frame,
-)
-from escape_hw.calibration.acquisition.mean_focus import StaticFocusEstimator
+from escape_hw.calibration.acquisition.frames import FluxMonitor, limit_to_reachable, next_frame
 from escape_hw.calibration.acquisition.preview import MatrixPreview
 from escape_hw.calibration.acquisition.sensor_setup import (
     build_sensor_setup,
@@ -28,24 +22,25 @@ from escape_hw.calibration.acquisition.sensor_setup import (
     prepare_sensor,
     refine_geometry,
 )
-from escape_hw.calibration.acquisition.stopping import RunMonitor
+from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics, StaticFocusEstimator
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
+from escape_hw.calibration.docrime.monitor import RunMonitor
 from escape_hw.calibration.loop.runner import PokeSource
 from escape_hw.errors import Aborted
 from escape_hw.io.fits.run_state import RunState
 
-#: Seconds of turbulence over which what it leaves in the geometry averages out well enough.
+#: Seconds of turbulence over which the mean slopes become accurate references.
 _MIN_REFERENCE_S = 10.0
-
 #: Parts of a run whose mean frames are compared.
 _N_PARTS = 6
 
+#: Frame indices ``(n,)``, slopes ``(n, n_slopes)`` and pokes ``(n, n_modes)``.
 AcquisitionRecord = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(slots=True, eq=False)
 class OpenLoopAcquisition:
-    """State of a run: frames wait until the geometry is known, then become slopes at once.
+    """State of an open-loop run; frames are buffered until the geometry is known.
 
     Parameters
     ----------
@@ -54,15 +49,15 @@ class OpenLoopAcquisition:
     m2c
         Mode-to-command matrix ``(n_act, n_modes)``.
     grid
-        The sensor's geometry, when it is known already; found on the first frames otherwise.
+        Geometry of the sensor, if it is known; otherwise it is found on the first frames.
     setup_frames
-        How many first frames to find it on.
-    estimator
-        Makes the estimator that takes the slopes, from their number; ``None``: there is none.
-    keep
-        Whether to keep slopes and pokes.
-    looks
-        What is done with the estimate on the way.
+        Number of frames to find it on.
+    estimator_factory
+        Builds the estimator from the number of slopes; ``None``: no estimator.
+    store_samples
+        Whether to keep slopes and pokes, for :meth:`record`.
+    monitor
+        Checkpoint and stopping criterion of the estimate.
     """
 
     bench: Bench
@@ -88,21 +83,21 @@ class OpenLoopAcquisition:
     recorded: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] = field(default_factory=list)
 
     def poke(self, frames: int, pokes: PokeSource, stage: str = "DO-CRIME") -> Procedure[bool]:
-        """Send pokes, one per frame, and take the frames; the mirror ends flat.
+        """Send one poke per frame and process the frames; the mirror is flat in the end.
 
         Parameters
         ----------
         frames
-            How many, with those of the run that this one goes on with.
+            Number of frames, including those of a resumed run.
         pokes
-            Gives the modal poke of each frame ``(n_modes,)``.
+            Source of the modal poke of each frame ``(n_modes,)``.
         stage
             Name of the stage in progress reports.
 
         Returns
         -------
         bool
-            Whether the operator stopped it early; that the estimate will do is no reason to complain.
+            Whether the run was aborted; false if it ended by its stopping criterion.
         """
         bench, to_modes = self.bench, np.linalg.pinv(self.m2c)
         self.n_planned = frames
@@ -116,13 +111,10 @@ class OpenLoopAcquisition:
                     requested = self.m2c @ pokes()
                     achievable = limit_to_reachable(bench.dm, requested)
                     self.shortened += not np.array_equal(requested, achievable)
-                    # What was really sent, not what was asked for: a shortened poke is still a known poke.
+                    # The poke as sent: a shortened poke is a known poke, too.
                     self._handle_frame(frame, to_modes @ bench.dm.send(achievable).sent)
-                    if (
-                        self.monitor is not None
-                        and self.monitor.due(self.n_processed)
-                        and (yield from self._check_progress())
-                    ):
+                    is_due = self.monitor is not None and self.monitor.is_due(self.n_processed)
+                    if is_due and (yield from self._check_progress()):
                         return False
                     if report.due():
                         yield report(done + 1, self._preview_arrays(preview), shortened=float(self.shortened))
@@ -134,13 +126,12 @@ class OpenLoopAcquisition:
         return False
 
     def _preview_arrays(self, preview: MatrixPreview) -> Mapping[str, NDArray[np.float32]] | None:
-        """The matrix so far, when it is time to show it."""
-        if self.estimator is None or not preview.due():
+        if self.estimator is None or not preview.is_due():
             return None
         return preview(self.estimator.preview)
 
     def _check_progress(self, final: bool = False) -> Procedure[bool]:
-        """Keep the state and judge the estimate, as far as either is due."""
+        """Save the state and evaluate the criterion, if due; whether the criterion is met."""
         if (
             self.monitor is None
             or self.estimator is None
@@ -148,7 +139,6 @@ class OpenLoopAcquisition:
             or self.slope_statistics is None
         ):
             return False
-        # A model of the sensor has to match how far its spots moved.
         grid = self.slope_statistics.annotate_geometry(self.grid)
         parts = {str(part): count for part, (_, count) in self.partial_means.items()}
         values = {
@@ -168,9 +158,9 @@ class OpenLoopAcquisition:
         )
 
     def restore(self, state: RunState) -> None:
-        """Go on from what a run that was broken off has kept."""
+        """Continue from a saved state."""
         if state.grid is None:
-            raise RuntimeError("a state without a geometry was kept")
+            raise RuntimeError("a state without a geometry was saved")
         self.grid = state.grid
         self.mean_frame = state.arrays.get("mean_frame")
         self._set_up_sensor()
@@ -197,7 +187,7 @@ class OpenLoopAcquisition:
             self._process_frame(frame, poke)
 
     def process_pending(self) -> None:
-        """Set up the sensor, on the frames that wait if no grid was given, and work them off."""
+        """Set up the sensor, on the buffered frames if no geometry was given, and process these frames."""
         if self.slopes_of is not None or not self.pending_frames:
             return
         if self.grid is None:
@@ -213,24 +203,20 @@ class OpenLoopAcquisition:
         self.pending_frames = []
 
     def _set_up_sensor(self) -> None:
-        """Everything that needs the geometry."""
+        """Create everything that depends on the geometry."""
         if self.grid is None:
             raise RuntimeError("the geometry is not known")
-        self.slopes_of, self.uses_run_mean = (
-            build_slope_function(self.bench, self.grid),
-            get_sensor_kind(self.bench).uses_run_mean,
-        )
-        self.slope_statistics, self.flux_monitor = (
-            SlopeStatistics(self.grid.n_slopes),
-            FluxMonitor(self.bench.wfs.name, self.grid),
-        )
+        self.slopes_of = build_slope_function(self.bench, self.grid)
+        self.uses_run_mean = get_sensor_kind(self.bench).uses_run_mean
+        self.slope_statistics = SlopeStatistics(self.grid.n_slopes)
+        self.flux_monitor = FluxMonitor(self.bench.wfs.name, self.grid)
         if self.mean_frame is not None and isinstance(self.grid, SubApertureGrid):
             self.focus_estimator = StaticFocusEstimator(self.grid, self.bench.wfs.settings.frame_rate_hz)
         if self.estimator_factory is not None:
             self.estimator = self.estimator_factory(self.grid.n_slopes)
 
     def build_final_geometry(self) -> SensorGeometry:
-        """The grid with all that the run taught about it; given references stay as they were."""
+        """The geometry improved by all frames of the run; references of a given geometry stay."""
         if self.grid is None or self.slope_statistics is None:
             raise RuntimeError("the sensor was never set up")
         grid = self.slope_statistics.annotate_geometry(self.grid)
@@ -242,7 +228,7 @@ class OpenLoopAcquisition:
         return self.slope_statistics.update_references(grid, self.focus_estimator)
 
     def notes(self) -> tuple[str, ...]:
-        """What to know of the references before closing a loop on them."""
+        """Notes on the accuracy of the references."""
         seconds = self.n_received / self.bench.wfs.settings.frame_rate_hz
         has_static_focus = (
             self.focus_estimator is not None and self.focus_estimator.static_focus() is not None
@@ -253,7 +239,7 @@ class OpenLoopAcquisition:
 
     def _process_frame(self, frame: Frame, poke: NDArray[np.float64]) -> None:
         if self.slopes_of is None or self.slope_statistics is None or self.flux_monitor is None:
-            raise RuntimeError("frames were fed before the sensor was set up")
+            raise RuntimeError("a frame was processed before the sensor was set up")
         slopes = self.slopes_of(frame.data)
         self.flux_monitor(self.slopes_of.flux)
         self.slope_statistics.add(slopes, poke)
@@ -268,7 +254,7 @@ class OpenLoopAcquisition:
             self.recorded.append((frame.index, slopes, poke))
 
     def _add_to_partial_mean(self, frame: Frame) -> None:
-        """Add a frame to the sum of its part of the run."""
+        """Add a frame to the sum over its part of the run."""
         part = min(self.n_processed * _N_PARTS // max(self.n_planned, 1), _N_PARTS - 1)
         if part not in self.partial_means:
             self.partial_means[part] = frame.data.astype(np.float64), 1
@@ -278,7 +264,7 @@ class OpenLoopAcquisition:
         self.partial_means[part] = total, count + 1
 
     def record(self) -> AcquisitionRecord | None:
-        """Frame indices ``(n,)``, slopes ``(n, n_slopes)`` and pokes ``(n, n_modes)``, if they were kept."""
+        """Frame indices, slopes and pokes; ``None`` if they were not stored."""
         if not self.recorded:
             return None
         index, slopes, pokes = zip(*self.recorded, strict=True)

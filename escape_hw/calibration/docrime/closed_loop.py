@@ -1,4 +1,4 @@
-"""DO-CRIME in closed loop: pokes beside the integrator, which are the instruments of its commands."""
+"""DO-CRIME in closed loop: pokes added to the controller's command, used as instrumental variables."""
 
 from __future__ import annotations
 
@@ -15,51 +15,50 @@ from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.checkpoint import Checkpoint, fingerprint
-from escape_hw.calibration.acquisition.frames import next_frame, validate_frame_count
-from escape_hw.calibration.acquisition.pokes import PokeSequence, RandomPokes, select_random_pokes
-from escape_hw.calibration.acquisition.preview import MatrixPreview
-from escape_hw.calibration.acquisition.sensor_setup import (
-    build_slope_function,
+from escape_hw.calibration.acquisition.frames import validate_frame_count
+from escape_hw.calibration.acquisition.pokes import (
+    PokeSequence,
+    RandomPokes,
     compute_random_amplitudes,
-    prepare_sensor,
+    select_random_pokes,
 )
-from escape_hw.calibration.acquisition.stopping import RunMonitor, StoppingCriterion, Target
+from escape_hw.calibration.acquisition.preview import MatrixPreview
+from escape_hw.calibration.acquisition.stopping import Target
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 from escape_hw.calibration.docrime.estimator_thread import EstimatorThread
+from escape_hw.calibration.docrime.monitor import RunMonitor, StoppingCriterion
 from escape_hw.calibration.docrime.open_loop import (
-    MAX_CORRELATED_SLOPES,
     DocrimeRun,
     build_snr_criterion,
     build_solution_matrix,
     collect_solution_notes,
     require_enough_frames,
 )
-from escape_hw.calibration.loop.performance import (
-    build_integrator,
-    collect_loop_notes,
-    select_settled_residual,
-)
-from escape_hw.calibration.loop.runner import SETTLING_S, LoopRecord, RunningLoop, require_not_diverged
+from escape_hw.calibration.docrime.regression import MAX_CORRELATED_SLOPES
+from escape_hw.calibration.loop.control import build_integrator
+from escape_hw.calibration.loop.divergence import require_not_diverged
+from escape_hw.calibration.loop.performance import collect_loop_notes, select_settled_residual
+from escape_hw.calibration.loop.runner import LoopRecord, RunningLoop
 from escape_hw.errors import Aborted, ConfigError, TooFewFrames
 from escape_hw.io.fits.run_state import RunState
 
-#: Frames after which a running loop asks whether the estimate will do.
+#: Frames between two checks of the stopping criterion.
 _CHECK_INTERVAL = 500
 
 
 class ClosedLoopAcquisition:
-    """A loop that runs while pokes are injected and estimated beside it.
+    """A loop with injected pokes, and the estimator beside it.
 
     Parameters
     ----------
     bench
-        An open bench, its sensor prepared.
+        An open bench.
     matrix, grid
-        What closes the loop.
+        Matrix that closes the loop, and its geometry.
     estimator
-        Takes slopes, commands and pokes.
-    looks
-        What is done with the estimate on the way.
+        Closed-loop estimator.
+    monitor
+        Checkpoint and stopping criterion of the estimate.
     """
 
     def __init__(
@@ -70,9 +69,8 @@ class ClosedLoopAcquisition:
         estimator: DocrimeEstimator,
         monitor: RunMonitor,
     ) -> None:
-        self._bench, self._grid, self._monitor, self._estimator = bench, grid, monitor, estimator
-        control = build_integrator(bench, matrix, grid)
-        self._loop = RunningLoop(bench, matrix.m2c, build_slope_function(bench, grid), control)
+        self._grid, self._monitor, self._estimator = grid, monitor, estimator
+        self._loop = RunningLoop.prepare(bench, matrix, grid, build_integrator(bench, matrix, grid))
         self._criterion_met = self._aborted = False
         self._preview = MatrixPreview(matrix.n_modes, lambda: grid)
         self._preview_arrays: Mapping[str, NDArray[np.float32]] = {}
@@ -80,7 +78,7 @@ class ClosedLoopAcquisition:
 
     @property
     def record(self) -> LoopRecord:
-        """What the loop gathered."""
+        """Measurements of the loop."""
         return self._loop.record
 
     @property
@@ -90,71 +88,64 @@ class ClosedLoopAcquisition:
 
     @property
     def grid(self) -> SensorGeometry:
-        """The geometry with the motion of the closed loop, which a model of the sensor has to match."""
+        """The geometry with the slope statistics of the closed loop."""
         return self._estimator_thread.slope_statistics.annotate_geometry(self._grid, closed=True)
 
     def restore(self, state: RunState) -> None:
-        """Go on from what a run that was broken off has kept."""
+        """Continue from a saved state."""
         self._estimator.restore(state.values, state.arrays)
         self._estimator_thread.slope_statistics.restore(state.arrays["motion"])
 
     def poke(self, frames: int, pokes: PokeSequence, stage: str) -> Procedure[bool]:
-        """Close the loop, poke until the estimator has so many frames, open it; the mirror ends flat.
+        """Close the loop, inject pokes until the estimator has a number of frames, and open the loop.
 
         Returns
         -------
         bool
-            Whether the operator stopped it early.
+            Whether the run was aborted.
 
         Raises
         ------
         CalibrationError
             The loop diverged, or the sensor went dark.
         """
-        bench, loop = self._bench, self._loop
-        partial, settling_frames = False, int(SETTLING_S * bench.wfs.settings.frame_rate_hz)
-        bench.dm.flatten()
-        # One frame first: what the camera lost while nobody read it is not a loss of the loop.
-        next_frame(bench)
-        try:
-            with self._estimator_thread as estimator_thread:
-                try:
-                    yield from loop.run(settling_frames, report=Reporter("closing the loop", settling_frames))
-                    done, report = self._estimator.frames_received, Reporter(stage, frames)
-                    while done < frames and not self._criterion_met and not loop.record.diverged:
-                        n_frames = min(_CHECK_INTERVAL, frames - done)
-                        yield from self._with_preview(
-                            loop.run(n_frames, inject=pokes, observe=(estimator_thread,), report=report)
-                        )
-                        done += n_frames
-                        estimator_thread.wait_until_summed()
-                except Aborted:
-                    # At once: the sums may have a while to go.
-                    bench.dm.flatten()
-                    partial = self._aborted = True
-                estimator_thread.finish()
-        finally:
-            bench.dm.flatten()
-        require_not_diverged(self._loop.record)
-        if partial:
+        loop, estimator_thread = self._loop, self._estimator_thread
+        with loop.closed(), estimator_thread:
+            try:
+                yield from loop.settle()
+                done, report = self._estimator.frames_received, Reporter(stage, frames)
+                while done < frames and not self._criterion_met and not loop.record.diverged:
+                    n_frames = min(_CHECK_INTERVAL, frames - done)
+                    yield from self._with_preview(
+                        loop.run(n_frames, inject=pokes, observe=(estimator_thread,), report=report)
+                    )
+                    done += n_frames
+                    estimator_thread.wait_until_summed()
+            except Aborted:
+                # At once, because the sums may take a while.
+                loop.open()
+                self._aborted = True
+            estimator_thread.finish()
+        require_not_diverged(loop.record)
+        if self._aborted:
             self._save_and_check(final=True)
-        return partial
+        return self._aborted
 
     def _with_preview(self, steps: Procedure[LoopRecord]) -> Iterator[Progress]:
-        """Progress of the loop with the newest picture of the matrix."""
+        """Progress of the loop with the latest preview of the matrix."""
         for step in steps:
             preview_arrays, self._preview_arrays = self._preview_arrays, {}
             yield replace(step, arrays={**step.arrays, **preview_arrays}) if preview_arrays else step
 
     def _on_block(self, estimator: DocrimeEstimator) -> None:
-        """Show, keep and judge the estimate, as far as it is due; in the estimator's thread."""
-        if self._preview.due():
+        """Preview, save and check the estimate, as far as each is due; in the estimator's thread."""
+        if self._preview.is_due():
             self._preview_arrays = self._preview(estimator.preview)
-        if not self._criterion_met and not self._aborted and self._monitor.due(estimator.frames_received):
+        if not self._criterion_met and not self._aborted and self._monitor.is_due(estimator.frames_received):
             self._criterion_met = self._save_and_check()
 
     def _save_and_check(self, *, final: bool = False) -> bool:
-        """Whether the estimate will do; its progress is nobody's. False if the run is stopped meanwhile."""
+        """Whether the criterion is met, without reporting progress; false if the run is aborted meanwhile."""
         arrays = {"motion": self._estimator_thread.slope_statistics.state()}
         frames_received = self._estimator.frames_received
         procedure = self._monitor.check(self._estimator, self.grid, frames_received, {}, arrays, final=final)
@@ -179,7 +170,7 @@ def docrime_closed_run(
     checkpoint: Checkpoint | None = None,
     criterion: StoppingCriterion | None = None,
 ) -> Procedure[DocrimeRun]:
-    """As :func:`docrime_closed_loop`, with the solution beside the matrix; see ``docrime_run``."""
+    """Run :func:`docrime_closed_loop` and return also the solution; parameters as for ``docrime_run``."""
     c, m2c, grid = bench.config.calibration, closed_loop.matrix.m2c, closed_loop.grid
     n_frames = c.frames if frames is None else validate_frame_count(frames)
     poke = c.poke if poke is None else poke
@@ -192,14 +183,10 @@ def docrime_closed_run(
         grid.n_slopes, m2c.shape[1], order=c.whiten_order, lags=c.lags, closed=True,
         correlations=correlations and grid.n_slopes <= MAX_CORRELATED_SLOPES,
     )  # fmt: skip
-    method = _method_name(pattern)
-    settings = {
-        "poke": poke,
-        "correlations": correlations,
-        "closed with": fingerprint(closed_loop.matrix.data),
-    }
+    method = f"{pattern.method}-closed"
+    closed_with = fingerprint(closed_loop.matrix.data)
+    settings = {"poke": poke, "correlations": correlations, "closed with": closed_with}
     state = None if checkpoint is None else checkpoint.begin(bench, method, m2c, settings)
-    prepare_sensor(bench)
     loop = ClosedLoopAcquisition(
         bench, closed_loop.matrix, grid, estimator, RunMonitor(checkpoint, criterion)
     )
@@ -237,25 +224,25 @@ def docrime_closed_loop(
     until: Target | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
-    """Measure the interaction matrix while the loop is closed, by pokes beside the integrator.
+    """Measure the interaction matrix in closed loop, by pokes added to the controller's command.
 
-    Unbiased for any controller, at pokes of a few thousandths of the stroke: see
-    ``docs/theory/docrime.md``.
+    Unbiased for any controller, with pokes of a few thousandths of the stroke (``docs/theory/docrime.md``).
 
     Parameters
     ----------
     bench
         An open bench.
-    closing
-        A calibration whose matrix closes the loop, with the configured gain, leak and dropped modes; the
-        measured matrix is on its grid and in its modes.
-    frames, poke, pattern, until, keep
+    closed_loop
+        Calibration whose matrix closes the loop with the configured gain, leak and dropped modes; the
+        measured matrix has its geometry and modes.
+    frames, poke, pattern, until, checkpoint
         As for :func:`~escape_hw.calibration.docrime.open_loop.docrime`.
 
     Returns
     -------
     CalibrationResult
-        On the grid of ``closed_loop``, with the motion that the loop left. Stopped early, ``partial`` is true.
+        On the geometry of ``closed_loop``, with the slope statistics of the closed loop. After an abort
+        ``partial`` is true.
 
     Raises
     ------
@@ -266,29 +253,19 @@ def docrime_closed_loop(
     CalibrationError
         The loop diverged, the sensor went dark, or it does not respond to the pokes.
     Aborted
-        Stopped before a matrix could be solved.
+        Aborted before a matrix could be solved.
     """
-    criterion = build_snr_criterion(bench, closed_loop.matrix.m2c, until, _method_name(pattern))
+    criterion = build_snr_criterion(bench, closed_loop.matrix.m2c, until, f"{pattern.method}-closed")
     run = yield from docrime_closed_run(
-        bench,
-        closed_loop,
-        frames=frames,
-        poke=poke,
-        correlations=False,
-        pattern=pattern,
-        checkpoint=checkpoint,
-        criterion=criterion,
-    )
+        bench, closed_loop, frames=frames, poke=poke, correlations=False, pattern=pattern,
+        checkpoint=checkpoint, criterion=criterion,
+    )  # fmt: skip
     return run.result
 
 
-def _method_name(pattern: type[PokeSequence]) -> str:
-    return f"{pattern.method}-closed"
-
-
 def _collect_loop_notes(bench: Bench, loop: ClosedLoopAcquisition) -> list[str]:
-    """What to know of the loop that a matrix was measured in."""
+    """Notes on the loop that qualify the measured matrix."""
     notes = collect_loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)
     if loop.skipped:
-        notes.append(f"{loop.skipped} frames were lost to the estimate: its sums were behind the loop")
+        notes.append(f"the estimate skipped {loop.skipped} frames, because its sums were behind the loop")
     return notes

@@ -1,4 +1,4 @@
-"""DO-CRIME: the interaction matrix from random pokes under turbulence (Lai et al. 2020).
+"""Streaming DO-CRIME estimator: the interaction matrix from random pokes under turbulence (Lai et al. 2020).
 
 The paper's estimator, ``D = <s c^T> <c c^T>^-1``, is the special case of a filter of length one.
 """
@@ -29,9 +29,9 @@ from escape_hw.calibration.docrime.response import (
 )
 from escape_hw.errors import TooFewFrames
 
-#: Frames kept to fit the whitening filter before the sums start.
+#: Frames from which response and whitening filter are estimated before the sums start.
 BURN_IN_FRAMES = 1000
-#: Frames gathered before the sums are updated: large enough for matrix products to be efficient.
+#: Frames of a block that is added to the sums at once.
 BLOCK = 500
 
 
@@ -41,19 +41,24 @@ class DocrimeEstimator:
     Parameters
     ----------
     n_slopes, n_modes
-        Sizes.
+        Number of slopes and of modes.
     order
-        Past frames that predict the turbulence; 0 is the paper's plain estimator.
+        Number of past frames that predict the turbulence; 0 for the paper's plain estimator.
     lags
-        Frames over which the temporal response is estimated.
+        Number of lags of the temporal response.
     correlations
-        Find how the noise of the slopes is correlated, which SPRINT's error bars want; costs as much
-        as the rest when there are many slopes.
+        Whether to sum the correlations of the slopes' noise, which the errors of SPRINT need. With many
+        slopes this takes as much time as all the rest.
     closed
-        Frames come with the poke beside the whole command of a closed loop, and pokes are the
-        instruments of the commands (:class:`~escape_hw.calibration.docrime.regression.InstrumentalVariableSums`).
-    known
-        The temporal response by other frames of the same mirror and sensor.
+        Closed loop: frames have a poke beside the command, and pokes are the instruments of the commands
+        (:class:`~escape_hw.calibration.docrime.regression.InstrumentalVariableSums`).
+    known_response
+        Temporal response from other frames of the same mirror and sensor.
+
+    Raises
+    ------
+    ValueError
+        ``order`` is below 0 (1 in closed loop), or ``lags`` below 1.
     """
 
     def __init__(
@@ -91,23 +96,24 @@ class DocrimeEstimator:
         command: NDArray[np.float64],
         poke: NDArray[np.float64] | None = None,
     ) -> DocrimeEstimator:
-        """Take one frame and the command that was sent when it had arrived.
+        """Add one frame and the command that was sent after it.
 
         Parameters
         ----------
         index
-            Frame index; it must rise. A gap loses the pairs that it touches and shifts none.
+            Frame index, larger than the one before. A gap removes the pairs of slopes and commands that it
+            touches and shifts none.
         slopes
             ``(n_slopes,)``.
         command
-            ``(n_modes,)``, as it really was sent: a poke, or in closed loop controller and poke together.
+            Command as sent ``(n_modes,)``: a poke, or in closed loop the sum of controller and poke.
         poke
-            In closed loop, the poke in it ``(n_modes,)``, as it was drawn.
+            In closed loop, the poke in it ``(n_modes,)``.
 
         Raises
         ------
         ValueError
-            Wrong shape, not finite, or an index that does not rise.
+            Wrong shape, not finite, or the index does not increase.
         """
         if slopes.shape != self._shapes[0] or command.shape != self._shapes[1]:
             raise ValueError(
@@ -117,7 +123,7 @@ class DocrimeEstimator:
         excitation = command
         if self.closed:
             if poke is None or poke.shape != self._shapes[1]:
-                raise ValueError(f"in closed loop a poke ({self.n_modes},) stands beside the command")
+                raise ValueError(f"in closed loop a poke ({self.n_modes},) is needed beside the command")
             excitation = self._excitation
             excitation[: self.n_modes], excitation[self.n_modes :] = command, poke
         if index != self._next_index or self._unusable:
@@ -133,15 +139,20 @@ class DocrimeEstimator:
     def extend(
         self, index: NDArray[np.int64], slopes: NDArray[np.floating], excitation: NDArray[np.floating]
     ) -> DocrimeEstimator:
-        """Take many recorded frames at once, or none of them; see :meth:`partial_fit`.
+        """Add many recorded frames, all or none of them.
 
         Parameters
         ----------
         index
-            Frame indices ``(n,)``, rising.
-        slopes, driven
-            ``(n, n_slopes)`` and commands ``(n, n_modes)``, in closed loop with the pokes beside them
+            Frame indices ``(n,)``, increasing.
+        slopes, excitation
+            ``(n, n_slopes)``, and commands ``(n, n_modes)``, in closed loop with the pokes beside them
             ``(n, 2 n_modes)``.
+
+        Raises
+        ------
+        ValueError
+            As for :meth:`partial_fit`.
         """
         n, columns = len(index), self.n_modes * (2 if self.closed else 1)
         if slopes.shape != (n, self.n_slopes) or excitation.shape != (n, columns):
@@ -159,7 +170,7 @@ class DocrimeEstimator:
         if (steps <= 0).any():
             k = int(np.argmax(steps <= 0))
             last = before if k == 0 else index[k - 1]
-            raise ValueError(f"frame index went from {last} to {index[k]}; it must rise")
+            raise ValueError(f"frame index went from {last} to {index[k]}; it must increase")
         breaks = np.flatnonzero(steps[1:] != 1) + 1
         for start, end in zip([0, *breaks], [*breaks, n], strict=True):
             self._add_lost_frames(int(steps[start]) - 1)
@@ -168,45 +179,41 @@ class DocrimeEstimator:
                 n_taken = self._buffer.append(slopes[done:end], excitation[done:end])
                 self._unusable -= self._buffer.mark_unusable(n_taken, self._unusable)
                 done += n_taken
-                if self._buffer.full:
+                if self._buffer.is_full:
                     self._update_sums()
         self._next_index = int(index[-1]) + 1
         return self
 
     def mark_pause(self) -> None:
-        """The run pauses, the mirror goes flat, and the next frame may have any index.
+        """Mark a pause: the mirror becomes flat, and the next frame may have any index.
 
-        A loop is closed again before the first of its frames comes here, and what the mirror did until
-        then is not known: in closed loop the first frames only tell their commands.
+        In closed loop the first frames after a pause contribute only their commands, because the commands
+        before them are unknown.
         """
         if self._next_index is None:
             return
         self._unusable = self.lags if self.closed else 0
         for _ in range(self._history_rows() + self.order + self.lags):
             self._buffer.append_lost(flat=True)
-            if self._buffer.full:
+            if self._buffer.is_full:
                 self._update_sums()
         self._next_index = None
 
     def _add_lost_frames(self, frames: int) -> None:
-        """Lay out lost frames; a gap longer than all memory separates the stretches for good."""
+        """Append lost frames, at most as many as separate the frames before and after them."""
         self.lost_frames += frames
         for _ in range(min(frames, self._history_rows() + self.order + self.lags)):
             self._buffer.append_lost()
-            if self._buffer.full:
+            if self._buffer.is_full:
                 self._update_sums()
 
     def _history_rows(self) -> int:
-        """Rows before a row that its filtered slopes and pokes are made of."""
+        """Number of rows before a row that its filtered slopes and commands depend on."""
         return 2 * self.order + self.lags
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """Plain values and arrays from which :meth:`restore` makes this estimator again, for another run.
-
-        These are the sums or, before there is a filter, the frames themselves.
-        """
+        """Plain values and arrays for :meth:`restore`: the sums or, before there is a filter, the frames."""
         if self._whitener is None or self._response is None or self._tracker is None:
-            # A filter found now would be that of too few frames.
             data = self._buffer.telemetry()
             return {}, {"rows": data.rows.copy(), "present": data.present.copy()}
         self._update_sums()
@@ -226,17 +233,16 @@ class DocrimeEstimator:
         return values, arrays
 
     def restore(self, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from what :meth:`state` of an equal estimator gave; the mirror was flat meanwhile.
+        """Continue from the state of an estimator with the same parameters, after a pause with a flat mirror.
 
         Raises
         ------
         ValueError
-            The estimator has taken frames, or the arrays have other shapes.
+            The estimator already has frames, or the arrays have other shapes.
         """
         if self.frames or self._buffer.n_filled:
-            raise ValueError("an estimator that has taken frames cannot be restored")
+            raise ValueError("an estimator that already has frames cannot be restored")
         if "rows" in arrays:
-            # Frames from before there was a filter, by their places on the time line.
             at = np.flatnonzero(arrays["present"])
             self.extend(at, arrays["rows"][at, : self.n_slopes], arrays["rows"][at, self.n_slopes :])
             self.mark_pause()
@@ -248,36 +254,35 @@ class DocrimeEstimator:
         self._tracker, self._sums.count = ResponseTracker(self._response, spectra), int(values["count"])
         for prefix, target in (("sums", self._sums.arrays()), ("tracker", self._tracker.arrays())):
             for name, array in target.items():
-                kept = arrays.get(f"{prefix}.{name}")
-                if kept is None or kept.shape != array.shape:
-                    found = "missing" if kept is None else str(kept.shape)
-                    raise ValueError(f"{prefix}.{name} is {found}, not {array.shape}; begin the run again")
-                array[...] = kept
+                saved = arrays.get(f"{prefix}.{name}")
+                if saved is None or saved.shape != array.shape:
+                    found = "missing" if saved is None else str(saved.shape)
+                    raise ValueError(f"{prefix}.{name} is {found}, not {array.shape}; start a new run")
+                array[...] = saved
         self._buffer.resize(BLOCK + self._history_rows())
-        # Rows before the first that is new: the mirror was flat, no slopes are known.
         self._buffer.append_lost(flat=True)
         self._next_index = 0
         self.mark_pause()
 
     @property
     def frames_received(self) -> int:
-        """Frames taken, also those not in the sums yet; less those whose slopes will not be taken."""
+        """Number of usable frames received, including those not in the sums yet."""
         return self.frames + self._buffer.n_new - self._unusable
 
     @property
     def is_initialised(self) -> bool:
-        """Whether the filter is found, so that a solution in the middle of a run costs nothing later."""
+        """Whether the filter is known. A solution before that would fix it on too few frames."""
         return self._tracker is not None
 
     def solve(self) -> DocrimeSolution:
-        """The matrix, its standard errors and the temporal response so far.
+        """Matrix, standard errors and temporal response of the frames so far.
 
         Raises
         ------
         TooFewFrames
-            Fewer complete frames than modes plus a margin; says how many are needed.
+            Fewer complete frames than modes plus a margin; the message says how many are needed.
         CalibrationError
-            The mirror does not respond, or the pokes do not span the modes.
+            The sensor does not respond significantly, or the pokes do not span the modes.
         """
         self._update_sums()
         needed = self.n_modes + self.lags + MIN_DEGREES_OF_FREEDOM
@@ -292,9 +297,9 @@ class DocrimeEstimator:
         )  # fmt: skip
 
     def preview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Matrix and standard errors by the frames summed so far, for those who watch; ``None``: too few.
+        """Matrix and standard errors of the frames in the sums, for display; ``None`` if they are too few.
 
-        It changes nothing: a run ends with the same numbers whether it is watched or not.
+        Does not change the state, so previews do not affect the result of a run.
         """
         if self._tracker is None:
             return None
@@ -302,36 +307,34 @@ class DocrimeEstimator:
         return estimate_preview(self._sums, scale, self.lags, self._variance_inflation)
 
     def _update_sums(self) -> None:
-        """Move the gathered frames into the sums; fit the filter first if there is none yet."""
+        """Add the buffered frames to the sums, after fitting response and filter if they are unknown."""
         buffer = self._buffer
-        data, start = buffer.telemetry(), buffer.kept
+        data, start = buffer.telemetry(), buffer.n_retained
         self.frames += buffer.n_new
         if self._response is None:
             start = 0
-            found = fit_first_frames(data, self.order, self.lags)
-            if found is not None:
-                self._whitener, self._variance_inflation = found.whitener, found.variance_inflation
-                first = found.response
-                self._response = (
-                    first if self._known_response is None else first.combine_with(self._known_response)
-                )
+            fit = fit_first_frames(data, self.order, self.lags)
+            if fit is not None:
+                self._whitener, self._variance_inflation = fit.whitener, fit.variance_inflation
+                known = self._known_response
+                self._response = fit.response if known is None else fit.response.combine_with(known)
         if self._response is not None:
             self._add_rows(data, start)
         buffer.retain_last(buffer.n_filled if self._response is None else self._history_rows())
         if self._response is None:
-            # Not enough to go by yet: the next call sees these frames again.
+            # Too few frames: the next call uses them again.
             buffer.resize(buffer.n_filled + BURN_IN_FRAMES)
         elif start == 0:
             buffer.resize(buffer.n_filled + BLOCK)
 
     def _add_rows(self, data: AlignedTelemetry, start: int) -> None:
-        """Add the rows from ``start`` on to the sums."""
+        """Add the rows from ``start`` on to the sums, and to the temporal response."""
         if self._whitener is None or self._response is None:
             raise RuntimeError("sums need the filter and the response")
         block = filter_telemetry(data, self._whitener, self.lags, start)
         if not block.now.size:
             return
-        # Without the filter later frames would tell less than the first ones' differences did.
+        # Without a filter the differences of the first frames give the more accurate response.
         if self._tracker is not None and self.order:
             before = self._sums.centred_sample()
             matrix = before.solve()

@@ -1,4 +1,4 @@
-"""An estimator beside a running loop: frames are handed over in blocks, the sums are another thread's."""
+"""Runs a DO-CRIME estimator in a thread beside a closed loop."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.calibration.acquisition.frames import SlopeStatistics
+from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 
-#: Frames handed over at once.
+#: Frames of a block that is passed to the thread.
 BLOCK = 100
-#: Blocks that may wait.
+#: Largest number of blocks in the queue.
 _MAX_QUEUED_BLOCKS = 8
-#: How much less urgent the sums are than the loop (Unix: nice).
+#: Increment of the thread's nice value: the loop has priority.
 _NICE_INCREMENT = 10
 
 
 class EstimatorThread:
-    """Feeds a closed-loop estimator from a loop that must not wait for it; use it in ``with``.
+    """Passes the frames of a loop to an estimator in another thread; an observer and a context manager.
 
-    The loop's thread copies a frame's numbers into a buffer and no more. Matrix products run in
-    another thread, and they hold no interpreter lock.
+    The loop's thread only copies each frame into a buffer. The matrix products of the other thread release
+    the interpreter lock.
 
     Parameters
     ----------
     estimator
-        Takes slopes with commands and pokes beside them. Nobody else touches it before :meth:`finish`.
-    patient
-        Whether the loop waits when the sums are :data:`_MAX_QUEUED_BLOCKS` blocks behind; otherwise these
-        frames are lost to the estimate, and counted.
-    look
-        Called in the other thread after each block, with the estimator.
+        A closed-loop estimator; not to be used elsewhere before :meth:`finish`.
+    blocking
+        Whether the loop waits while the queue is full; otherwise the frames of a block are skipped and
+        counted.
+    on_block
+        Called with the estimator after each block, in the estimator's thread.
 
     Attributes
     ----------
-    motion
-        Of the slopes in the estimate.
+    slope_statistics
+        Statistics of the slopes in the estimate.
     skipped
-        Frames lost because the sums were behind.
+        Number of frames skipped because the queue was full.
     """
 
     def __init__(
@@ -58,14 +58,10 @@ class EstimatorThread:
         self._n_slopes, self._n_modes = estimator.n_slopes, estimator.n_modes
         self.slope_statistics = SlopeStatistics(estimator.n_slopes)
         columns = self._n_slopes + 2 * self._n_modes
-        self._free_blocks: queue.SimpleQueue[tuple[NDArray[np.int64], NDArray[np.float32]]] = (
-            queue.SimpleQueue()
-        )
+        self._free_blocks = queue.SimpleQueue[tuple[NDArray[np.int64], NDArray[np.float32]]]()
         for _ in range(_MAX_QUEUED_BLOCKS + 1):
             self._free_blocks.put((np.zeros(BLOCK, np.int64), np.zeros((BLOCK, columns), np.float32)))
-        self._filled_blocks: queue.Queue[tuple[NDArray[np.int64], NDArray[np.float32], int] | None] = (
-            queue.Queue()
-        )
+        self._filled_blocks = queue.Queue[tuple[NDArray[np.int64], NDArray[np.float32], int] | None]()
         self._index, self._rows = self._free_blocks.get()
         self._n_filled = 0
         self._error: BaseException | None = None
@@ -79,19 +75,9 @@ class EstimatorThread:
         self._stop_thread()
 
     def __call__(
-        self,
-        index: int,
-        slopes: NDArray[np.float32],
-        command: NDArray[np.float64],
-        poke: NDArray[np.float64],
+        self, index: int, slopes: NDArray[np.float32], command: NDArray[np.float64], poke: NDArray[np.float64]
     ) -> None:
-        """Take one frame, as a loop's observer.
-
-        Raises
-        ------
-        Exception
-            What the estimator raised in its thread.
-        """
+        """Add one frame, as an observer of the loop; raises an exception of the estimator's thread."""
         k, n, m = self._n_filled, self._n_slopes, self._n_modes
         row = self._rows[k]
         row[:n], row[n : n + m], row[n + m :] = slopes, command, poke
@@ -101,18 +87,12 @@ class EstimatorThread:
             self._submit_block()
 
     def wait_until_summed(self) -> None:
-        """Wait until all whole blocks are in the sums, if the loop may wait at all."""
+        """Wait until all complete blocks are in the sums, if ``blocking``."""
         if self._blocking:
             self._filled_blocks.join()
 
     def finish(self) -> DocrimeEstimator:
-        """Wait for the sums; the estimator with all frames in it.
-
-        Raises
-        ------
-        Exception
-            What the estimator raised in its thread.
-        """
+        """Wait for the thread and return the estimator; raises an exception of the estimator's thread."""
         if self._n_filled:
             self._filled_blocks.put((self._index, self._rows, self._n_filled))
             self._n_filled = 0
@@ -125,7 +105,7 @@ class EstimatorThread:
         if self._error is not None:
             raise self._error
         if not self._blocking and self._free_blocks.empty():
-            # The estimator sees a gap in the index, as of frames that the camera lost.
+            # The estimator treats the gap in the index like frames that the camera lost.
             self.skipped += self._n_filled
         else:
             self._filled_blocks.put((self._index, self._rows, self._n_filled))
@@ -139,21 +119,20 @@ class EstimatorThread:
 
     def _process_blocks(self) -> None:
         if hasattr(os, "setpriority"):
-            # Threads have priorities of their own on Linux only.
+            # A thread id is accepted here on Linux only.
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE_INCREMENT)
         while (block := self._filled_blocks.get()) is not None:
             index, rows, filled = block
             try:
                 if self._error is None:
-                    part = rows[:filled]
-                    n = self._n_slopes
-                    self.estimator.extend(index[:filled], part[:, :n], part[:, n:])
-                    self.slope_statistics.extend(part[:, :n])
+                    slopes, excitation = np.split(rows[:filled], [self._n_slopes], axis=1)
+                    self.estimator.extend(index[:filled], slopes, excitation)
+                    self.slope_statistics.extend(slopes)
                     if self._on_block is not None:
                         self._on_block(self.estimator)
             except BaseException as error:
-                # The loop's thread raises it at its next block.
+                # Raised in the loop's thread with its next block.
                 self._error = error
             finally:
                 self._free_blocks.put((index, rows))

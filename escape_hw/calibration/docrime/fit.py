@@ -1,4 +1,4 @@
-"""Fit of the first frames (temporal response, whitening filter), significance tests, and the solution of the accumulated sums."""
+"""Fit of the first frames (temporal response, whitening filter), significance tests, solution of the sums."""
 
 from __future__ import annotations
 
@@ -25,38 +25,43 @@ from escape_hw.calibration.docrime.response import (
 from escape_hw.calibration.docrime.whitening import apply_filter, fit_prediction_error_filter
 from escape_hw.errors import CalibrationError
 
-#: Standard deviations by which the pokes must explain more of the slopes than chance would.
+#: Standard deviations by which the pokes must explain more of the slopes than chance.
 _MIN_SIGNIFICANCE = 5.0
-#: What the colour of the noise adds to that: one filter for all slopes leaves some of each slope's own,
-#: and where nothing responds the response comes out broad, so that it counts. Up to 1.3 on the twins.
+#: Factor on the chance level for noise that is not white: one filter for all slopes leaves some correlation
+#: in each slope, and without a response the estimated one is broad. Up to 1.3 on the twins.
 _COLOURED_NOISE_FACTOR = 1.5
+#: Least reciprocal condition number of the information on the modes.
+_MIN_RECIPROCAL_CONDITION = 1e-7
+#: Degrees of freedom from which on standard errors are stated.
+MIN_DEGREES_OF_FREEDOM = 20
+#: Number of slopes from which the filter, common to all, is estimated.
+_FILTER_SLOPES = 32
 
 
 def require_response(
     gram: NDArray[np.floating], matrix: NDArray[np.floating], covariance: NDArray[np.floating], lags: int
 ) -> None:
-    """Refuse a matrix that chance alone explains.
+    """Raise unless the pokes explain more of the slopes than chance does.
 
-    Without a response the pokes explain as much power as the noise has, with the scatter that as
-    many degrees of dof as modes times independent slopes leave; looking for the temporal
-    response that explains most adds what the largest eigenvalue of a Wishart matrix exceeds the
-    mean by (Marchenko & Pastur 1967).
+    Without a response the pokes explain as much power as the noise has, with the scatter of as many degrees
+    of freedom as modes times independent slopes. The choice of the temporal response that explains most adds
+    the excess of the largest eigenvalue of a Wishart matrix over the mean (Marchenko & Pastur 1967).
 
     Parameters
     ----------
     gram
         Sum of pokes times pokes ``(n_modes, n_modes)``.
     matrix
-        The least-squares matrix ``(n_slopes, n_modes)``.
+        Least-squares matrix ``(n_slopes, n_modes)``.
     covariance
-        Of the noise of one frame's slopes ``(n_slopes, n_slopes)``.
+        Covariance of the noise of one frame's slopes ``(n_slopes, n_slopes)``.
     lags
-        Lags among which the response was looked for.
+        Number of lags of the response.
 
     Raises
     ------
     CalibrationError
-        The sensor does not respond to the mirror, as far as these frames tell.
+        The sensor does not respond significantly to the mirror.
     """
     noise = float(np.trace(covariance))
     if not noise > 0:
@@ -70,8 +75,8 @@ def require_response(
     if ratio < chance_ratio:
         raise CalibrationError(
             f"the wavefront sensor does not respond to the mirror: the pokes explain {ratio:.2f} times the "
-            f"power of the noise, chance alone up to {chance_ratio:.2f}; check that there is light and that the "
-            "mirror is in the beam and powered, or use larger pokes or more frames"
+            f"power of the noise, chance alone up to {chance_ratio:.2f}; check that there is light and that "
+            "the mirror is in the beam and powered, or use larger pokes or more frames"
         )
 
 
@@ -80,20 +85,19 @@ def variance_inflation(
 ) -> float:
     """Factor on the variance of a regression whose noise is not white.
 
-    A poke that shows in several frames meets nearly the same turbulence in all of them:
-    ``1 + 2 sum over k > 0 of rho_noise(k) rho_poke(k)``, with the autocorrelations of the noise and
-    of the poke as the sensor sees it.
+    ``1 + 2 sum over k > 0 of rho_noise(k) rho_poke(k)``, with the autocorrelations of the noise and of the
+    pokes through the temporal response: the frames that show a poke have nearly the same turbulence.
 
     Parameters
     ----------
     noise
-        Slopes less what the pokes explain ``(n, n_slopes)``.
-    seen
+        Residual slopes ``(n, n_slopes)``.
+    filtered_commands
         Pokes through the temporal response ``(n, n_modes)``.
     at
-        Time of each row in frames ``(n,)``, rising.
+        Time of each row in frames ``(n,)``, increasing.
     lags
-        Frames over which a poke shows.
+        Number of lags of the response.
     """
     centred = noise - noise.mean(axis=0)
     factor = 1.0
@@ -110,23 +114,17 @@ def _correlation(values: NDArray[np.floating], now: NDArray[np.intp], past: NDAr
     return float(np.vdot(a, b)) / size if size > 0 else 0.0
 
 
-#: Degrees of freedom without which no standard error is worth stating.
-MIN_DEGREES_OF_FREEDOM = 20
-#: Slopes that the filter, common to all, is found from.
-_FILTER_SLOPES = 32
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialFit:
-    """What the first frames say.
+    """Fit of the first frames.
 
     Parameters
     ----------
     whitener
         Filter over time ``(order + 1,)``.
     response
-        The temporal response.
-    spread
+        Temporal response.
+    variance_inflation
         Factor on the variance of an estimate whose noise is not white.
     """
 
@@ -136,48 +134,44 @@ class InitialFit:
 
 
 def create_sums(n_slopes: int, n_modes: int, closed: bool, *, correlations: bool) -> RegressionSums:
-    """Sums for open or closed loop."""
+    """Empty sums for open or closed loop."""
     if closed:
         return InstrumentalVariableSums.zeros(n_slopes, 2 * n_modes, correlations=correlations)
     return RegressionSums.zeros(n_slopes, n_modes, correlations=correlations)
 
 
 def fit_first_frames(data: AlignedTelemetry, order: int, lags: int) -> InitialFit | None:
-    """Temporal response and filter from the first frames: by frame differences, then by the filter.
+    """Estimate temporal response and whitening filter, first from frame differences, then iteratively.
 
     Parameters
     ----------
     data
-        The frames so far.
+        Telemetry so far.
     order
-        Past frames that predict the turbulence; 0 finds the response alone.
+        Number of past frames that predict the turbulence; 0 for no filter.
     lags
-        Frames over which the temporal response is estimated.
+        Number of lags of the temporal response.
 
     Returns
     -------
-    FirstFit or None
-        ``None``: too few frames.
+    InitialFit or None
+        ``None`` if there are too few frames.
 
     Raises
     ------
     CalibrationError
-        The pokes do not span the modes, the response goes on after its last lag, or (plain estimator)
-        the mirror does not respond.
+        The pokes do not span the modes, the sensor responds after the last lag, or (without a filter) it does
+        not respond.
     """
     if find_usable_rows(data, max(order, 1), lags).size < data.n_modes + lags + MIN_DEGREES_OF_FREEDOM:
         return None
     require_excitation(data.pokes.T @ data.pokes)
-    # Differences tell the response well even where the plain estimator is asked for.
-    difference, sampled = (
-        np.array([1.0, -1.0]),
-        data.select_slopes(_FILTER_SLOPES if order else RESPONSE_SLOPES),
-    )
+    difference = np.array([1.0, -1.0])
+    sampled = data.select_slopes(_FILTER_SLOPES if order else RESPONSE_SLOPES)
     response = fit_response(sampled, difference, lags)
     if not order:
-        return InitialFit(
-            np.ones(1), response, _estimate_plain_inflation(sampled, difference, response, lags)
-        )
+        inflation = _estimate_plain_inflation(sampled, difference, response, lags)
+        return InitialFit(np.ones(1), response, inflation)
     residuals, usable = _compute_residuals(sampled, difference, response, lags)
     whitener = fit_prediction_error_filter(residuals, usable, order)
     require_no_late_response(data, whitener, lags)
@@ -187,7 +181,7 @@ def fit_first_frames(data: AlignedTelemetry, order: int, lags: int) -> InitialFi
 def _regress(
     block: FilteredTelemetry, response: ResponseEstimate
 ) -> tuple[NDArray[np.float32], RegressionSums, NDArray[np.float64]]:
-    """Commands as the slopes saw them (pokes beside them in closed loop), sums and matrix of a block."""
+    """Commands through the response (pokes beside them in closed loop), sums and matrix of a block."""
     excitation = block.excitation(response.weights)
     sums = create_sums(block.n_slopes, block.n_modes, block.closed, correlations=False)
     sums = sums.add(block.slopes, excitation).subtract_means()
@@ -197,25 +191,23 @@ def _regress(
 def _estimate_plain_inflation(
     sampled: AlignedTelemetry, difference: NDArray[np.float64], response: ResponseEstimate, lags: int
 ) -> float:
-    """Factor on the plain estimator's variance; the differences must show that there is a response."""
+    """Variance inflation of the plain estimator; raises unless the frame differences show a response."""
     block = filter_telemetry(sampled, difference, lags)
     filtered_commands, sums, matrix = _regress(block, response)
     noise, now = block.slopes - filtered_commands @ matrix.T.astype(np.float32), block.now
     covariance = noise.T @ noise / (len(noise) - sampled.n_modes - lags)
-    require_response(
-        sums.gram, matrix, covariance * variance_inflation(noise, filtered_commands, now, lags), lags
-    )
+    covariance *= variance_inflation(noise, filtered_commands, now, lags)
+    require_response(sums.gram, matrix, covariance, lags)
     residuals, usable = _compute_residuals(sampled, difference, response, lags)
     at = np.flatnonzero(usable)
-    return variance_inflation(
-        residuals[at], apply_filter(sampled.rows, response.weights, at, sampled.n_slopes), at, lags
-    )
+    commands = apply_filter(sampled.rows, response.weights, at, sampled.n_slopes)
+    return variance_inflation(residuals[at], commands, at, lags)
 
 
 def _compute_residuals(
     data: AlignedTelemetry, whitener: NDArray[np.float64], response: ResponseEstimate, lags: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Slopes less what the commands explain ``(n_times, n_slopes)``, and the rows where that is known."""
+    """Slopes without the response to the commands ``(n_times, n_slopes)``, and a mask of the valid rows."""
     *_, matrix = _regress(filter_telemetry(data, whitener, lags), response)
     at = data.find_complete_rows(0, lags)
     residuals = np.zeros_like(data.slopes)
@@ -227,11 +219,11 @@ def _compute_residuals(
 
 
 def require_excitation(gram: NDArray[np.floating]) -> None:
-    """Raise :class:`CalibrationError` unless pokes with these sums of squares span the modes."""
-    # Factor and estimated condition: a twentieth of the time of the eigenvalues.
+    """Raise :class:`CalibrationError` unless pokes with this gram matrix span the modes."""
+    # The estimated condition takes a twentieth of the time of the eigenvalues.
     size = np.abs(gram).sum(axis=0).max()
     cholesky, failed = lapack.dpotrf(gram)
-    if failed or lapack.dpocon(cholesky, size)[0] <= 1e-7:
+    if failed or lapack.dpocon(cholesky, size)[0] <= _MIN_RECIPROCAL_CONDITION:
         raise CalibrationError(
             "the pokes do not excite every mode; check that the poke is not zero and not clipped away"
         )
@@ -240,21 +232,21 @@ def require_excitation(gram: NDArray[np.floating]) -> None:
 def estimate_preview(
     sums: RegressionSums, scale: NDArray[np.float64], lags: int, variance_inflation: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Matrix and standard errors ``(n_slopes, n_modes)`` without tests, correlations or a change of the sums.
+    """Estimate matrix and standard errors ``(n_slopes, n_modes)`` from sums, which are not changed.
 
     Parameters
     ----------
     sums
-        Of a run that goes on.
+        Sums of a running measurement.
     scale
-        Factors on the columns ``(n_modes,)``.
-    lags, spread
-        Frames of the temporal response, and factor on the variance.
+        Factors on the columns ``(n_modes,)`` or ``(1,)``.
+    lags, variance_inflation
+        Number of lags of the temporal response, and factor on the variance.
 
     Returns
     -------
     tuple or None
-        ``None``: too few frames, or pokes that do not span the modes yet.
+        ``None`` if there are too few frames, or the pokes do not span the modes yet.
     """
     if sums.count < scale.size + lags + MIN_DEGREES_OF_FREEDOM:
         return None
@@ -264,38 +256,39 @@ def estimate_preview(
         matrix, unit = centred_sums.solve(), centred_sums.inverse_diagonal()
     except np.linalg.LinAlgError:
         return None
-    variance = np.maximum(
-        centred_sums.residual_power(matrix) / max(centred_sums.degrees_of_freedom() - lags, 1.0), 0.0
-    )
+    dof = max(centred_sums.degrees_of_freedom() - lags, 1.0)
+    variance = np.maximum(centred_sums.residual_power(matrix) / dof, 0.0)
     sigma = np.outer(np.sqrt(variance * variance_inflation), np.sqrt(np.maximum(unit, 0.0)) * np.abs(scale))
     return matrix * scale, sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DocrimeSolution:
-    """A solved DO-CRIME run.
+    """Solution of a DO-CRIME run.
 
     Parameters
     ----------
     matrix, sigma
-        ``(n_slopes, n_modes)``: slopes per unit mode, and standard errors of single elements beside a
-        gain that they share.
+        Slopes per unit mode ``(n_slopes, n_modes)``, and standard errors of its elements, without that of
+        their common gain.
+    response
+        Temporal response.
     covariance
-        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; ``None`` where
-        correlations were not asked for.
+        Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; ``None`` if the
+        correlations were not summed.
     gram
-        Sum over frames of filtered pokes times filtered pokes ``(n_modes, n_modes)``; in closed loop
-        what stands in its place: the inverse of the covariance of a row of the matrix, per variance of
-        its slope's noise.
+        Information on the modes ``(n_modes, n_modes)``: inverse covariance of a row of the matrix, per
+        variance of its slope's noise; in open loop the sum of filtered pokes times filtered pokes.
     variance
-        Variance of each slope's filtered noise, with what its correlation over time adds ``(n_slopes,)``.
+        Variance of each slope's filtered noise, including the variance inflation ``(n_slopes,)``.
     whitener
-        The filter used, ``[1]`` for the plain estimator.
+        Filter ``(order + 1,)``, ``[1]`` for the plain estimator.
+    frames, lost_frames
+        Number of frames used, and lost by the camera.
     gain_sigma
-        Relative standard error of the gain that all elements share: an error of the temporal response,
-        which is scaled to sum 1, scales the whole matrix.
+        Relative standard error of the common gain, by the errors of the temporal response.
     response_covariance
-        Of the response's weights ``(lags, lags)``.
+        Covariance of the weights of the response ``(lags, lags)``.
     """
 
     matrix: NDArray[np.float64]
@@ -322,27 +315,27 @@ def solve_sums(
     frames: int,
     lost_frames: int,
 ) -> DocrimeSolution:
-    """The matrix, its standard errors and the temporal response that sums hold.
+    """Solve sums for the matrix, its standard errors and the temporal response.
 
     Parameters
     ----------
-    whole
-        Sums over all filtered frames, of slopes and of what the pokes made of them; not changed.
+    raw_sums
+        Sums over all filtered frames; not changed.
     tracker
-        Follows the temporal response over the same frames.
+        Temporal response over the same frames.
     whitener
-        The filter ``(order + 1,)``; one weight is none, and then nothing tells whether the mirror responds.
-    spread
+        Filter ``(order + 1,)``. With one weight only, the response is not tested for significance.
+    variance_inflation
         Factor on the variance of an estimate whose noise is not white.
     lags
-        Frames over which the temporal response was estimated.
+        Number of lags of the temporal response.
     frames, lost_frames
-        As the solution tells them.
+        Number of frames used and lost.
 
     Raises
     ------
     CalibrationError
-        The mirror does not respond, or the pokes do not span the modes.
+        The sensor does not respond significantly, or the pokes do not span the modes.
     """
     sums = raw_sums.subtract_means()
     information = sums.information()

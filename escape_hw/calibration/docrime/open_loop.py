@@ -1,4 +1,4 @@
-"""DO-CRIME in open loop: random pokes on every mode, under turbulence (paper; Lai et al. 2020)."""
+"""DO-CRIME in open loop: random pokes on all modes, under turbulence (paper; Lai et al. 2020)."""
 
 from __future__ import annotations
 
@@ -15,37 +15,30 @@ from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.checkpoint import Checkpoint
 from escape_hw.calibration.acquisition.frames import build_interaction_matrix, validate_frame_count
-from escape_hw.calibration.acquisition.pokes import PokeSequence, RandomPokes, select_random_pokes
-from escape_hw.calibration.acquisition.sensor_setup import (
-    SETUP_FRAMES,
-    build_modal_basis,
+from escape_hw.calibration.acquisition.pokes import (
+    PokeSequence,
+    RandomPokes,
     compute_random_amplitudes,
+    select_random_pokes,
 )
-from escape_hw.calibration.acquisition.stopping import (
-    RunMonitor,
-    StoppingCriterion,
-    Target,
-    reject_accuracy_target,
-)
+from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
+from escape_hw.calibration.acquisition.stopping import Target, reject_accuracy_target
 from escape_hw.calibration.docrime.acquisition import AcquisitionRecord, OpenLoopAcquisition
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 from escape_hw.calibration.docrime.fit import DocrimeSolution
+from escape_hw.calibration.docrime.monitor import RunMonitor, StoppingCriterion
+from escape_hw.calibration.docrime.regression import MAX_CORRELATED_SLOPES
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.config.system import CalibrationSection
 from escape_hw.errors import Aborted, TooFewFrames
 
-#: Slopes up to which the correlation of their noise is followed.
-MAX_CORRELATED_SLOPES = 3000
-#: Share of the response in its last frame beyond which one may doubt that it ends there.
+#: Share of the response in its last frame above which it may continue beyond.
 _TAIL_FRACTION = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DocrimeRun:
-    """A DO-CRIME run: the calibration, and the solution it came from.
-
-    ``record`` holds, when it was asked for, the frame indices ``(n,)``, slopes ``(n, n_slopes)`` and
-    pokes ``(n, n_modes)``.
-    """
+    """A DO-CRIME run: its calibration, the solution behind it, and its telemetry if it was recorded."""
 
     result: CalibrationResult
     solution: DocrimeSolution
@@ -66,11 +59,19 @@ def docrime_run(
     checkpoint: Checkpoint | None = None,
     criterion: StoppingCriterion | None = None,
 ) -> Procedure[DocrimeRun]:
-    """As :func:`docrime`, with the solution beside the matrix, and with the telemetry if asked for.
+    """Run :func:`docrime` and return also the solution.
 
-    The solution knows how the noise of the slopes is correlated unless ``correlations`` is false, or
-    there are more than :data:`MAX_CORRELATED_SLOPES` slopes. ``pattern`` makes the pokes, ``criterion`` says
-    when a solution will do.
+    Parameters
+    ----------
+    bench, frames, poke, whiten, grid, pattern, checkpoint
+        As for :func:`docrime`.
+    record
+        Whether to return the telemetry.
+    correlations
+        Whether to estimate the correlations of the slopes' noise, up to
+        :data:`~escape_hw.calibration.docrime.regression.MAX_CORRELATED_SLOPES` slopes.
+    criterion
+        Stopping criterion.
     """
     c = bench.config.calibration
     n_frames = c.frames if frames is None else validate_frame_count(frames)
@@ -82,21 +83,15 @@ def docrime_run(
     order, lags = c.whiten_order if whiten else 0, c.lags
 
     def estimator(n_slopes: int) -> DocrimeEstimator:
-        # Their number squared: with as many slopes as a pyramid has, gigabytes.
         with_correlations = correlations and n_slopes <= MAX_CORRELATED_SLOPES
         return DocrimeEstimator(
             n_slopes, m2c.shape[1], order=order, lags=lags, correlations=with_correlations
         )
 
     acquisition = OpenLoopAcquisition(
-        bench,
-        m2c,
-        grid,
-        min(SETUP_FRAMES, n_frames),
-        estimator,
-        store_samples=record,
-        monitor=RunMonitor(checkpoint, criterion),
-    )
+        bench, m2c, grid, min(SETUP_FRAMES, n_frames), estimator,
+        store_samples=record, monitor=RunMonitor(checkpoint, criterion),
+    )  # fmt: skip
     settings = {"poke": poke, "whiten": whiten, "correlations": correlations}
     state = None if checkpoint is None else checkpoint.begin(bench, pattern.method, m2c, settings)
     if state is not None:
@@ -126,7 +121,7 @@ def build_solution_matrix(
     method: str,
     **metrics: float | int | str,
 ) -> InteractionMatrix:
-    """The matrix of a solution with its provenance and metrics."""
+    """Build the interaction matrix of a solution with its provenance and metrics."""
     return build_interaction_matrix(
         bench, grid, m2c, solution.matrix, solution.sigma, method,
         frames=solution.frames, lost_frames=solution.lost_frames, delay_frames=solution.response.delay,
@@ -135,15 +130,15 @@ def build_solution_matrix(
 
 
 def collect_solution_notes(solution: DocrimeSolution, matrix: InteractionMatrix) -> list[str]:
-    """What to know of a solution before using it."""
+    """Notes on the quality of a solution."""
     notes = []
     if float(np.median(matrix.snr())) < 1:
         notes.append("the median mode has a signal-to-noise ratio below 1; use more frames or larger pokes")
     tail, error = solution.response.weights[-1], solution.response.sigma[-1]
     if abs(tail) > max(_TAIL_FRACTION, 4 * error):
         notes.append(
-            f"{tail:.0%} of the response come only {solution.response.weights.size - 1} frames after a "
-            "command, so some may come later still, which scales the matrix; raise calibration.lags"
+            f"{tail:.0%} of the response is in the last lag, {solution.response.weights.size - 1} frames "
+            "after a command; a part beyond it would scale the matrix: raise calibration.lags"
         )
     return notes
 
@@ -151,12 +146,12 @@ def collect_solution_notes(solution: DocrimeSolution, matrix: InteractionMatrix)
 def build_snr_criterion(
     bench: Bench, m2c: NDArray[np.float64], until: Target | None, method: str
 ) -> StoppingCriterion | None:
-    """Judges a solution by the signal-to-noise ratio asked for; ``None`` when none is.
+    """Build the stopping criterion of a target signal-to-noise ratio; ``None`` without a target.
 
     Raises
     ------
     ConfigError
-        A registration's accuracy is asked for, too: a matrix alone has none.
+        The target is an accuracy, which only a registration has.
     """
     reject_accuracy_target(until)
     if until is None:
@@ -172,7 +167,7 @@ def build_snr_criterion(
 def _result(
     acquisition: OpenLoopAcquisition, matrix: InteractionMatrix, solution: DocrimeSolution, partial: bool
 ) -> CalibrationResult:
-    """The matrix with all that the run taught about the sensor."""
+    """The calibration with the geometry improved by all frames."""
     seconds = (solution.frames + solution.lost_frames) / acquisition.bench.wfs.settings.frame_rate_hz
     return CalibrationResult(
         matrix,
@@ -198,52 +193,51 @@ def docrime(
     until: Target | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
-    """Measure the interaction matrix by random pokes, under turbulence or not.
+    """Measure the interaction matrix by random pokes, with or without turbulence.
 
-    The sensor's grid is found on the first frames of the run itself, so it costs no sky time.
+    The geometry of the sensor is found on the first frames of the run itself, which takes no extra sky time.
 
     Parameters
     ----------
     bench
         An open bench, loop open.
     frames
-        Frames to take; as configured by default.
+        Number of frames; by default as configured.
     poke
-        Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
+        Amplitude: pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
     whiten
-        Subtract what the past predicts of the turbulence; false gives the paper's plain estimator.
+        Whether to subtract the part of the turbulence that past frames predict; false for the paper's
+        estimator.
     grid
-        The sensor's grid, when it is known already.
+        Geometry of the sensor, if it is known.
     pattern
-        Other pokes than random ones: :class:`~escape_hw.calibration.acquisition.pokes.PushPullPokes` make it
-        a fast push-pull.
+        Poke sequence; :class:`~escape_hw.calibration.acquisition.pokes.PushPullPokes` for fast push-pull.
     until
-        Stop before that number of frames when this is reached.
-    keep
-        Where the state is kept meanwhile, and what to go on with.
+        Target at which the run stops before its number of frames.
+    checkpoint
+        Where the state is saved, and the state to resume from.
 
     Returns
     -------
     CalibrationResult
-        With the measured temporal response. Stopped early, ``partial`` is true.
+        With the measured temporal response. After an abort ``partial`` is true.
 
     Raises
     ------
     ConfigError
-        A number of frames or a poke that means nothing; nothing moved.
+        The number of frames, the poke or the target is out of range; nothing moved.
     TooFewFrames
         Too few frames for the number of modes; nothing moved.
     CalibrationError
         No spots or pupil images, no light, no response, or pokes that do not span the modes.
     ProductError
-        The state to go on with is damaged or of another run; nothing moved.
+        The state to resume from is damaged or of another run; nothing moved.
     Aborted
-        Stopped before a matrix could be solved.
+        Aborted before a matrix could be solved.
     """
     criterion = (
         None if until is None else build_snr_criterion(bench, build_modal_basis(bench), until, pattern.method)
     )
-    # Nobody asks a matrix how the noise of its slopes is correlated.
     run = yield from docrime_run(
         bench, frames=frames, poke=poke, whiten=whiten, grid=grid, correlations=False, pattern=pattern,
         checkpoint=checkpoint, criterion=criterion,
@@ -252,20 +246,14 @@ def docrime(
 
 
 def minimum_frames(settings: CalibrationSection, n_modes: int, whiten: bool = True) -> int:
-    """Fewest frames that a matrix is worth starting with: twice the unknowns per slope."""
+    """Fewest frames of a run: twice the number of unknowns per slope."""
     return 2 * (n_modes + (settings.whiten_order if whiten else 0) + settings.lags)
 
 
 def require_enough_frames(
     settings: CalibrationSection, frames: int, n_modes: int, whiten: bool = True
 ) -> None:
-    """Raise unless the frames are twice the unknowns per slope.
-
-    Raises
-    ------
-    TooFewFrames
-        Says how many are needed.
-    """
+    """Raise :class:`TooFewFrames` for fewer frames than :func:`minimum_frames`."""
     needed = minimum_frames(settings, n_modes, whiten)
     if frames < needed:
         raise TooFewFrames(

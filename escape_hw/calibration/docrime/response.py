@@ -1,4 +1,9 @@
-"""Temporal response of mirror and sensor (weight per frame of lag), estimated by instrumental variables from the run itself."""
+"""Temporal response of mirror and sensor (weight per frame of lag), by instrumental variables.
+
+With slopes ``y``, predictions ``x`` from a matrix and the commands, and predictions ``z`` from the matrix and
+the pokes, the weights of the lags solve ``sum_t z_l(t) (y(t) - sum_k w_k x_k(t)) = 0`` (Söderström & Stoica
+1983). They are scaled to sum 1; the rest is the gain of the matrix.
+"""
 
 from __future__ import annotations
 
@@ -11,28 +16,42 @@ from scipy.linalg import toeplitz
 
 from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
-from escape_hw.calibration.docrime.regression import N_SAMPLED_SLOPES, sampling_step
+from escape_hw.calibration.docrime.regression import N_SAMPLED_SLOPES, InstrumentalEquations, sampling_step
 from escape_hw.calibration.docrime.whitening import apply_filter
 from escape_hw.errors import CalibrationError
 
-#: Share of the largest singular value below which a direction counts as not seen: single precision ends here.
+#: Relative singular value below which a direction is not measured, in single precision.
 _RCOND = 1e-7
+#: Number of evenly spaced slopes from which the response is estimated.
+RESPONSE_SLOPES = N_SAMPLED_SLOPES
+#: Least share of a matrix's power that is taken for signal.
+_MIN_SIGNAL_FRACTION = 0.01
+#: Damping of a provisional matrix, since half of a short run may hold fewer frames than modes.
+_DAMPING = 1e-2
+#: Frames per lag from which the errors of later frames' weights are known.
+_MIN_FRAMES_PER_LAG = 40
+#: Frames beyond the lags in which a late response is searched.
+_EXTRA_LAGS = 8
+#: Standard errors and share of the response from which on a late response is significant.
+_MIN_SIGNIFICANCE, _MIN_FRACTION = 6.0, 0.25
+#: Standard errors by which two responses must differ, and the difference of a weight that is always allowed.
+_MAX_DIFFERENCE_SIGMA, _NEGLIGIBLE_DIFFERENCE = 6.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResponseEstimate:
-    """A temporal response with the covariance of its weights ``(lags, lags)``, whose errors sum to zero."""
+    """A temporal response: weights ``(lags,)`` of sum 1, and their covariance ``(lags, lags)``."""
 
     weights: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
     @property
     def response(self) -> TemporalResponse:
-        """With standard errors alone."""
+        """The response with standard errors instead of the covariance."""
         return TemporalResponse(self.weights, np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
     def combine_with(self, other: ResponseEstimate) -> ResponseEstimate:
-        """The mean of two independent estimates, weighed by their covariances."""
+        """Mean of two independent estimates, weighted by their covariances."""
         inverse_sum = np.linalg.pinv(self.covariance + other.covariance, rcond=_RCOND, hermitian=True)
         weight = self.covariance @ inverse_sum
         covariance = self.covariance - weight @ self.covariance
@@ -42,13 +61,11 @@ class ResponseEstimate:
 
 
 class LagSums:
-    """Weights of the lags by instrumental variables, and their errors.
+    """Sums over frames for the weights of the lags and their covariance; see the module.
 
-    With slopes ``y``, predictions ``x`` from the commands and ``z`` from the pokes, the instruments,
-    the weights solve ``sum_t z_l(t) (y(t) - sum_k w_k x_k(t)) = 0`` (Söderström & Stoica 1983). Each
-    frame's products ``z_l y`` and ``z_l x_k`` are summed, and so are the products of those with each
-    other: that gives the scores' covariance for whatever weights come out in the end (White 1980), in
-    which slopes may err together, but frames do not.
+    The products ``z_l y`` and ``z_l x_k`` of each frame are summed, and also the products of these with each
+    other. The latter give the covariance of the scores for any weights (White 1980), with errors that are
+    correlated between slopes and independent between frames.
 
     Parameters
     ----------
@@ -64,9 +81,9 @@ class LagSums:
     def add(
         self, slopes: NDArray[np.float32], predicted: NDArray[np.float32], instrument: NDArray[np.float32]
     ) -> Self:
-        """Add frames: slopes ``(n, n_slopes)``, predictions and instruments ``(n, lags, n_slopes)``, centred.
+        """Add frames: slopes ``(n, n_slopes)``, predictions and instruments ``(n, lags, n_slopes)``.
 
-        All predictions should have one scale: what they miss of the commands' motion is noise.
+        All arrays are centred, and all predictions have one scale.
         """
         regressors = np.concatenate([slopes[:, None], predicted], axis=1).transpose(0, 2, 1)
         products = np.matmul(instrument, regressors).reshape(len(slopes), -1).astype(np.float64)
@@ -76,27 +93,27 @@ class LagSums:
         return self
 
     def merge(self, other: LagSums) -> Self:
-        """Add the frames of another."""
+        """Add the sums of other frames."""
         for name, array in self.arrays().items():
             array += other.arrays()[name]
         return self
 
     def scale_covariance(self, factor: float) -> Self:
-        """Multiply the scores' covariance, for frames that do not err independently."""
+        """Multiply the covariance of the scores, for frames with dependent errors."""
         self._score_products *= factor
         return self
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """All sums by name, themselves and no copies: written into, they are restored."""
+        """The arrays of the sums by name; views, through which they can be restored."""
         return {"products": self._products, "squares": self._score_products, "frames": self._frames}
 
     @property
     def count(self) -> int:
-        """Frames added."""
+        """Number of frames."""
         return int(self._frames[0])
 
     def weights(self) -> NDArray[np.float64]:
-        """Weights of the lags as regressed, of any scale ``(lags,)``."""
+        """Weights of the lags, not scaled ``(lags,)``."""
         right_hand_side, bread = self._solve_normal_equations()
         return np.asarray(bread @ right_hand_side)
 
@@ -106,7 +123,7 @@ class LagSums:
         weights = bread @ right_hand_side
         total = weights.sum()
         score = np.kron(np.eye(self._lags), np.concatenate([[1.0], -weights]))
-        # Scaled to sum 1, a weight errs with all others: d(w / sum) = (1 - w 1^T) dw / sum.
+        # d(w / sum) = (1 - w 1^T) dw / sum.
         scaled = (np.eye(self._lags) - (weights / total)[:, None]) @ bread @ score / total
         return ResponseEstimate(weights / total, scaled @ self._score_products @ scaled.T)
 
@@ -116,27 +133,19 @@ class LagSums:
         return table[:, 0], np.asarray(np.linalg.pinv(table[:, 1:], rcond=_RCOND))
 
 
-#: Slopes that the response is estimated from, evenly spread; more tell little and take time.
-RESPONSE_SLOPES = N_SAMPLED_SLOPES
-#: Share of a matrix's power that is taken for signal at least.
-_MIN_SIGNAL_FRACTION = 0.01
-#: Frames per lag without which the later frames' errors are not known.
-_MIN_FRAMES_PER_LAG = 40
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FilteredTelemetry:
-    """Filtered telemetry.
+    """Slopes, commands and pokes filtered over time.
 
     Parameters
     ----------
     rows
-        Filtered slopes and commands ``(n_rows, n_slopes + n_modes)``, in closed loop with the filtered
-        pokes beside them.
+        Filtered slopes and commands ``(n_rows, n_slopes + n_modes)``, in closed loop with the filtered pokes
+        beside them.
     now
-        Rows whose slopes and whose commands of all lags are known ``(n,)``, rising.
+        Usable rows: their slopes and their commands of all lags are known ``(n,)``, increasing.
     n_slopes, n_modes
-        How many columns are slopes, and how many commands.
+        Number of columns with slopes, and with commands.
     """
 
     rows: NDArray[np.float32]
@@ -161,45 +170,45 @@ class FilteredTelemetry:
 
     @property
     def closed(self) -> bool:
-        """Whether commands hold more than pokes."""
+        """Whether the telemetry is of a closed loop."""
         return bool(self.rows.shape[1] > self.n_slopes + self.n_modes)
 
     def rows_before(self, lag: int) -> NDArray[np.float32]:
-        """The rows ``lag`` rows before the usable ones."""
+        """Rows that precede the usable ones by ``lag`` rows."""
         return shift_rows(self.rows, self.now, lag)
 
     def excitation(self, response: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Commands as the usable rows' slopes saw them ``(n, n_modes)``, pokes beside them in closed loop."""
+        """Commands through a response at the usable rows ``(n, n_modes)``; in closed loop also pokes."""
         return apply_filter(self.rows, response, self.now, self.n_slopes)
 
 
 def shift_rows(rows: NDArray[np.float32], now: NDArray[np.intp], lag: int) -> NDArray[np.float32]:
-    """``rows[now - lag]``; a view where ``now`` is unbroken."""
+    """``rows[now - lag]``; a view if ``now`` is contiguous."""
     if now.size and now[-1] - now[0] + 1 == now.size:
         return rows[now[0] - lag : now[-1] - lag + 1]
     return rows[now - lag]
 
 
 def find_usable_rows(data: AlignedTelemetry, order: int, lags: int) -> NDArray[np.intp]:
-    """Rows whose filtered slopes and filtered pokes of all lags are known."""
+    """Rows whose filtered slopes and whose filtered commands of all lags are known."""
     return data.find_complete_rows(order, lags + order)
 
 
 def filter_telemetry(
     data: AlignedTelemetry, whitener: NDArray[np.float64], lags: int, start: int = 0
 ) -> FilteredTelemetry:
-    """Filter slopes and pokes alike.
+    """Filter slopes, commands and pokes over time.
 
     Parameters
     ----------
     data
-        Slopes and pokes.
+        Telemetry.
     whitener
-        Filter over time.
+        Filter ``(order + 1,)``.
     lags
-        Lags that must be known.
+        Number of lags whose commands must be known.
     start
-        First row whose slopes are wanted.
+        First row whose slopes are needed.
     """
     order = whitener.size - 1
     at = find_usable_rows(data, order, lags)
@@ -210,13 +219,13 @@ def filter_telemetry(
 
 
 def compute_lag_covariances(data: FilteredTelemetry, lags: int) -> NDArray[np.float64]:
-    """Sums of the filtered commands ``l`` rows ago times the pokes ``k`` rows ago.
+    """Sums of the filtered commands at lag ``l`` times the filtered pokes at lag ``k``.
 
     Returns
     -------
     ndarray, ``(1, lags, lags)`` or ``(n_modes, lags, lags)``
-        Element ``[., l, k]``. In open loop every mode's pokes have the same spectrum, and one serves
-        all; in closed loop the controller gives each mode its own.
+        Element ``[., l, k]``. In open loop the pokes of all modes have the same spectrum; in closed loop the
+        controller gives each mode its own.
     """
     commands = np.stack([shift_rows(data.commands, data.now, lag) for lag in range(lags)])
     if not data.closed:
@@ -229,27 +238,27 @@ def compute_lag_covariances(data: FilteredTelemetry, lags: int) -> NDArray[np.fl
 
 
 def fit_response(data: AlignedTelemetry, whitener: NDArray[np.float64], lags: int) -> ResponseEstimate:
-    """Share of the final response in each of the frames after a command.
+    """Estimate the share of the response in each of the frames after a command.
 
-    Every slope answers to the same few lags, so the lags are regressed on what a provisional matrix
-    predicts. That matrix is noisy. Fitted to the same frames, its noise would pass for response at
-    the neighbouring lags; the frames are therefore cut in half, and the matrix of one half predicts
-    the other (its noise then only scales all lags alike, and the weights are scaled to sum 1). In
-    closed loop the pokes are the instruments of the commands, for the matrix and for the lags alike.
+    All slopes respond with the same weights, so the weights are regressed on the predictions of a provisional
+    matrix. Fitted to the same frames, the noise of that matrix would be taken for a response at neighbouring
+    lags. The frames are therefore cut in half, and the matrix of one half predicts the other. Its noise then
+    scales all weights alike, and they are scaled to sum 1. In closed loop the pokes are the instruments of
+    the commands, for the matrix and for the weights.
 
     Parameters
     ----------
     data
-        Frames and pokes; enough rows for a matrix in each half (see :func:`find_usable_rows`).
+        Telemetry with enough rows for a matrix in each half (see :func:`find_usable_rows`).
     whitener
-        Filter over time for slopes and pokes alike.
+        Filter over time ``(order + 1,)``.
     lags
         Number of lags.
 
     Returns
     -------
     ResponseEstimate
-        Its errors hold for turbulence that moves neighbouring slopes together.
+        Its errors allow for correlations between slopes.
     """
     sums = LagSums(lags)
     for part in fit_halves(filter_telemetry(data.select_slopes(RESPONSE_SLOPES), whitener, lags), lags):
@@ -260,27 +269,27 @@ def fit_response(data: AlignedTelemetry, whitener: NDArray[np.float64], lags: in
 def predict_slopes(
     data: FilteredTelemetry, matrix: NDArray[np.float32], power: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What a noisy matrix makes of commands and pokes, of all rows ``(n_rows, n_slopes)``, centred.
+    """Predict the slopes from commands and from pokes with a noisy matrix.
 
-    Noise makes a matrix longer and tells nothing. With ``c`` the power of its answer to the pokes without
-    its noise and ``v`` that with it, what it makes of the pokes weighs best by ``sqrt(c) / v``, whatever the
-    matrix's own scale. Where each mode's commands have a spectrum of their own, in closed loop, the noisy
-    modes' would count too much in what is predicted, and the lags be mistaken: there each mode is
-    shortened to what its noise leaves of it.
+    With ``c`` the power of the response to the pokes without the noise of the matrix and ``v`` that with it,
+    ``sqrt(c) / v`` is the best weight of the predictions from the pokes. In closed loop, where the commands
+    of each mode have their own spectrum, noisy modes would weigh too much and bias the lags. There each mode
+    is shrunk by the ratio of its power without and with noise.
 
     Parameters
     ----------
     data
         Filtered telemetry.
     matrix
-        Any matrix that owes nothing to the noise of these frames ``(n_modes, n_slopes)``.
+        Matrix whose errors are independent of the noise of these frames ``(n_modes, n_slopes)``.
     power
         Sum of squares of each mode's column without its noise ``(n_modes,)``.
 
     Returns
     -------
-    made, poked : ndarray
-        One and the same in open loop.
+    predicted, instrument : ndarray
+        Predictions from commands and from pokes for all rows ``(n_rows, n_slopes)``, centred; the same array
+        in open loop.
     """
     noisy_power = np.square(matrix, dtype=np.float64).sum(axis=1)
     poke_power = np.mean(np.square(data.pokes), axis=0, dtype=np.float64)
@@ -298,19 +307,18 @@ def predict_slopes(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HalfFit:
-    """One half of a stretch of frames, and what the matrix of the other half makes of it.
+    """One half of some frames, and the predictions by the matrix of the other half.
 
     Parameters
     ----------
     slopes
         Slopes of the half's rows ``(n, n_slopes)``.
     predicted, instrument
-        What the other half's matrix makes of the commands and of the pokes alone, of all rows
-        ``(n_rows, n_slopes)``, of any scale.
+        Predictions from commands and from pokes for all rows ``(n_rows, n_slopes)``, of any scale.
     now
-        Where the half's rows stand among all ``(n,)``.
+        Indices of the half's rows among all ``(n,)``.
     sums
-        Regression of the slopes on what is predicted.
+        Regression of the slopes on the predictions.
     """
 
     slopes: NDArray[np.float32]
@@ -321,12 +329,11 @@ class HalfFit:
 
 
 def fit_halves(sampled: FilteredTelemetry, lags: int) -> list[HalfFit]:
-    """Both halves of some filtered frames, each seen with the matrix of the other."""
-    slopes, commands = (
-        sampled.slopes - sampled.slopes.mean(axis=0),
-        sampled.commands - sampled.commands.mean(axis=0),
-    )
-    pokes, now = sampled.pokes - sampled.pokes.mean(axis=0) if sampled.closed else commands, sampled.now
+    """Regress the slopes of each half of some frames on the predictions by the matrix of the other."""
+    now = sampled.now
+    slopes = sampled.slopes - sampled.slopes.mean(axis=0)
+    commands = sampled.commands - sampled.commands.mean(axis=0)
+    pokes = sampled.pokes - sampled.pokes.mean(axis=0) if sampled.closed else commands
     best_lag = _find_strongest_lag(slopes, pokes, now, lags)
     middle = now.size // 2
     parts = [slice(0, middle), slice(middle, now.size)]
@@ -336,7 +343,7 @@ def fit_halves(sampled: FilteredTelemetry, lags: int) -> list[HalfFit]:
         )
         for part in parts
     ]
-    # The noise of one half knows nothing of the other's.
+    # The noise of the two halves is independent.
     power = np.einsum("ms,ms->m", *matrices, dtype=np.float64)
     fits = []
     for matrix, part in zip(matrices, parts[::-1], strict=True):
@@ -344,7 +351,7 @@ def fit_halves(sampled: FilteredTelemetry, lags: int) -> list[HalfFit]:
         sums = LagSums(lags).add(
             slopes[part], stack_lags(predicted, now[part], lags), stack_lags(instrument, now[part], lags)
         )
-        # The noise of either half's matrix is also in the other half's slopes: errors of both are shared.
+        # The noise of each half enters both results: in its slopes, and in the other's predictions.
         signal = float(power.sum() / max(np.square(matrix, dtype=np.float64).sum(), 1e-300))
         sums.scale_covariance(2 - float(np.clip(signal, 0, 1)))
         fits.append(HalfFit(slopes[part], predicted, instrument, now[part], sums))
@@ -366,40 +373,37 @@ def _find_strongest_lag(
 def _instrumental_matrix(
     slopes: NDArray[np.float32], commands: NDArray[np.float32], pokes: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Matrix ``(n_modes, n_slopes)``, pokes being the instruments of the commands."""
-    link = pokes.T @ commands
-    # Half a short run may hold fewer frames than modes; a little damping keeps the matrix finite.
-    link[np.diag_indices_from(link)] += 1e-2 * np.trace(link) / len(link)
-    return np.asarray(np.linalg.solve(link, pokes.T @ slopes))
+    """Damped matrix ``(n_modes, n_slopes)`` with pokes as instruments of the commands."""
+    return InstrumentalEquations.from_rows(slopes, commands, pokes).solve(_DAMPING).T
 
 
 class ResponseTracker:
-    """Keeps estimating the temporal response while a run goes on.
+    """Estimates the temporal response during a run.
 
-    The matrix of all frames so far predicts the next ones, whose noise knows nothing of it.
+    The matrix of all frames so far predicts the next ones, whose noise is independent of its errors.
 
     Parameters
     ----------
     first
-        Response of the first frames, through which the commands of the matrix are seen.
+        Response of the first frames, which the sums of the matrix assume.
     spectra
-        From :func:`compute_lag_covariances`, of the first frames.
+        Output of :func:`compute_lag_covariances` for the first frames.
     """
 
     def __init__(self, first: ResponseEstimate, spectra: NDArray[np.float64]) -> None:
         self._first, self._spectra = first, spectra
-        #: Of the frames after the first, whose matrices have one scale.
+        #: Sums of the frames after the first ones.
         self._sums = LagSums(first.weights.size)
 
     def add(self, data: FilteredTelemetry, matrix: NDArray[np.float64], power: NDArray[np.float64]) -> None:
-        """Take a block of filtered slopes and commands, with the rows of the lags before it.
+        """Add a block of filtered telemetry, with the rows of the lags before it.
 
         Parameters
         ----------
         data
             The block.
         matrix
-            Of the frames before it ``(n_few, n_modes)``, of the slopes that ``RegressionSums.some`` has.
+            Matrix of the frames before it for the sampled slopes ``(n_few, n_modes)``.
         power
             As for :func:`predict_slopes`.
         """
@@ -412,75 +416,69 @@ class ResponseTracker:
         self._spectra += compute_lag_covariances(data, lags)
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """What it has gathered by name, themselves and no copies: written into, they are restored."""
+        """The arrays of its sums by name; views, through which they can be restored."""
         return {"spectra": self._spectra, **self._sums.arrays()}
 
     def response(self) -> ResponseEstimate:
-        """The response of all rows so far."""
+        """The response by all frames so far."""
         if self._sums.count < _MIN_FRAMES_PER_LAG * self._first.weights.size:
             return self._first
         return self._first.combine_with(self._sums.response())
 
     def scale(self, response: ResponseEstimate) -> NDArray[np.float64]:
-        """Factors on the columns of a matrix whose commands were seen through the assumed response.
+        """Factors on the columns of the matrix that correct the response assumed in its sums.
 
-        Every slope answers through the same response, so seeing a mode's commands through a slightly
-        wrong one only scales its column: by one factor where all modes' pokes have one spectrum.
+        All slopes respond with the same weights, so an error of the assumed response scales the columns: by a
+        common factor if the pokes of all modes have the same spectrum.
         """
         seen_spectra = self._spectra @ self._first.weights
         return np.asarray((seen_spectra @ self._first.weights) / (seen_spectra @ response.weights))
 
     def gain_sigma(self, response: ResponseEstimate) -> float:
-        """Standard error of the factor that the response's errors put on all of a matrix."""
+        """Standard error of the factor on the whole matrix by the errors of the response."""
         seen_spectra = self._spectra.mean(axis=0) @ self._first.weights
         variance = max(float(seen_spectra @ response.covariance @ seen_spectra), 0.0)
         return float(np.sqrt(variance)) / abs(float(response.weights @ seen_spectra))
 
 
-#: Frames beyond the lags in which an answer is looked for.
-_EXTRA_LAGS = 8
-#: Standard errors by which it must stand out, and its least share of the response that was found.
-_MIN_SIGNIFICANCE, _MIN_FRACTION = 6.0, 0.25
-
-
 def require_no_late_response(data: AlignedTelemetry, whitener: NDArray[np.float64], lags: int) -> None:
-    """Refuse to go on with too few lags, which would give a matrix that is wrong and looks sound.
+    """Raise if the sensor responds after the last lag, which would bias the matrix unnoticed.
 
-    Whitened pokes are correlated from frame to frame, so a response later than all lags still shows in
-    them, with the wrong size or even sign. What such a response leaves in the slopes goes with the pokes
-    of the later lags, and noise does not.
+    Whitened pokes are correlated from frame to frame, so a response after the last lag appears in the matrix
+    with the wrong size or sign. Its remainder in the slopes is correlated with the pokes of later lags; noise
+    is not.
 
     Parameters
     ----------
     data
-        Frames and pokes.
+        Telemetry.
     whitener
-        Filter over time.
+        Filter over time ``(order + 1,)``.
     lags
         Number of lags of the temporal response.
 
     Raises
     ------
     CalibrationError
-        There is an answer after the last lag; says when.
+        The sensor responds after the last lag; the message says when.
     """
     parts = fit_halves(
         filter_telemetry(data.select_slopes(RESPONSE_SLOPES), whitener, lags + _EXTRA_LAGS), lags
     )
     late_responses = np.array([_late_response(part, lags) for part in parts])
     fraction, significance = late_responses[:, 0], late_responses[:, 1]
-    # The same lag in both halves, each with the matrix of the other.
+    # The same lag must be significant in both halves.
     is_late = (np.abs(fraction).min(axis=0) > _MIN_FRACTION) & (significance.min(axis=0) > _MIN_SIGNIFICANCE)
     if is_late.any():
         lag = lags + int(np.argmax(np.where(is_late, np.abs(fraction).min(axis=0), 0.0)))
         raise CalibrationError(
-            f"the sensor answers pokes {lag} frames after they were sent, later than calibration.lags = "
-            f"{lags} frames can tell; set calibration.lags to at least {lag + 3}"
+            f"the sensor responds to pokes {lag} frames after they were sent, beyond calibration.lags = "
+            f"{lags} frames; set calibration.lags to at least {lag + 3}"
         )
 
 
 def _late_response(part: HalfFit, lags: int) -> NDArray[np.float64]:
-    """For each later lag, its share of the response found, and by how many standard errors ``(2, n)``."""
+    """Share of the response and significance in standard errors for each later lag ``(2, n)``."""
     residuals, weights = part.slopes.astype(float), part.sums.weights()
     for lag, weight in enumerate(weights):
         residuals -= weight * shift_rows(part.predicted, part.now, lag)
@@ -488,7 +486,81 @@ def _late_response(part: HalfFit, lags: int) -> NDArray[np.float64]:
     size *= np.abs(weights).max()
     rows = []
     for lag in range(lags, lags + _EXTRA_LAGS):
-        # Neighbouring slopes err together, frames (whitened) do not.
+        # Errors are correlated between slopes, and (whitened) independent between frames.
         scores = np.einsum("ts,ts->t", shift_rows(part.instrument, part.now, lag), residuals)
         rows.append([scores.sum() / size, abs(scores.sum()) / np.sqrt(np.square(scores).sum())])
     return np.array(rows).T
+
+
+class ResponseAccumulator:
+    """Temporal response from pokes in a running loop, for as long as it runs.
+
+    Slopes are regressed on the predictions of a matrix from the commands, with its predictions from the pokes
+    as instruments.
+
+    Parameters
+    ----------
+    lags
+        Number of lags.
+    """
+
+    def __init__(self, lags: int) -> None:
+        self._sums, self._lags = LagSums(lags), lags
+        self._auto = np.zeros((lags, lags))
+
+    def add(self, block: FilteredTelemetry, matrix: NDArray[np.float64]) -> None:
+        """Add a block of filtered telemetry with the rows of the lags before it.
+
+        Parameters
+        ----------
+        block
+            Telemetry of a closed loop.
+        matrix
+            The best known matrix ``(n_slopes, n_modes)``.
+        """
+        stride = sampling_step(block.n_slopes)
+        sampled_matrix = matrix[::stride].T.astype(np.float32)
+        command_slopes = stack_lags(block.commands @ sampled_matrix, block.now, self._lags)
+        poke_slopes = stack_lags(block.pokes @ sampled_matrix, block.now, self._lags)
+        slopes = block.slopes[:, ::stride]
+        slopes = slopes - slopes.mean(axis=0)
+        inverse_variance = 1 / np.maximum(slopes.var(axis=0), 1e-12 * float(slopes.var()) + 1e-30)
+        instruments = (poke_slopes - poke_slopes.mean(axis=0)) * inverse_variance
+        self._sums.add(slopes, command_slopes - command_slopes.mean(axis=0), instruments)
+        self._auto += np.einsum("tls,tks->lk", instruments, poke_slopes, optimize=True)
+
+    def response(self, known: TemporalResponse | None) -> TemporalResponse:
+        """The measured response, or the known one while its errors are smaller and the two agree."""
+        if not self._auto.any():
+            if known is None:
+                raise RuntimeError("no frames yet, and no response is known")
+            return known
+        return select_response(self._sums.response().response, known)
+
+    def gain_sigma(self, response: TemporalResponse) -> float:
+        """Relative error of the gain of a matrix by the errors of the response."""
+        if not self._auto.any():
+            return 0.0
+        weighted_auto = self._auto @ response.weights
+        power = float(response.weights @ weighted_auto)
+        # The errors of the weights sum to zero, so only deviations from the mean of the lags count.
+        spread = float(np.sqrt(np.square((weighted_auto - power) * response.sigma).sum()))
+        return spread / max(abs(power), 1e-300)
+
+
+def select_response(measured: TemporalResponse, known: TemporalResponse | None) -> TemporalResponse:
+    """The known response if its errors are smaller and it agrees with the measured one, else the latter."""
+    if (
+        known is not None
+        and known.sigma.max() < measured.sigma.max()
+        and not responses_differ(measured, known)
+    ):
+        return known
+    return measured
+
+
+def responses_differ(measured: TemporalResponse, known: TemporalResponse) -> bool:
+    """Whether two responses differ by more than their errors explain."""
+    errors = np.hypot(measured.sigma, known.sigma)
+    difference = np.abs(measured.weights - known.weights)
+    return bool((difference > np.maximum(_MAX_DIFFERENCE_SIGMA * errors, _NEGLIGIBLE_DIFFERENCE)).any())

@@ -1,9 +1,8 @@
-"""Whitening: a filter over time that takes out what the past predicts of the turbulence.
+"""Prediction-error filters that whiten the turbulence over time (Cochrane & Orcutt 1949).
 
-Pokes are independent of the past, so whatever the past predicts of the present slopes may be
-subtracted without bias. The filter is the prediction-error filter of the slopes' own residuals
-(feasible generalised least squares, Cochrane & Orcutt 1949); frame differencing is its simplest
-case.
+Pokes are independent of the past, so the part of the present slopes that the past predicts is subtracted
+without bias. The filter is estimated from the residuals of the slopes (feasible generalised least squares);
+frame differencing is its simplest case.
 """
 
 from __future__ import annotations
@@ -16,22 +15,21 @@ from numpy.typing import NDArray
 def fit_prediction_error_filter(
     residuals: NDArray[np.float32], present: NDArray[np.bool_], order: int
 ) -> NDArray[np.float64]:
-    """Prediction-error filter common to all slopes.
+    """Estimate the prediction-error filter common to all slopes.
 
-    Least squares of every row on the rows before it, summed over the slopes, on rows whose past is
-    complete (the covariance method: with turbulence this smooth, sums over unequal rows, as in the
-    Yule-Walker equations, would spoil the filter as soon as frames are lost). One filter for all
-    slopes keeps generalised and ordinary least squares equal across slopes, whatever their
-    correlation (Zellner 1962: equal regressors).
+    Least squares of every row on the rows before it, summed over the slopes, on rows whose past is complete
+    (covariance method). Sums over unequal rows, as in the Yule-Walker equations, would make the filter
+    inaccurate when frames are lost, since turbulence is smooth. One filter for all slopes keeps generalised
+    and ordinary least squares equal across slopes for any correlation (Zellner 1962: equal regressors).
 
     Parameters
     ----------
     residuals
-        ``(n_times, n_slopes)``; rows where ``present`` is false are ignored.
+        ``(n_times, n_slopes)``.
     present
-        ``(n_times,)``.
+        ``(n_times,)``; rows where it is false are ignored.
     order
-        Number of past frames used.
+        Number of past frames.
 
     Returns
     -------
@@ -52,7 +50,7 @@ def fit_prediction_error_filter(
     covariance = history @ history.T
     if covariance[0, 0] <= 0:
         return np.asarray(np.eye(1, order + 1)[0])
-    # A whisper of white noise keeps the system well conditioned when the slopes are noise-free.
+    # White noise that keeps the system well conditioned with noise-free slopes.
     covariance[np.diag_indices(order + 1)] *= 1 + 1e-6
     return np.concatenate([[1.0], -np.linalg.solve(covariance[1:, 1:], covariance[1:, 0])])
 
@@ -60,19 +58,18 @@ def fit_prediction_error_filter(
 def apply_filter(
     values: NDArray[np.floating], weights: NDArray[np.float64], at: NDArray[np.intp], column: int = 0
 ) -> NDArray[np.float32]:
-    """Filtered rows ``sum_k weights[k] values[at - k]`` in single precision.
+    """Filter rows in single precision: ``sum_k weights[k] values[at - k]``.
 
     Parameters
     ----------
     values
         ``(n_times, n)``.
     weights
-        The filter, latest first.
+        Filter, latest row first.
     at
-        Rows wanted; they rise. All rows between the first and the last are filtered, and those not
-        wanted dropped.
+        Indices of the rows to return, increasing. All rows between the first and the last are computed.
     column
-        First column wanted.
+        First column to return.
 
     Returns
     -------
@@ -82,7 +79,7 @@ def apply_filter(
     if not at.size:
         return np.empty((0, source.shape[1] - column), np.float32)
     first, n = int(at[0]), int(at[-1] - at[0]) + 1
-    # Whole quads of taps: one pass over a row serves four.
+    # A multiple of four taps, which one pass over a row applies together.
     taps = np.zeros(-(-weights.size // 4) * 4, np.float32)
     taps[: weights.size] = weights
     out = np.empty((n, source.shape[1] - column), np.float32)
@@ -93,11 +90,11 @@ def apply_filter(
 def fit_history_filters(
     residuals: NDArray[np.float32], present: NDArray[np.bool_], order: int
 ) -> list[NDArray[np.float64]]:
-    """Prediction-error filters for every number of known past frames, ``order + 1`` of them.
+    """Estimate prediction-error filters for 0 to ``order`` known past frames.
 
-    Each is scaled so that what it leaves has the variance of what the longest leaves: rows with a short
-    past then stand beside the others with their due weight. Together they whiten a stretch of any
-    length without giving up its first frames, as the Cholesky factor of its covariance over time would.
+    Each is scaled so that its residuals have the variance of those of the longest filter, which gives rows
+    with a short past their proper weight. Together they whiten a stretch of any length including its first
+    frames, like the Cholesky factor of its covariance over time.
 
     Parameters
     ----------
@@ -120,7 +117,7 @@ def fit_history_filters(
 
 
 def count_known_history(present: NDArray[np.bool_], order: int) -> NDArray[np.intp]:
-    """How many frames in a row are known before each one, at most ``order``; -1 where the frame is lost."""
+    """Number of consecutive frames known before each one, at most ``order``; -1 where the frame is lost."""
     history, running = np.full(present.size, -1, np.intp), 0
     for t in np.flatnonzero(present):
         running = running + 1 if t and present[t - 1] else 0
@@ -131,16 +128,16 @@ def count_known_history(present: NDArray[np.bool_], order: int) -> NDArray[np.in
 def apply_history_filters(
     values: NDArray[np.floating], filters: list[NDArray[np.float64]], history: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """Rows filtered by as much past as they have, in time order ``(n_usable, n)``.
+    """Filter each row with its known past rows; returns the usable rows in time order ``(n_usable, n)``.
 
     Parameters
     ----------
     values
         ``(n_times, n)``.
     filters
-        From :func:`fit_history_filters`; with more than one, rows without a past are left out.
-    past
-        From :func:`count_known_history`, no more than there are filters for.
+        Output of :func:`fit_history_filters`; with more than one, rows without a past are left out.
+    history
+        Output of :func:`count_known_history` for at most as many past frames.
     """
     usable = history >= min(1, len(filters) - 1)
     out = np.empty((history.size, values.shape[1]))
@@ -162,11 +159,11 @@ def _filter_rows(
 @njit(cache=True, fastmath=True, nogil=True)
 def _filter(values, taps, first, column, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     for t in range(out.shape[0]):
-        # Whole rows as slices, else the compiler does not see that it may take many columns at once.
+        # Rows as slices, so that the compiler vectorises over columns.
         row = out[t]
         for k in range(0, taps.size, 4):
             a, b, c, d = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
-            # Taps that only fill the last quad may reach before the first row; they weigh nothing.
+            # Padding taps may refer to rows before the first; their weight is zero.
             now = first + t - k
             va, vb = values[max(now, 0), column:], values[max(now - 1, 0), column:]
             vc, vd = values[max(now - 2, 0), column:], values[max(now - 3, 0), column:]

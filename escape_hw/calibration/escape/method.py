@@ -12,7 +12,6 @@ from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.checkpoint import Checkpoint
-from escape_hw.calibration.acquisition.sensor_setup import build_modal_basis
 from escape_hw.calibration.acquisition.stopping import Target
 from escape_hw.calibration.docrime.closed_loop import docrime_closed_run
 from escape_hw.calibration.docrime.fit import DocrimeSolution
@@ -22,6 +21,7 @@ from escape_hw.calibration.escape.short_runs import (
     calibrate_short_run_closed_loop,
     fit_recorded_frames,
 )
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.sprint.fit import estimate_registration, sprint_options_from_config
 from escape_hw.calibration.sprint.solvers import MATRIX_ONLY_SOLVERS
 from escape_hw.calibration.sprint.synthetic_matrix import synthesise_calibration

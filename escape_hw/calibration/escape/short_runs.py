@@ -13,23 +13,19 @@ from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import (
-    SlopeStatistics,
     build_interaction_matrix,
-    next_frame,
     validate_frame_count,
 )
-from escape_hw.calibration.acquisition.pokes import select_random_pokes
-from escape_hw.calibration.acquisition.sensor_setup import (
-    SETUP_FRAMES,
-    build_modal_basis,
-    build_slope_function,
-    compute_random_amplitudes,
-    prepare_sensor,
-)
+from escape_hw.calibration.acquisition.pokes import compute_random_amplitudes, select_random_pokes
+from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
+from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry, TelemetryBuffer
 from escape_hw.calibration.docrime.acquisition import AcquisitionRecord, OpenLoopAcquisition
-from escape_hw.calibration.loop.performance import build_integrator, collect_loop_notes
-from escape_hw.calibration.loop.runner import SETTLING_S, RunningLoop, require_not_diverged
+from escape_hw.calibration.loop.control import build_integrator
+from escape_hw.calibration.loop.divergence import require_not_diverged
+from escape_hw.calibration.loop.performance import collect_loop_notes
+from escape_hw.calibration.loop.runner import RunningLoop
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.sprint.synthetic_matrix import synthesise_calibration
 from escape_hw.calibration.sprint.telemetry_fit import (
     MIN_WHITENED_FRAMES,
@@ -231,8 +227,7 @@ def calibrate_short_run_closed_loop(
     c = bench.config.calibration
     order, poke = whitening_order_for(c, frames), c.poke if poke is None else poke
     control = build_integrator(bench, closed_loop.matrix, closed_loop.grid)
-    prepare_sensor(bench)
-    loop = RunningLoop(bench, closed_loop.matrix.m2c, build_slope_function(bench, closed_loop.grid), control)
+    loop = RunningLoop.prepare(bench, closed_loop.matrix, closed_loop.grid, control)
     past = 2 * c.whiten_order + c.lags
     buffer = TelemetryBuffer(closed_loop.grid.n_slopes, closed_loop.matrix.n_modes, past + frames, past)
     slope_statistics = SlopeStatistics(closed_loop.grid.n_slopes)
@@ -268,23 +263,19 @@ def _record_frames(
     bench = loop.bench
     amplitude = compute_random_amplitudes(bench, loop.m2c, poke)
     pokes = select_random_pokes(bench.config.calibration.pokes)(amplitude, bench.rng)
-    settling_frames = max(int(SETTLING_S * bench.wfs.settings.frame_rate_hz) - past, 0)
+    settling_frames = max(loop.settling_frames - past, 0)
     stage = f"{pokes.title} in closed loop"
-    bench.dm.flatten()
-    # One frame first: what the camera lost while nobody read it is not a loss of the loop.
-    next_frame(bench)
-    try:
-        yield from loop.run(settling_frames, report=Reporter("closing the loop", settling_frames))
-        yield from loop.run(past, observe=(buffer,), report=Reporter("closing the loop", past))
-        observers = (buffer, lambda _index, slopes, _command, _poke: slope_statistics.add(slopes))
-        yield from loop.run(frames, inject=pokes, observe=observers, report=Reporter(stage, frames))
-    except Aborted:
-        raise Aborted(
-            f"aborted after {loop.record.frames} of {settling_frames + past + frames} frames, too few for a "
-            "registration"
-        ) from None
-    finally:
-        bench.dm.flatten()
+    with loop.closed():
+        try:
+            yield from loop.settle(settling_frames)
+            yield from loop.settle(past, observe=(buffer,))
+            observers = (buffer, lambda _index, slopes, _command, _poke: slope_statistics.add(slopes))
+            yield from loop.run(frames, inject=pokes, observe=observers, report=Reporter(stage, frames))
+        except Aborted:
+            raise Aborted(
+                f"aborted after {loop.record.frames} of {settling_frames + past + frames} frames, too few for a "
+                "registration"
+            ) from None
     require_not_diverged(loop.record)
 
 

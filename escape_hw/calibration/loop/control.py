@@ -1,31 +1,73 @@
-"""What is asked of a loop that runs: another gain, leak, matrix, or to open; from any thread."""
+"""The integrator of a matrix, and settings of a running loop that any thread may change."""
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.results import CalibrationResult
-from escape_hw.api.sensor import SlopeFunction
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function
-from escape_hw.calibration.loop.performance import build_integrator
-from escape_hw.errors import ConfigError
+from escape_hw.errors import ConfigError, IncompatibleProduct
 from escape_hw.pipeline.control.integrator import LeakyIntegrator
+from escape_hw.pipeline.control.reconstructor import reconstructor
+
+
+def build_integrator(
+    bench: Bench,
+    matrix: InteractionMatrix,
+    grid: SensorGeometry,
+    *,
+    gain: float | None = None,
+    leak: float | None = None,
+    dropped_modes: int | None = None,
+) -> LeakyIntegrator:
+    """Build the leaky integrator that closes the loop with a matrix; nothing moves.
+
+    Parameters
+    ----------
+    bench
+        Bench whose configuration gives the default loop parameters.
+    matrix, grid
+        Interaction matrix, and the sensor geometry that it was measured on.
+    gain, leak, dropped_modes
+        Loop parameters; by default as configured.
+
+    Raises
+    ------
+    ConfigError
+        The gain is not positive, or the leak is outside [0, 1].
+    IncompatibleProduct
+        The matrix belongs to another mirror or geometry.
+    CalibrationError
+        The matrix cannot be inverted.
+    """
+    c = bench.config.loop
+    gain = c.gain if gain is None else gain
+    leak = c.leak if leak is None else leak
+    if not (0 < gain < math.inf and 0 <= leak <= 1):
+        raise ConfigError(f"gain is {gain} and leak {leak}; the gain must be positive, the leak in [0, 1]")
+    if matrix.m2c.shape[0] != bench.dm.info.n_act or matrix.n_slopes != grid.n_slopes:
+        raise IncompatibleProduct(
+            f"the matrix is for {matrix.m2c.shape[0]} actuators and {matrix.n_slopes} slopes; "
+            f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
+        )
+    if not np.array_equal(matrix.valid, grid.valid):
+        raise IncompatibleProduct(f"the matrix and the geometry mark different {grid.elements} as valid")
+    stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
+    dropped = c.dropped_modes if dropped_modes is None else dropped_modes
+    return LeakyIntegrator(reconstructor(matrix.data, scale=stroke, dropped_modes=dropped), gain, leak)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopSettings:
-    """Settings of a loop.
-
-    Parameters
-    ----------
-    closing
-        The calibration whose matrix closes it.
-    """
+    """Settings of a loop: calibration with the matrix that closes it, gain, leak and dropped modes."""
 
     calibration: CalibrationResult
     gain: float
@@ -35,13 +77,15 @@ class LoopSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopChange:
-    """Settings with what follows from them, ready to be put in place.
+    """New settings, ready to be applied between two frames.
 
     Parameters
     ----------
+    settings
+        The settings.
     control, slopes_of
-        Controller by the settings, and slopes about the matrix's own references.
-    outside
+        Controller, and slope function with the references of the calibration.
+    undriven
         Combinations of modes that the controller does not drive ``(n_modes, n)``, orthonormal.
     """
 
@@ -52,21 +96,21 @@ class LoopChange:
 
 
 class LoopControl:
-    """Takes orders for a loop and hands them over between two frames.
+    """Requests to a running loop, from any thread; the loop applies them between two frames.
 
-    All that takes time, such as to invert a matrix, happens in the thread that asks.
+    The requesting thread does all slow work, such as the inversion of a matrix.
 
     Parameters
     ----------
-    bench, closing
-        The bench, and the calibration whose matrix closes the loop.
+    bench, calibration
+        Bench, and the calibration whose matrix closes the loop.
     gain, leak, dropped_modes
-        As configured by default.
+        Loop parameters; by default as configured.
 
     Raises
     ------
     ConfigError, IncompatibleProduct, CalibrationError
-        As for :func:`~escape_hw.calibration.loop.performance.closed_loop`; nothing moved.
+        As for :func:`build_integrator`; nothing moved.
     """
 
     def __init__(
@@ -81,18 +125,17 @@ class LoopControl:
         c = bench.config.loop
         self._bench, self._lock = bench, threading.Lock()
         self._open_requested = False
-        first = LoopSettings(
+        self._requested = LoopSettings(
             calibration,
             c.gain if gain is None else gain,
             c.leak if leak is None else leak,
             c.dropped_modes if dropped_modes is None else dropped_modes,
         )
-        self._pending: LoopChange | None = self._prepare(first)
-        self._requested = first
+        self._pending: LoopChange | None = self._prepare(self._requested)
 
     @property
     def settings(self) -> LoopSettings:
-        """The settings asked for last, in force at the next frames."""
+        """The settings requested last, applied at one of the next frames."""
         return self._requested
 
     @property
@@ -100,7 +143,7 @@ class LoopControl:
         """Whether the loop was asked to open."""
         return self._open_requested
 
-    def change(
+    def request_change(
         self,
         *,
         calibration: CalibrationResult | None = None,
@@ -108,15 +151,15 @@ class LoopControl:
         leak: float | None = None,
         dropped_modes: int | None = None,
     ) -> LoopSettings:
-        """Ask for other settings; what is not given stays. Returns all of them.
+        """Request other settings; ``None`` leaves a setting as it is. Returns all requested settings.
 
         Raises
         ------
         ConfigError
-            A number that means nothing, or a matrix of other modes or another geometry: open the loop
-            for that.
+            A number is out of range, or the matrix has other modes or another geometry, for which the loop
+            must be opened first.
         IncompatibleProduct, CalibrationError
-            The matrix belongs elsewhere, or cannot be inverted. The loop goes on as it was.
+            As for :func:`build_integrator`. The loop goes on unchanged.
         """
         with self._lock:
             now = self._requested
@@ -126,17 +169,17 @@ class LoopControl:
                 now.leak if leak is None else leak,
                 now.dropped_modes if dropped_modes is None else dropped_modes,
             )
-            _require_compatible(now.calibration, requested.calibration)
+            _require_exchangeable(now.calibration, requested.calibration)
             self._pending = self._prepare(requested)
             self._requested = requested
             return requested
 
-    def open(self) -> None:
-        """Ask the loop to open; the mirror will be flat."""
+    def request_open(self) -> None:
+        """Request that the loop opens; the mirror will be flat."""
         self._open_requested = True
 
-    def take(self) -> LoopChange | None:
-        """What was asked for since the last call; for the loop itself."""
+    def take_change(self) -> LoopChange | None:
+        """Return and clear the pending change; ``None`` if there is none. For the loop itself."""
         if self._pending is None:
             return None
         with self._lock:
@@ -144,34 +187,31 @@ class LoopControl:
         return change
 
     def _prepare(self, requested: LoopSettings) -> LoopChange:
+        matrix, grid = requested.calibration.matrix, requested.calibration.grid
         control = build_integrator(
-            self._bench, requested.calibration.matrix, requested.calibration.grid,
+            self._bench, matrix, grid,
             gain=requested.gain, leak=requested.leak, dropped_modes=requested.dropped_modes,
         )  # fmt: skip
-        slopes_of = build_slope_function(self._bench, requested.calibration.grid)
-        return LoopChange(
-            requested, control, slopes_of, _undriven_modes(control.reconstructor, requested.dropped_modes)
-        )
+        undriven = _undriven_modes(control.reconstructor, requested.dropped_modes)
+        return LoopChange(requested, control, build_slope_function(self._bench, grid), undriven)
 
 
 def _undriven_modes(reconstructor: NDArray[np.float32], dropped_modes: int) -> NDArray[np.float32]:
     if not dropped_modes:
         return np.zeros((len(reconstructor), 0), np.float32)
     exact = reconstructor.astype(np.float64)
-    # By rising eigenvalue, and as many are zero as modes were dropped.
+    # Eigenvalues rise, and one is zero per dropped mode.
     vectors = np.linalg.eigh(exact @ exact.T)[1]
     return np.ascontiguousarray(vectors[:, :dropped_modes], np.float32)
 
 
-def _require_compatible(now: CalibrationResult, new: CalibrationResult) -> None:
-    """Raise unless two matrices can follow each other in one loop."""
+def _require_exchangeable(now: CalibrationResult, new: CalibrationResult) -> None:
+    """Raise :class:`ConfigError` unless a running loop can change from one matrix to the other."""
     if new is now:
         return
     if now.matrix.m2c.shape != new.matrix.m2c.shape or not np.allclose(now.matrix.m2c, new.matrix.m2c):
-        raise ConfigError("the other matrix is of other modes; open the loop and close it on that matrix")
-    same = now.grid.n_slopes == new.grid.n_slopes and np.array_equal(now.grid.valid, new.grid.valid)
-    if not same:
+        raise ConfigError("the new matrix has other modes than the loop; open the loop first")
+    if now.grid.n_slopes != new.grid.n_slopes or not np.array_equal(now.grid.valid, new.grid.valid):
         raise ConfigError(
-            f"the other matrix marks other {now.grid.elements} as valid; open the loop and close it on "
-            "that matrix"
+            f"the new matrix marks other {now.grid.elements} as valid than the loop; open the loop first"
         )

@@ -1,6 +1,11 @@
-"""The gain with which a matrix closes the loop best."""
+"""Search for the loop gain with the highest Strehl ratio or the lowest residual."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +19,41 @@ from escape_hw.calibration.loop.performance import close_loop
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.control.integrator import gain_limit
 
-#: Shares of the stable limit that the search for the best gain tries.
+#: Gains of the scan as fractions of the largest stable gain.
 GAIN_FRACTIONS = (0.25, 0.35, 0.45, 0.55, 0.65, 0.75)
-#: Gains tried beyond those while the loop gets better and better towards one end, and the factors
-#: between them: on the way up small, because the loop's limit is near.
+#: Further gains tried while the best one lies at an end of the scan, and the ratios between them: small
+#: upwards, where the limit of stability is near.
 _MAX_EXTRA_GAINS, _STEP_UP, _STEP_DOWN = 4, 1.2, 1 / 1.5
-#: Delay assumed for the gain's limit when the matrix does not carry a measured one.
+#: Delay assumed for the largest stable gain when the matrix has no measured one.
 _DEFAULT_DELAY_FRAMES = 2.0
+#: A run that is worse than the best by d deviates from a parabola about the top by this times d.
+_PARABOLA_MISFIT = 0.5
+#: Relative error assumed for all runs, as a fraction of their range, when their own errors are unknown; only
+#: the weights depend on it.
+_NOMINAL_ERROR = 0.1
 
 
-def best_gain(
+@dataclass(frozen=True, slots=True, eq=False)
+class GainSearch:
+    """Result of a search for the best gain; unpacks as ``gain, runs``.
+
+    Parameters
+    ----------
+    gain, sigma
+        The best gain and its standard error, NaN if the search was stopped.
+    runs
+        One run per gain tried.
+    """
+
+    gain: float
+    sigma: float
+    runs: list[LoopResult]
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.gain, self.runs))
+
+
+def find_best_gain(
     bench: Bench,
     matrix: InteractionMatrix,
     grid: SensorGeometry,
@@ -31,20 +61,28 @@ def best_gain(
     gains: tuple[float, ...] | None = None,
     frames: int = 1500,
     model_psf: NDArray[np.float32] | None = None,
-) -> Procedure[tuple[float, list[LoopResult]]]:
-    """The gain with the least residual (or the highest Strehl ratio, given a model PSF).
+) -> Procedure[GainSearch]:
+    """Close the loop at several gains and find the best one.
 
     Parameters
     ----------
-    bench, matrix, grid
-        As for :func:`close_loop`.
+    bench
+        An open bench.
+    matrix, grid
+        Interaction matrix, and the sensor geometry that it was measured on.
     gains
-        Gains to try; by default shares of the largest stable one for the delay that was measured
-        with the matrix.
+        Gains to try; by default fractions of the largest stable gain for the delay that was measured with
+        the matrix, continued beyond either end while the best gain lies there.
     frames
         Frames per gain.
     model_psf
-        With it, gains are judged by the Strehl ratio.
+        PSF without turbulence. With it gains are compared by the Strehl ratio of the peak, else by the
+        residual.
+
+    Returns
+    -------
+    GainSearch
+        The top of a parabola through the gains near the best one, with its standard error.
 
     Raises
     ------
@@ -52,28 +90,22 @@ def best_gain(
         No gain gives a stable loop.
     """
     delay = float(matrix.metrics.get("delay_frames", _DEFAULT_DELAY_FRAMES))
-    pending = list(gains or (share * gain_limit(delay) for share in GAIN_FRACTIONS))
+    pending = list(gains or (fraction * gain_limit(delay) for fraction in GAIN_FRACTIONS))
     extra_gains = 0 if gains else _MAX_EXTRA_GAINS
     runs: list[LoopResult] = []
     while pending:
         gain = pending.pop(0)
         run = yield from close_loop(
-            bench,
-            matrix,
-            grid,
-            gain=gain,
-            frames=frames,
-            model_psf=model_psf,
-            stage=f"loop at gain {gain:.2f}",
-        )
+            bench, matrix, grid,
+            gain=gain, frames=frames, model_psf=model_psf, stage=f"loop at gain {gain:.2f}",
+        )  # fmt: skip
         runs.append(run)
         if run.partial:
-            return gain, runs
+            return GainSearch(gain, math.nan, runs)
         if sum(not r.stable for r in runs) > 1:
             pending = []
         next_gain = _next_gain(runs) if extra_gains and not pending else None
         if next_gain is not None:
-            # The top is not passed yet: a best gain at the edge of the scan is none.
             pending, extra_gains = [next_gain], extra_gains - 1
     stable = [run for run in runs if run.stable]
     if not stable:
@@ -81,36 +113,58 @@ def best_gain(
             f"the loop closes at none of the gains {', '.join(f'{r.gain:.2f}' for r in runs)}; "
             "drop more modes or measure the matrix again"
         )
-    return _fit_peak(stable), runs
+    return GainSearch(*_fit_peak(stable), runs)
 
 
 def _next_gain(runs: list[LoopResult]) -> float | None:
-    """A gain beyond the end of the scan at which the best loop lies; ``None`` if it lies within."""
+    """A gain beyond the end of the scan at which the best run lies; ``None`` if it lies within the scan."""
     by_gain = sorted(runs, key=lambda run: run.gain)
     stable = [run for run in by_gain if run.stable]
-    best = stable[int(np.argmax(_compute_merits(stable)))] if stable else None
+    best = stable[int(np.argmax(_compute_merits(stable)[0]))] if stable else None
     if best is None or best is by_gain[0]:
         return by_gain[0].gain * _STEP_DOWN
     return best.gain * _STEP_UP if best is by_gain[-1] else None
 
 
-def _fit_peak(runs: list[LoopResult]) -> float:
-    """Gain at the top of a parabola through the merits, so that one lucky run does not decide.
+def _fit_peak(runs: list[LoopResult]) -> tuple[float, float]:
+    """Gain of the highest merit and its standard error.
 
-    With fewer than four runs, or where the parabola has no top, the best run's gain.
+    A parabola is fitted to the merits. Each run is weighted by its standard error and by the deviation of
+    the curve from a parabola, which grows with the distance from the top, so that runs far below the top do
+    not displace it. With fewer than four runs, or if the parabola has no top among the gains, the result is
+    the gain of the best run, with the error of a uniform distribution between its neighbours.
     """
+    runs = sorted(runs, key=lambda run: run.gain)
     gains = np.array([run.gain for run in runs])
-    merits = _compute_merits(runs)
-    best = float(gains[int(np.argmax(merits))])
-    if gains.size < 4:
-        return best
-    curvature, slope, _ = np.polyfit(gains, merits, 2)
-    if curvature >= 0:
-        return best
-    return float(np.clip(-slope / (2 * curvature), gains.min(), gains.max()))
+    merits, errors = _compute_merits(runs)
+    best = int(np.argmax(merits))
+    below, above = max(best - 1, 0), min(best + 1, gains.size - 1)
+    best_run = float(gains[best]), float(gains[above] - gains[below]) / math.sqrt(12) or math.nan
+    spread = float(np.ptp(merits))
+    if gains.size < 4 or not spread > 0:
+        return best_run
+    known = bool(np.isfinite(errors).all())
+    statistical = np.maximum(errors, 1e-3 * spread) if known else np.full(gains.size, _NOMINAL_ERROR * spread)
+    weight = 1 / np.hypot(statistical, _PARABOLA_MISFIT * (merits[best] - merits))
+    scale = float(np.ptp(gains))
+    position = (gains - gains[best]) / scale
+    design = np.stack([np.ones_like(position), position, np.square(position)], axis=1) * weight[:, None]
+    covariance = np.linalg.inv(design.T @ design)
+    coefficients = covariance @ (design.T @ (merits * weight))
+    _, slope, curvature = coefficients
+    top = -slope / (2 * curvature) if curvature < 0 else math.inf
+    if not position[0] <= top <= position[-1]:
+        return best_run
+    chi_squared = float(np.square(merits * weight - design @ coefficients).sum()) / (gains.size - 3)
+    covariance *= max(chi_squared, 1.0) if known else chi_squared
+    derivative = np.array([0.0, -1.0, -2 * top]) / (2 * curvature)
+    sigma = scale * math.sqrt(float(derivative @ covariance @ derivative))
+    return float(gains[best] + scale * top), sigma
 
 
-def _compute_merits(runs: list[LoopResult]) -> NDArray[np.float64]:
-    """Strehl ratios, or (as soon as one run has none) residuals: never one beside the other."""
-    ratios = [run.strehl.peak.value for run in runs if run.strehl is not None]
-    return np.array(ratios if len(ratios) == len(runs) else [-run.residual_rms_nm for run in runs])
+def _compute_merits(runs: list[LoopResult]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Strehl ratios and their errors or, if a run has none, negative residuals and NaN."""
+    ratios = [run.strehl.peak for run in runs if run.strehl is not None]
+    if len(ratios) == len(runs):
+        return np.array([one.value for one in ratios]), np.array([one.sigma for one in ratios])
+    return np.array([-run.residual_rms_nm for run in runs]), np.full(len(runs), math.nan)

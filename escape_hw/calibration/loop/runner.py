@@ -1,23 +1,27 @@
-"""The loop frame by frame: controller, pokes beside it, and those who watch."""
+"""The closed loop frame by frame: start-up, controller, injected pokes, observers."""
 
 from __future__ import annotations
 
 import math
 import time
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.camera import Frame
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.mirror import SendReport
 from escape_hw.api.procedure import Procedure, Reporter
-from escape_hw.api.sensor import SlopeFunction
+from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import FluxMonitor, limit_to_reachable, next_frame
-from escape_hw.errors import CalibrationError
+from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, prepare_sensor
+from escape_hw.calibration.loop.divergence import DivergenceLimits, SaturationMonitor
 from escape_hw.pipeline.control.integrator import Controller
 from escape_hw.pipeline.control.matrix_products import build_command_mapper
 from escape_hw.pipeline.psf.frame_stack import FrameStack
@@ -25,61 +29,51 @@ from escape_hw.pipeline.psf.strehl import is_peak_saturated
 from escape_hw.pipeline.statistics import MIN_SAMPLES
 from escape_hw.streams.timing import LoopTiming
 
-#: Seconds after closing during which the science frames do not count.
+#: Seconds after closing in which the loop settles; science frames taken meanwhile do not count.
 SETTLING_S = 0.3
-#: The loop counts as diverging when this share of the actuators stays clipped ...
-_SATURATED_FRACTION = 0.2
-#: ... for this many frames in a row.
-_SATURATED_FRAMES = 50
+#: Residuals in a progress report.
+_N_REPORTED = 500
 
-#: Gives the modal poke of a frame ``(n_modes,)``.
+#: Returns the modal poke of a frame ``(n_modes,)``.
 PokeSource = Callable[[], NDArray[np.float64]]
-#: Gets, after each frame was answered: its index; its slopes ``(n_slopes,)``, float32; the modal command
-#: that the mirror really got ``(n_modes,)``, float64, controller and poke together and within the limits;
-#: the poke in it ``(n_modes,)``, float64, zeros without one. Both were sent after that frame had arrived.
-#: The arrays are used again; what is to be kept must be copied.
+#: Called after the command of each frame was sent, with the frame's index; its slopes ``(n_slopes,)``,
+#: float32; the modal command that the mirror executed ``(n_modes,)``, float64, the sum of controller and poke
+#: within the limits; and the poke in it ``(n_modes,)``, float64, zeros without pokes. The arrays are
+#: overwritten by the next frame: copy what is to be kept.
 LoopObserver = Callable[[int, NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]], object]
 
 
-#: Residuals that a progress report shows.
-_N_REPORTED = 500
-
-
 def minimum_strehl_frames(loop_hz: float, science_hz: float) -> int:
-    """Least frames of a loop whose Strehl ratios have an error: while it closes, no science frame counts.
+    """Fewest frames of a loop after which its Strehl ratios have standard errors.
 
     Parameters
     ----------
     loop_hz, science_hz
-        Frames per second of the sensor's and of the science camera.
+        Frame rates of the wavefront sensor and of the science camera.
     """
     return math.ceil((SETTLING_S + (MIN_SAMPLES + 2) / science_hz) * loop_hz)
 
 
-def _latest_residuals(residual: array[float]) -> NDArray[np.float32]:
-    return np.array(residual[-_N_REPORTED:], np.float32)
-
-
 @dataclass(slots=True, eq=False)
 class LoopRecord:
-    """What a run gathers on its way.
+    """Measurements of a running loop.
 
     Parameters
     ----------
     science
-        Frames of the science camera since the loop has been closed for :data:`SETTLING_S`.
+        Frames of the science camera, from :data:`SETTLING_S` after closing on.
     residual
-        Rms of the reconstructed wavefront, in nanometres, by frame.
+        Rms of the reconstructed wavefront by frame, in nm.
     latency
-        Nanoseconds from a frame in hand to its command sent, by frame.
+        Time from the arrival of a frame to its command by frame, in ns.
     frames
-        Frames answered.
+        Number of frames processed.
     shortened
-        Commands that the limits cut.
+        Number of commands that the mirror's limits changed.
     diverged
-        Whether the mirror was held at its limits for too long, and the run was stopped for that.
+        Whether the run was stopped because the mirror stayed at its limits.
     last, command
-        The last frame, and the last shape sent ``(n_act,)``.
+        Last frame, and last command sent ``(n_act,)``.
     """
 
     science: FrameStack = field(default_factory=FrameStack)
@@ -92,27 +86,11 @@ class LoopRecord:
     command: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
 
-def require_not_diverged(record: LoopRecord) -> None:
-    """Refuse to go on with a loop that had to be opened.
-
-    Raises
-    ------
-    CalibrationError
-        It diverged; says what to do.
-    """
-    if record.diverged:
-        raise CalibrationError(
-            f"the loop diverged after {record.frames} frames and was opened: most actuators stood at "
-            "their limits. Lower loop.gain or raise loop.dropped_modes; if that does not help, the "
-            "matrix does not belong to this state of the bench, or the delay is longer than thought"
-        )
-
-
 class RunningLoop:
-    """A loop that can be run in stretches without being opened between them.
+    """A loop that runs in stretches without being opened between them.
 
-    Whoever makes one flattens the mirror before the first stretch and in a ``finally`` after the last.
-    Between two frames the controller may be given another reconstructor or other gains.
+    Use it as ``with loop.closed(): yield from loop.run(frames)``. Between two frames the controller may get
+    another reconstructor or another gain.
 
     Parameters
     ----------
@@ -121,18 +99,22 @@ class RunningLoop:
     m2c
         Mode-to-command matrix ``(n_act, n_modes)``.
     slopes_of
-        Turns frames into slopes.
+        Slope function.
     control
-        The modal controller.
+        Modal controller.
     science
-        Whether to gather the frames of the science camera.
+        Whether to collect frames of the science camera.
 
     Attributes
     ----------
     record
-        What all stretches gathered so far, also when one of them was aborted.
+        Measurements of all stretches, also of an aborted one.
     timing
-        Latencies and the spacing of frames since the loop was made.
+        Latencies and frame intervals since construction.
+    settling_frames
+        Number of frames in :data:`SETTLING_S`.
+    closed_at_ns
+        Time at which the loop was closed, by the clock of the sensor's camera.
     """
 
     def __init__(
@@ -147,18 +129,82 @@ class RunningLoop:
         self.bench, self.control, self.slopes_of, self.record = bench, control, slopes_of, LoopRecord()
         self.m2c = m2c
         self.timing = LoopTiming()
-        self._shape_of, self._to_modes = build_command_mapper(m2c), np.linalg.pinv(m2c)
+        self.settling_frames = int(SETTLING_S * bench.wfs.settings.frame_rate_hz)
+        self.closed_at_ns = self._lost_before = 0
+        self._to_actuators, self._to_modes = build_command_mapper(m2c), np.linalg.pinv(m2c)
         self._flux_monitor = FluxMonitor(bench.wfs.name, slopes_of.grid)
+        self._is_saturated = SaturationMonitor(DivergenceLimits.from_config(bench.config), len(m2c))
         self._science = bench.science if science else None
-        self._settling_frames = int(SETTLING_S * bench.wfs.settings.frame_rate_hz)
         # Reflection doubles the surface; modes have unit rms surface.
         self._nm_per_unit = 2e9 * bench.dm.info.stroke_m
         self._slopes = np.zeros(slopes_of.grid.n_slopes, np.float32)
         self._command, self._zero_poke = np.zeros(m2c.shape[1]), np.zeros(m2c.shape[1])
         self._zero_poke.flags.writeable = False
-        self._n_saturated = 0
         self._residual_callback = bench.callbacks.residual
         self._residual_nm = np.zeros(m2c.shape[1], np.float32)
+
+    @classmethod
+    def prepare(
+        cls,
+        bench: Bench,
+        matrix: InteractionMatrix,
+        grid: SensorGeometry,
+        control: Controller,
+        *,
+        science: bool = False,
+    ) -> Self:
+        """Prepare the sensor and build the loop of a matrix on its geometry; the mirror does not move.
+
+        Raises
+        ------
+        IncompatibleProduct
+            The geometry does not fit the camera or the sensor.
+        CalibrationError
+            The dark frame is of another camera region.
+        SettingRejected, DeviceError
+            The modulator cannot do what the configuration asks for, or did not start.
+        """
+        prepare_sensor(bench)
+        return cls(bench, matrix.m2c, build_slope_function(bench, grid), control, science=science)
+
+    @contextmanager
+    def closed(self) -> Iterator[None]:
+        """Context in which the loop is closed: the mirror is flattened on entry and on exit.
+
+        A first frame is read on entry, so that frames which the camera lost before do not count.
+        """
+        self.bench.dm.flatten()
+        next_frame(self.bench)
+        self._lost_before, self.closed_at_ns = self.bench.wfs.status().lost, self.bench.wfs.now_ns()
+        if self._science is not None:
+            self._science.stop()
+        try:
+            yield
+        finally:
+            self.open()
+
+    def open(self) -> None:
+        """Flatten the mirror and stop the science camera."""
+        self.bench.dm.flatten()
+        if self._science is not None:
+            self._science.stop()
+
+    @property
+    def lost_frames(self) -> int:
+        """Frames that the camera lost since the loop was closed."""
+        return self.bench.wfs.status().lost - self._lost_before
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the loop was closed, by the clock of the sensor's camera."""
+        return (self.bench.wfs.now_ns() - self.closed_at_ns) * 1e-9
+
+    def settle(
+        self, frames: int | None = None, observe: Sequence[LoopObserver] = ()
+    ) -> Procedure[LoopRecord]:
+        """Run without pokes while the loop settles, for :attr:`settling_frames` by default."""
+        frames = self.settling_frames if frames is None else frames
+        return self.run(frames, observe=observe, report=Reporter("closing the loop", frames))
 
     def run(
         self,
@@ -168,20 +214,20 @@ class RunningLoop:
         observe: Sequence[LoopObserver] = (),
         report: Reporter | None = None,
     ) -> Procedure[LoopRecord]:
-        """Answer a number of frames; the loop stays closed, unless it diverged.
+        """Process a number of frames; the loop stays closed unless it diverged.
 
         Parameters
         ----------
         frames
-            How many.
+            Number of frames.
         inject
-            Gives each frame's poke, which is added beside the controller, never to its state. While
-            pokes are injected, a command beyond the limits is shortened as a whole instead of
-            actuator by actuator: so it remains a command of the modes, and known as such.
+            Source of pokes. Pokes are added to the controller's command and do not enter its state. With
+            pokes, a command beyond the limits is shortened as a whole instead of actuator by actuator, so
+            that it remains a known combination of the modes.
         observe
-            Called after each frame, when its command is out.
+            Called after the command of each frame was sent.
         report
-            Counts the frames for the progress; a stage of its own by default.
+            Progress reporter; a stage of its own by default.
 
         Raises
         ------
@@ -203,23 +249,20 @@ class RunningLoop:
             if inject is not None:
                 # Drawn in the idle time before the next frame.
                 poke = inject()
-            if self._science is not None and record.frames > self._settling_frames:
+            if self._science is not None and record.frames > self.settling_frames:
                 image = self._science.poll()
-                if image is not None and record.frames > self._settling_frames + 2:
+                if image is not None and record.frames > self.settling_frames + 2:
                     record.science.add(image.data, clipped=is_peak_saturated(image))
             if report.step():
-                yield report.now(
-                    {"residual": _latest_residuals(record.residual)}, residual_nm=record.residual[-1]
-                )
+                latest = np.array(record.residual[-_N_REPORTED:], np.float32)
+                yield report.now({"residual": latest}, residual_nm=record.residual[-1])
         return record
 
     def _process_frame(self, frame: Frame, poke: NDArray[np.float64], shorten_whole: bool) -> None:
-        """Send the command that answers a frame, and book it."""
         record, began = self.record, time.perf_counter_ns()
         self.slopes_of(frame.data, None, self._slopes)
         np.add(self.control(self._slopes), poke, out=self._command)
-        shape = self._shape_of(self._command)
-        sent, n_clipped = self._send(shape, shorten_whole)
+        sent, n_clipped = self._send(self._to_actuators(self._command), shorten_whole)
         ended = time.perf_counter_ns()
         record.latency.append(ended - began)
         self.timing.add(began, ended)
@@ -228,23 +271,17 @@ class RunningLoop:
             record.shortened += 1
             np.dot(self._to_modes, sent.sent, out=self._command)
             self.control.set_applied(self._command - poke)
-        self._n_saturated = (
-            self._n_saturated + 1
-            if n_clipped is not None and n_clipped > _SATURATED_FRACTION * shape.size
-            else 0
-        )
-        record.diverged = self._n_saturated >= _SATURATED_FRAMES
+        record.diverged = self._is_saturated(n_clipped or 0)
         record.frames, record.last, record.command = record.frames + 1, frame, sent.sent
         residual = self.control.residual
         rms = self._nm_per_unit * float(np.sqrt(residual.dot(residual)))
         record.residual.append(rms)
         if self._residual_callback is not None:
-            self._residual_callback(
-                frame.index, np.multiply(residual, self._nm_per_unit, out=self._residual_nm), rms
-            )
+            residual_nm = np.multiply(residual, self._nm_per_unit, out=self._residual_nm)
+            self._residual_callback(frame.index, residual_nm, rms)
 
     def _send(self, shape: NDArray[np.float64], shorten_whole: bool) -> tuple[SendReport, int | None]:
-        """What was sent, and how many actuators were asked beyond the stroke if it was not the shape."""
+        """Send a command; if the limits changed it, also the number of actuators asked beyond the stroke."""
         dm = self.bench.dm
         if not shorten_whole:
             sent = dm.send(shape)

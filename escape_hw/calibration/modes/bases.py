@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import count, islice
 from math import factorial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from escape_hw.bench import Bench
+from escape_hw.config.system import SystemConfig
 from escape_hw.errors import CalibrationError, ConfigError
 
-if TYPE_CHECKING:
-    from escape_hw.config.system import SystemConfig
-
-
-#: On a symmetric mirror modes come in pairs of equal variance, and rounding would decide how a pair lies
-#: in its plane (and which half of one is cut off). This much anisotropy decides it instead.
+#: Relative anisotropy that separates pairs of modes with equal variance on a symmetric mirror, whose
+#: orientation would otherwise depend on rounding errors.
 _ANISOTROPY = 1e-4
+#: Ratio of singular values below which the surfaces of modes are linearly dependent.
+_MIN_SINGULAR_RATIO = 1e-3
+#: Outer scale of the turbulence assumed for the modal basis, in pupil diameters.
+_OUTER_SCALE = 4.0
 
 
 def scale_to_unit_rms(
@@ -36,21 +37,26 @@ def scale_to_unit_rms(
     pupil
         Boolean ``(n, n)``.
     """
-    pupil_surfaces = surfaces[:, pupil]
-    pupil_surfaces = pupil_surfaces - pupil_surfaces.mean(axis=1, keepdims=True)
+    pupil_surfaces = _pupil_surfaces(surfaces, pupil)
     gram = pupil_surfaces @ pupil_surfaces.T / pupil_surfaces.shape[1]
     return np.asarray(m2c / np.sqrt(np.einsum("am,ab,bm->m", m2c, gram, m2c)))
 
 
+def _pupil_surfaces(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Influence functions over the pupil without piston ``(n_act, n_pixels)``."""
+    inside = surfaces[:, pupil]
+    return np.asarray(inside - inside.mean(axis=1, keepdims=True))
+
+
 def fix_signs(m2c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn every mode so that its largest coefficient is positive; ties go to the first actuator."""
+    """Flip modes so that the largest coefficient of each, the first one of equals, is positive."""
     size = np.abs(m2c)
     pivot = np.argmax(size >= size.max(axis=0) * (1 - 1e-6), axis=0)
     return np.asarray(m2c * np.sign(m2c[pivot, np.arange(m2c.shape[1])]))
 
 
 def von_karman_covariance(distance_m: NDArray[np.float64], outer_scale_m: float) -> NDArray[np.float64]:
-    """Covariance of von Karman phase at a distance, relative to the variance.
+    """Covariance of von Karman phase at a distance, divided by the variance.
 
     ``x^(5/6) K_5/6(x) 2^(1/6) / Gamma(5/6)`` with ``x = 2 pi r / L0``: the Fourier transform of the
     power spectrum ``(f^2 + 1 / L0^2)^(-11/6)`` (Conan 2000).
@@ -75,9 +81,8 @@ def karhunen_loeve(
 ) -> NDArray[np.float64]:
     """Karhunen-Loeve modes of von Karman turbulence within the span of the influence functions.
 
-    Double diagonalisation (Gendron 1995): modes whose turbulent coefficients are uncorrelated, ordered
-    by falling variance, and which are orthonormal over the pupil once their piston is taken out; no
-    sensor sees it.
+    Double diagonalisation (Gendron 1995): modes that are orthonormal over the pupil without piston, with
+    uncorrelated coefficients of the turbulence, ordered by decreasing variance.
 
     Parameters
     ----------
@@ -88,7 +93,7 @@ def karhunen_loeve(
     pixel_m
         Pixel size in metres.
     n_modes
-        How many modes to keep, at most ``n_act - 1``.
+        Number of modes, at most ``n_act - 1``.
     outer_scale_m
         Outer scale of the turbulence in metres.
 
@@ -102,8 +107,7 @@ def karhunen_loeve(
     CalibrationError
         More modes than the mirror can make.
     """
-    pupil_surfaces = surfaces[:, pupil]
-    pupil_surfaces = pupil_surfaces - pupil_surfaces.mean(axis=1, keepdims=True)
+    pupil_surfaces = _pupil_surfaces(surfaces, pupil)
     orthonormal = _orthonormal_modes(pupil_surfaces, pupil, n_modes)
     covariance = _turbulence_covariance(pupil_surfaces, pupil, pixel_m, outer_scale_m)
     variance, rotation = np.linalg.eigh(orthonormal.T @ covariance @ orthonormal)
@@ -114,10 +118,7 @@ def karhunen_loeve(
 def _orthonormal_modes(
     pupil_surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int
 ) -> NDArray[np.float64]:
-    """Modes ``(n_act, n_modes)`` orthonormal over the pupil that span what the mirror makes best.
-
-    ``pupil_surfaces (n_act, n_pixels)`` are the influence functions over the pupil, without piston.
-    """
+    """Modes ``(n_act, n_modes)``, orthonormal over the pupil, that need the smallest commands."""
     n_act = len(pupil_surfaces)
     gram = pupil_surfaces @ pupil_surfaces.T / pupil_surfaces.shape[1]
     rows, columns = np.nonzero(pupil)
@@ -131,7 +132,7 @@ def _orthonormal_modes(
     significant = values > values[-1] * 1e-9
     if n_modes > min(int(significant.sum()), n_act - 1):
         raise CalibrationError(
-            f"{n_modes} modes asked for; this mirror of {n_act} actuators makes at most "
+            f"{n_modes} modes requested; this mirror of {n_act} actuators makes at most "
             f"{min(int(significant.sum()), n_act - 1)} without piston; lower basis.n_modes"
         )
     order = np.argsort(values)[::-1][:n_modes]
@@ -142,11 +143,11 @@ def _orthonormal_modes(
 def _turbulence_covariance(
     pupil_surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], pixel_m: float, outer_scale_m: float
 ) -> NDArray[np.float64]:
-    """Covariance of what turbulence puts on each influence function ``(n_act, n_act)``, of unit trace."""
+    """Covariance of the turbulence projected on the influence functions ``(n_act, n_act)``, of unit trace."""
     n_act, n = len(pupil_surfaces), pupil.shape[0]
     padded = np.zeros((n_act, 2 * n, 2 * n))
     padded[:, :n, :n][:, pupil] = pupil_surfaces
-    # With twice the pupil's size every pair of pixels keeps its own distance: nothing wraps around.
+    # Twice the pupil's size, so that distances do not wrap around.
     offsets_m = np.minimum(np.arange(2 * n), 2 * n - np.arange(2 * n)) * pixel_m
     kernel = von_karman_covariance(np.hypot((1 + _ANISOTROPY) * offsets_m[:, None], offsets_m), outer_scale_m)
     spectrum = np.fft.rfft2(kernel).real
@@ -156,7 +157,6 @@ def _turbulence_covariance(
     half_plane_weights[[0, -1]] = 1.0
     weighted = transform * (spectrum * half_plane_weights).ravel()
     covariance = weighted.real @ transform.real.T + weighted.imag @ transform.imag.T
-    # An overall factor turns no mode.
     return np.asarray(covariance / np.trace(covariance))
 
 
@@ -164,12 +164,10 @@ def zonal(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int)
     """Single actuators as modes ``(n_act, n_modes)``, the first ``n_modes`` of them."""
     n_act = surfaces.shape[0]
     if n_modes > n_act:
-        raise CalibrationError(f"{n_modes} modes asked for; this mirror has {n_act} actuators")
+        raise CalibrationError(
+            f"{n_modes} modes requested; this mirror has {n_act} actuators; lower basis.n_modes"
+        )
     return scale_to_unit_rms(np.eye(n_act)[:, :n_modes], surfaces, pupil)
-
-
-#: Modes whose surfaces are less independent than this (ratio of singular values) are not a basis.
-_MIN_SINGULAR_RATIO = 1e-3
 
 
 def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:
@@ -182,12 +180,12 @@ def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: in
     pupil
         Boolean ``(n, n)``.
     n_modes
-        How many.
+        Number of modes.
 
     Raises
     ------
     CalibrationError
-        The mirror cannot tell so many of them apart.
+        The mirror cannot make so many independent modes.
     """
     x, y = _unit_coordinates(pupil)
     r, angle = np.hypot(x, y), np.arctan2(y, x)
@@ -199,9 +197,7 @@ def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: in
 
 
 def fourier(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:
-    """Cosines and sines of whole cycles across the pupil's diameter, lowest frequency first.
-
-    Tip and tilt, which no whole cycle makes, come first.
+    """Tip, tilt, then cosines and sines of whole cycles across the pupil's diameter, lowest frequency first.
 
     Parameters
     ----------
@@ -211,7 +207,7 @@ def fourier(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: in
     Raises
     ------
     CalibrationError
-        The mirror cannot tell so many of them apart.
+        The mirror cannot make so many independent modes.
     """
     x, y = _unit_coordinates(pupil)
     shapes = [x, y]
@@ -256,7 +252,7 @@ def _azimuthal_factor(m: int, angle: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def _fourier_frequencies() -> Iterator[tuple[int, int]]:
-    """Half of all pairs of whole frequencies, by rising length: the other half are their negatives."""
+    """Pairs of whole frequencies by increasing length, without the negative of any of them."""
     max_frequency = 64
     pairs = [
         (a, b) for a in range(max_frequency) for b in range(-max_frequency, max_frequency) if a > 0 or b > 0
@@ -267,9 +263,8 @@ def _fourier_frequencies() -> Iterator[tuple[int, int]]:
 def _fit_shapes(
     surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], shapes: NDArray[np.float64], name: str
 ) -> NDArray[np.float64]:
-    """The mirror's least-squares approach to shapes ``(n_modes, n_pixels)``, piston aside."""
-    pupil_surfaces = surfaces[:, pupil]
-    pupil_surfaces = pupil_surfaces - pupil_surfaces.mean(axis=1, keepdims=True)
+    """Least-squares fit of the mirror to shapes ``(n_modes, n_pixels)``, without piston."""
+    pupil_surfaces = _pupil_surfaces(surfaces, pupil)
     shapes = shapes - shapes.mean(axis=1, keepdims=True)
     m2c = np.linalg.lstsq(pupil_surfaces.T, shapes.T, rcond=1e-6)[0]
     fitted_surfaces = m2c.T @ pupil_surfaces
@@ -278,16 +273,30 @@ def _fit_shapes(
     )
     if len(shapes) > len(pupil_surfaces) or values[-1] < _MIN_SINGULAR_RATIO * values[0]:
         raise CalibrationError(
-            f"this mirror of {len(pupil_surfaces)} actuators cannot tell {len(shapes)} {name} modes apart; "
-            "lower basis.n_modes, or choose basis.kind = 'kl'"
+            f"this mirror of {len(pupil_surfaces)} actuators cannot make {len(shapes)} independent {name} "
+            "modes; lower basis.n_modes, or choose basis.kind = 'kl'"
         )
-    return scale_to_unit_rms(m2c, surfaces, pupil)
+    return scale_to_unit_rms(np.asarray(m2c, np.float64), surfaces, pupil)
 
 
-#: Outer scale of the turbulence assumed for the modal basis, in pupil diameters.
-_OUTER_SCALE = 4.0
-#: Bases that need nothing but the influence functions.
+#: Bases that depend on the influence functions only.
 _BASIS_BUILDERS = {"zonal": zonal, "zernike": zernike, "fourier": fourier}
+
+
+def build_modal_basis(bench: Bench) -> NDArray[np.float64]:
+    """Build the mode-to-command matrix ``(n_act, n_modes)`` that the configuration asks for.
+
+    Raises
+    ------
+    ConfigError
+        The basis does not fit the mirror, or moves disabled actuators.
+    CalibrationError
+        More modes than the working actuators can make.
+    """
+    surfaces, pupil, pixel_m = bench.model().influence_functions()
+    if surfaces.shape[0] != bench.dm.info.n_act:
+        raise ConfigError(f"the model has {surfaces.shape[0]} actuators, the mirror {bench.dm.info.n_act}")
+    return build_basis(bench.config, surfaces, pupil, pixel_m, bench.dm.limits.disabled)
 
 
 def build_basis(
@@ -297,42 +306,36 @@ def build_basis(
     pixel_m: float,
     disabled: Sequence[int],
 ) -> NDArray[np.float64]:
-    """Mode-to-command matrix ``(n_act, n_modes)``, each column of unit rms surface.
-
-    Disabled actuators take no part: the modes are those of the others.
+    """Build a mode-to-command matrix ``(n_act, n_modes)`` with columns of unit rms surface.
 
     Parameters
     ----------
     config
-        Its ``basis`` says which.
+        Configuration with the section ``basis``.
     surfaces, pupil, pixel_m
-        Influence functions ``(n_act, n, n)`` in fractions of full stroke, the pupil ``(n, n)`` and the
-        size of a pixel in metres.
+        Influence functions ``(n_act, n, n)`` in fractions of full stroke, the pupil ``(n, n)`` and the size
+        of a pixel in metres.
     disabled
-        Actuators that must not move.
+        Indices of the actuators that must not move; the modes are those of the others.
 
     Raises
     ------
     ConfigError
         The basis of a file has other actuators or too few modes, or moves disabled actuators.
     CalibrationError
-        More modes than the actuators that work can make.
+        More modes than the working actuators can make.
     """
     basis = config.basis
     working = np.ones(surfaces.shape[0], dtype=bool)
     working[list(disabled)] = False
-    if basis.kind in _BASIS_BUILDERS:
-        return _embed_working_actuators(
-            working, _BASIS_BUILDERS[basis.kind](surfaces[working], pupil, basis.n_modes)
-        )
     if basis.kind == "file":
-        # Imported here: astropy takes a second to load, and only this needs it.
+        # Imported here, because astropy takes a second to load.
         from escape_hw.io.fits.matrix import load_basis
 
         m2c = load_basis(basis.file)
         if m2c.shape[0] != surfaces.shape[0] or m2c.shape[1] < basis.n_modes:
             raise ConfigError(
-                f"basis.file holds {m2c.shape[0]} actuators and {m2c.shape[1]} modes; "
+                f"basis.file has {m2c.shape[0]} actuators and {m2c.shape[1]} modes; "
                 f"{surfaces.shape[0]} and at least {basis.n_modes} are needed"
             )
         if m2c[~working, : basis.n_modes].any():
@@ -340,14 +343,10 @@ def build_basis(
                 "the modes of basis.file move actuators that devices.dm.limits.disabled keeps at zero"
             )
         return scale_to_unit_rms(m2c[:, : basis.n_modes], surfaces, pupil)
-    outer_scale_m = _OUTER_SCALE * config.system.pupil_m
-    return _embed_working_actuators(
-        working, karhunen_loeve(surfaces[working], pupil, pixel_m, basis.n_modes, outer_scale_m)
-    )
-
-
-def _embed_working_actuators(working: NDArray[np.bool_], m2c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Modes of the actuators that work as modes of the whole mirror."""
-    full_m2c = np.zeros((working.size, m2c.shape[1]))
-    full_m2c[working] = m2c
+    full_m2c = np.zeros((working.size, basis.n_modes))
+    if basis.kind in _BASIS_BUILDERS:
+        full_m2c[working] = _BASIS_BUILDERS[basis.kind](surfaces[working], pupil, basis.n_modes)
+    else:
+        outer_scale_m = _OUTER_SCALE * config.system.pupil_m
+        full_m2c[working] = karhunen_loeve(surfaces[working], pupil, pixel_m, basis.n_modes, outer_scale_m)
     return full_m2c

@@ -1,4 +1,8 @@
-"""Matrices of modes and derivatives of any synthetic model: its own where it has them, else differences."""
+"""Interaction matrices of a synthetic model by mode or actuator, and their derivatives.
+
+The derivatives with respect to the registration are the model's own where it has them, and central
+differences otherwise.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,8 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.results import PEDESTAL
 from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
 
-#: Half steps of the central differences: the registration in its units, then the relative width.
+#: Half steps of the central differences: registration in its units, relative width of the influence
+#: functions.
 _DIFFERENCE_STEPS = np.array([2.0, 2.0, 0.05, 0.2, 0.2, 0.02])
 
 
@@ -78,14 +83,14 @@ def pedestal_jacobian(
     width: float = 1.0,
     m2c: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes of the broad pedestal that influence functions may stand on, and their derivatives.
+    """Slopes of the broad pedestal of the influence functions, and their derivatives.
 
     Parameters
     ----------
     model, registration
         As for :func:`modal_matrix`.
     width
-        Scale of the influence functions' own width; that of the pedestal is a multiple of it.
+        Scale of the influence functions' width; that of the pedestal is a fixed multiple of it.
     m2c
         Modes ``(n_act, n_modes)``; single actuators by default.
 
@@ -95,11 +100,10 @@ def pedestal_jacobian(
     derivatives : ndarray, ``(6, n_slopes, n_modes)``
         By the five parameters of the registration, in their units, and by ``width``.
     """
-    wide = PEDESTAL * width
     if m2c is None:
-        broad, derivatives = zonal_jacobian(model, registration, wide)
+        broad, derivatives = zonal_jacobian(model, registration, PEDESTAL * width)
     else:
-        broad, derivatives = modal_jacobian(model, registration, m2c, wide)
+        broad, derivatives = modal_jacobian(model, registration, m2c, PEDESTAL * width)
     return broad, np.concatenate([derivatives[:5], PEDESTAL * derivatives[5:]])
 
 

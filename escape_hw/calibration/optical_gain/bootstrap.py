@@ -15,8 +15,12 @@ from escape_hw.api.optical_gains import ClosureStep, GainRound, GainsResult, Opt
 from escape_hw.api.procedure import Procedure, Progress
 from escape_hw.api.results import CalibrationResult, StrehlEstimate
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.pokes import noise_gain, scale_to_strehl_budget, strehl_loss
-from escape_hw.calibration.acquisition.sensor_setup import compute_poke_amplitudes
+from escape_hw.calibration.acquisition.pokes import (
+    compute_poke_amplitudes,
+    noise_gain,
+    scale_to_strehl_budget,
+    strehl_loss,
+)
 from escape_hw.calibration.optical_gain.estimator import GainMeasurementLoop, LoopSegment, OpticalGainEstimate
 from escape_hw.calibration.optical_gain.loop_closure import bootstrap_loop
 from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
@@ -325,20 +329,16 @@ def bootstrap_gains(
         {**(beside or {}), **({} if shape is None else {_CLOSED_LOOP_MATRIX: shape})},
     )
     loop = GainMeasurementLoop(bench, calibration, all_comparisons, science=model_psf is not None)
-    before = bench.wfs.status().lost
-    try:
-        loop.start()
-        before = bench.wfs.status().lost
-        yield from close_and_scale_loop(loop, target_gain, poke, state)
-        yield from rounds(
-            loop, BootstrapTarget(poke, accuracy, budget, frames, model_psf), list(all_comparisons), state
-        )
-    except Aborted:
-        state.partial = True
-        _save_partial_round(loop, state)
-    finally:
-        loop.open_loop()
-    return _build_run(loop, calibration, shape, state, bench.wfs.status().lost - before)
+    with loop.closed():
+        try:
+            yield from close_and_scale_loop(loop, target_gain, poke, state)
+            yield from rounds(
+                loop, BootstrapTarget(poke, accuracy, budget, frames, model_psf), list(all_comparisons), state
+            )
+        except Aborted:
+            state.partial = True
+            _save_partial_round(loop, state)
+    return _build_run(loop, calibration, shape, state, loop.lost_frames)
 
 
 def _save_partial_round(loop: GainMeasurementLoop, state: BootstrapState) -> None:

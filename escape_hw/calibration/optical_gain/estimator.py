@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,13 +14,11 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.frames import next_frame
 from escape_hw.calibration.acquisition.pokes import RandomPokes
-from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, prepare_sensor
-from escape_hw.calibration.acquisition.stopping import CHECK_GROWTH
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
+from escape_hw.calibration.docrime.monitor import CHECK_GROWTH
 from escape_hw.calibration.docrime.response import ResponseEstimate
-from escape_hw.calibration.loop.performance import build_integrator
+from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.runner import LoopRecord, RunningLoop
 from escape_hw.calibration.optical_gain.matrix_comparison import projector, scale_matrix, slope_weights
 from escape_hw.errors import CalibrationError, IncompatibleProduct, TooFewFrames
@@ -201,8 +200,8 @@ class GainMeasurementLoop:
     """A loop whose pokes measure the optical gains of its matrix, and whose matrix can be scaled.
 
     Mirror and sensor answer in the same time from one measurement to the next, whatever the gains do: each
-    goes on with the temporal response that those before it found, from larger pokes as a rule. Whoever
-    makes one calls :meth:`open_loop` in a ``finally``.
+    goes on with the temporal response that those before it found, from larger pokes as a rule. Measure within
+    ``with loop.closed():``.
 
     Parameters
     ----------
@@ -240,25 +239,24 @@ class GainMeasurementLoop:
         self._known_response: ResponseEstimate | None = None
         # Refused here, before anything moves, if a mode is noise.
         self._estimator = self._new_estimator()
-        prepare_sensor(bench)
-        slopes_of = build_slope_function(bench, calibration.grid)
-        self._loop = RunningLoop(bench, self.reference.m2c, slopes_of, self.control, science=science)
-        self._science = bench.science if science else None
+        self._loop = RunningLoop.prepare(
+            bench, self.reference, calibration.grid, self.control, science=science
+        )
         self.frames = 0
 
-    def start(self) -> None:
-        """Flatten the mirror and read the first frame; what was lost before is no loss of the loop."""
-        self.bench.dm.flatten()
-        next_frame(self.bench)
-        if self._science is not None:
-            self._science.stop()
+    def closed(self) -> AbstractContextManager[None]:
+        """Context in which the loop is closed: the mirror is flattened on entry and on exit."""
+        return self._loop.closed()
+
+    @property
+    def lost_frames(self) -> int:
+        """Frames that the camera lost since the loop was closed."""
+        return self._loop.lost_frames
 
     def open_loop(self) -> None:
-        """Open the loop: the mirror flat, the controller without memory."""
-        self.bench.dm.flatten()
+        """Flatten the mirror and reset the controller."""
+        self._loop.open()
         self.control.reset()
-        if self._science is not None:
-            self._science.stop()
 
     def scale(self, gains: NDArray[np.float64]) -> None:
         """Go on with the matrix scaled by gains ``(n_modes,)``, without a bump.

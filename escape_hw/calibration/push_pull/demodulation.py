@@ -1,8 +1,8 @@
-"""Lock-in detection of many sinusoids at once (Esposito et al. 2006; Pinna et al. 2012).
+"""Lock-in detection of several sinusoidally driven modes at once (Esposito et al. 2006; Pinna et al. 2012).
 
-A mode driven as ``a sin(w t)`` moves slope s as ``a D_s Re[-i H(w) exp(i w t)]``, where ``H`` is the
-common temporal response. Slopes and sinusoids are differenced from frame to frame first, for the
-turbulence's power falls so steeply with frequency that it would leak into every line.
+A mode driven as ``a sin(w t)`` changes slope s as ``a D_s Re[-i H(w) exp(i w t)]``, where ``H`` is the common
+temporal response. Slopes and sinusoids are differenced from frame to frame first, because the power of
+turbulence decreases so steeply with frequency that it would leak into every line.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from escape_hw.errors import TooFewFrames
 
-#: Distances in frequency bins at which the noise beside a line is taken.
+#: Distances from a line, in frequency bins, at which its noise is measured.
 _NOISE_BINS = (-2, -1, 1, 2)
-#: Lines stand this many bins apart.
+#: Distance between lines in frequency bins.
 LINE_SPACING_BINS = 4
-#: Step of the search for the delay, in frames.
+#: Step of the delay search in frames.
 _DELAY_STEP = 0.01
 
 
@@ -42,12 +42,12 @@ class SpectralLines:
 
 
 def choose_line_frequencies(n_modes: int, frames: int, band: tuple[float, float]) -> NDArray[np.float64]:
-    """Angular frequencies for as many modes as a batch of frames can tell apart.
+    """Choose angular frequencies for the modes of a batch.
 
     Parameters
     ----------
     n_modes
-        Modes wanted.
+        Number of modes to drive.
     frames
         Frames of the batch.
     band
@@ -56,20 +56,20 @@ def choose_line_frequencies(n_modes: int, frames: int, band: tuple[float, float]
     Returns
     -------
     ndarray, ``(n,)``
-        In radians per frame, spread over the band, each a whole number of cycles per batch;
-        ``n`` is ``n_modes`` or as many as fit.
+        In radians per frame, spread over the band, each a whole number of cycles per batch; ``n`` is
+        ``n_modes`` or the number of lines that fit.
 
     Raises
     ------
     TooFewFrames
-        Not even one line fits.
+        No line fits.
     """
     low, high = int(np.ceil(band[0] * frames)), int(np.floor(band[1] * frames))
     n_fitting = (high - low) // LINE_SPACING_BINS + 1
     if n_fitting < 1 or low < LINE_SPACING_BINS:
         raise TooFewFrames(
-            f"{frames} frames per batch hold no line between {band[0]:g} and {band[1]:g} cycles per frame; "
-            "take more"
+            f"{frames} frames per batch resolve no line between {band[0]:g} and {band[1]:g} cycles per "
+            "frame; use more frames"
         )
     n = min(n_modes, n_fitting)
     bins = low + np.rint(np.linspace(0, high - low, n) if n > 1 else np.zeros(1))
@@ -83,28 +83,30 @@ def fit_lines(
     amplitude: NDArray[np.float64],
     frames: int,
 ) -> SpectralLines:
-    """Amplitudes of all lines by least squares on the frames that arrived.
+    """Fit the amplitudes of all lines by least squares on the frames received.
 
     Parameters
     ----------
     time
-        Frame indices ``(n,)``, rising; the modes were driven as ``amplitude sin(frequency time)``.
+        Frame indices ``(n,)``, increasing; the modes were driven as ``amplitude sin(frequency time)``.
     slopes
         ``(n, n_slopes)``.
     frequency, amplitude
-        Of the modes ``(n_modes,)``, in radians per frame and units of the modes.
+        Frequencies in radians per frame, and amplitudes of the modes ``(n_modes,)``.
     frames
-        Length of the batch, for the width of a frequency bin.
+        Frames of the batch, which give the width of a frequency bin.
 
     Raises
     ------
     TooFewFrames
-        Too few frames in a row for the number of lines.
+        Too few consecutive frames for the number of lines.
     """
     pairs = np.flatnonzero(np.diff(time) == 1)
     lines = frequency.size
     if pairs.size < 2 * lines + 2 * len(_NOISE_BINS):
-        raise TooFewFrames(f"{pairs.size} frames in a row cannot tell {lines} lines apart")
+        raise TooFewFrames(
+            f"{pairs.size} pairs of consecutive frames are too few for {lines} lines; use more frames"
+        )
     y = np.asarray(slopes[pairs + 1] - slopes[pairs], dtype=np.float64)
     sinusoids = np.exp(1j * np.outer(time, frequency)) * amplitude
     steps = sinusoids[pairs + 1] - sinusoids[pairs]
@@ -118,18 +120,18 @@ def fit_lines(
     for mode in range(lines):
         probe = np.exp(-1j * np.outer(noise_frequencies[mode], time[pairs + 1]))
         power[:, mode] = np.mean(np.abs(probe @ residuals) ** 2, axis=0) / pairs.size
-    # What is left lacks the degrees of freedom that the lines took.
+    # The residuals lack the degrees of freedom of the lines.
     power *= pairs.size / (pairs.size - 2 * lines)
-    # Four bins tell little of one slope at one line; the spectrum of all slopes has one shape.
+    # Four bins are few for one slope at one line; the spectra of all slopes are assumed to have one shape.
     power = np.outer(power.mean(axis=1), power.mean(axis=0)) / max(float(power.mean()), 1e-300)
     differenced = np.abs(1 - np.exp(-1j * frequency)) * np.abs(amplitude)
     return SpectralLines(amplitudes, np.sqrt(2 * power / pairs.size) / differenced, frequency)
 
 
 def frequency_response(frequency: NDArray[np.float64], delay: float) -> NDArray[np.complex128]:
-    """Response ``H`` of a mirror that holds each command for a frame, seen ``delay`` frames late.
+    """Response ``H`` of a mirror that holds each command for a frame, after a delay in frames.
 
-    A delay that is not whole shows a frame's command partly in one frame and partly in the next.
+    With a fractional delay, a command acts partly in one frame and partly in the next.
     """
     whole_frames = np.floor(delay)
     share = delay - whole_frames
@@ -137,17 +139,17 @@ def frequency_response(frequency: NDArray[np.float64], delay: float) -> NDArray[
 
 
 def estimate_delay(lines: SpectralLines, max_delay: float) -> tuple[float, float]:
-    """The delay that turns all lines onto the real axis, and its standard error, in frames.
+    """Delay that rotates all lines onto the real axis, and its standard error, in frames.
 
-    ``sum_s Z_s^2`` has twice the phase of ``H`` whatever the signs of ``D``; lines at several
-    frequencies leave no ambiguity.
+    ``sum_s Z_s^2`` has twice the phase of ``H`` for any signs of ``D``. Lines at several frequencies make the
+    delay unambiguous.
 
     Parameters
     ----------
     lines
-        From :func:`fit_lines`.
-    longest
-        Longest delay that is looked for.
+        Output of :func:`fit_lines`.
+    max_delay
+        Largest delay of the search in frames.
     """
     weight = 1 / np.mean(np.square(lines.sigma), axis=0)
     square = np.sum(lines.amplitude**2, axis=0) * weight
@@ -155,14 +157,13 @@ def estimate_delay(lines: SpectralLines, max_delay: float) -> tuple[float, float
     responses = np.array([frequency_response(lines.frequency, d) for d in delays])
     agreement = (square * np.exp(-2j * np.angle(responses))).real.sum(axis=1)
     best = int(np.argmax(agreement))
-    # Curvature of the log-likelihood: half of the agreement is its sum of squares.
-    signal = np.abs(square)
+    # Curvature of the log-likelihood, of which the sum of squares is half the agreement.
     slope = np.gradient(np.unwrap(np.angle(responses), axis=0), delays, axis=0)[best]
-    information = float(np.sum(signal * slope**2))
+    information = float(np.sum(np.abs(square) * slope**2))
     return float(delays[best]), float(1 / np.sqrt(max(information, 1e-300)))
 
 
 def compute_matrix(lines: SpectralLines, delay: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Interaction matrix and standard errors ``(n_slopes, n_modes)``, the response taken out."""
+    """Interaction matrix and standard errors ``(n_slopes, n_modes)``, divided by the temporal response."""
     response = frequency_response(lines.frequency, delay)
     return (lines.amplitude / response).real, lines.sigma / np.abs(response)

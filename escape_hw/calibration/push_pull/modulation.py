@@ -1,4 +1,4 @@
-"""Modulation and demodulation: several modes at once, each on a frequency of its own."""
+"""Modulation-demodulation: drives batches of modes as sinusoids on distinct frequencies."""
 
 from __future__ import annotations
 
@@ -18,14 +18,11 @@ from escape_hw.calibration.acquisition.frames import (
     next_frame,
     validate_frame_count,
 )
+from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
 from escape_hw.calibration.acquisition.preview import MatrixPreview
-from escape_hw.calibration.acquisition.sensor_setup import (
-    build_modal_basis,
-    build_slope_function,
-    compute_poke_amplitudes,
-    ensure_sensor_ready,
-)
+from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, ensure_sensor_ready
 from escape_hw.calibration.acquisition.stopping import Target, reject_accuracy_target
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.push_pull.demodulation import (
     SpectralLines,
     choose_line_frequencies,
@@ -37,12 +34,12 @@ from escape_hw.calibration.push_pull.run_state import MAX_ROUNDS, ModeByModeRun
 from escape_hw.errors import Aborted, CalibrationError
 from escape_hw.io.fits.run_state import RunState
 
-#: Band of the lines in cycles per frame: above most of the turbulence and of the bench's vibrations,
-#: below where the response of two frames' delay and a frame's hold has faded.
+#: Band of the lines in cycles per frame: above most of the turbulence and vibrations, and below frequencies
+#: at which the mirror hardly responds.
 BAND = (0.1, 0.4)
-#: Frames at the start of a batch that still hold the mirror's way into the motion.
+#: Frames at the start of a batch in which the motion of the mirror settles.
 _SETTLING_FRAMES = 10
-#: Mean squared ratio of elements to their standard errors; noise alone makes it 1.
+#: Least mean squared ratio of the elements to their standard errors; 1 for noise alone.
 _MIN_MEAN_POWER = 2.0
 
 
@@ -55,44 +52,45 @@ def modulation_demodulation(
     until: Target | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
-    """Drive batches of modes as sinusoids and detect them in step (Esposito et al. 2006; Pinna et al. 2012).
+    """Drive batches of modes as sinusoids and demodulate the slopes.
 
-    Works on a source and under turbulence alike.
+    See Esposito et al. (2006) and Pinna et al. (2012). Works on a calibration source and under
+    turbulence.
 
     Parameters
     ----------
     bench
         An open bench, loop open.
     frames
-        Frames per batch; as configured by default (``calibration.modulated_frames``).
+        Frames per batch; by default as configured (``calibration.modulated_frames``).
     poke
-        Amplitude of each mode, rms surface as fraction of full stroke; as configured by default.
+        Amplitude of each mode, rms surface as fraction of full stroke; by default as configured.
     grid
-        The sensor's geometry; found first when not given.
+        Geometry of the sensor; found first if not given.
     until
-        Drive each batch again until all its modes have this signal-to-noise ratio, up to
+        Repeat each batch until all its modes have this signal-to-noise ratio, at most
         :data:`~escape_hw.calibration.push_pull.run_state.MAX_ROUNDS` times.
-    keep
-        Where the state is kept meanwhile, and what to go on with.
+    checkpoint
+        Where the state is saved, and the state to resume from.
 
     Returns
     -------
     CalibrationResult
-        With the delay, found from the phases of all lines. Stopped early, ``partial`` is true and the
-        modes of later batches are left out.
+        With the delay from the phases of all lines. After an abort ``partial`` is true and the modes of later
+        batches are left out.
 
     Raises
     ------
     ConfigError
-        A number of frames, a poke or a target that means nothing; nothing moved.
+        The number of frames, the poke or the target is out of range; nothing moved.
     ProductError
-        The state to go on with is damaged or of another run; nothing moved.
+        The state to resume from is damaged or of another run; nothing moved.
     TooFewFrames
         Too few frames for a single line.
     CalibrationError
         No spots or pupil images, no light, or no response.
     Aborted
-        Stopped before the first batch was done.
+        Aborted before the first batch was measured.
     """
     c = bench.config.calibration
     n_frames = c.modulated_frames if frames is None else validate_frame_count(frames)
@@ -116,7 +114,7 @@ def modulation_demodulation(
         try:
             for modes in batches[len(run.batch_lines) :]:
                 yield from run.measure(m2c[:, modes], amplitude[modes], until)
-                if preview.due():
+                if preview.is_due():
                     yield report.now(preview(lambda: run.estimate_matrix(c.lags)))
         except Aborted:
             run.save_if_due(final=True)
@@ -129,7 +127,9 @@ def modulation_demodulation(
     delay, error = estimate_delay(lines, c.lags - 1)
     data, sigma = compute_matrix(lines, delay)
     if np.mean(np.square(data / np.maximum(sigma, 1e-300))) < _MIN_MEAN_POWER:
-        raise CalibrationError("the sensor does not respond to the mirror; is the light on, does it move?")
+        raise CalibrationError(
+            "the sensor does not respond to the mirror; check that the light is on and the mirror moves"
+        )
     delivered, lost = run.count_frames()
     matrix = build_interaction_matrix(
         bench, grid, m2c[:, : data.shape[1]], data, sigma, "modulated",
@@ -144,7 +144,7 @@ def modulation_demodulation(
 
 
 class _ModulationRun(ModeByModeRun):
-    """The batches measured so far, of ``frames`` frames each."""
+    """Batches measured so far, of ``frames`` frames each."""
 
     def __init__(self, *args: Any, frames: int) -> None:
         super().__init__(*args)
@@ -152,7 +152,6 @@ class _ModulationRun(ModeByModeRun):
         self.batch_lines: list[SpectralLines] = []
 
     def restore(self, state: RunState) -> None:
-        """Go on from a kept state."""
         super().restore(state)
         parts = state.arrays
         self.batch_lines = [
@@ -165,12 +164,12 @@ class _ModulationRun(ModeByModeRun):
     def measure(
         self, m2c: NDArray[np.float64], amplitude: NDArray[np.float64], until: Target | None
     ) -> Procedure[None]:
-        """Drive one batch, again until its modes are known as well as asked."""
+        """Drive one batch, repeatedly until its modes have the target's signal-to-noise ratio."""
         rounds: list[SpectralLines] = []
         for _ in range(MAX_ROUNDS if until is not None else 1):
             rounds.append((yield from _measure_batch(self, m2c, amplitude)))
             lines = _average_lines(rounds)
-            # Of real and imaginary part alike: the response turns one into the other.
+            # Of real and imaginary part together, which the response rotates into each other.
             size = np.sqrt(np.maximum(np.square(np.abs(lines.amplitude)) - np.square(lines.sigma), 0.0))
             if until is None or until.snr is None or snr_per_mode(size, lines.sigma).min() >= until.snr:
                 break
@@ -178,12 +177,11 @@ class _ModulationRun(ModeByModeRun):
         self.save_if_due()
 
     def estimate_matrix(self, lags: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Matrix and standard errors of the batches driven ``(n_slopes, n)``."""
+        """Matrix and standard errors of the batches so far ``(n_slopes, n)``."""
         lines = _concatenate_lines(self.batch_lines)
         return compute_matrix(lines, estimate_delay(lines, lags - 1)[0])
 
     def save_if_due(self, *, final: bool = False) -> None:
-        """Keep the state if it is time."""
         arrays: dict[str, NDArray[Any]] = {}
         for k, lines in enumerate(self.batch_lines):
             arrays[f"real{k}"], arrays[f"imaginary{k}"] = lines.amplitude.real, lines.amplitude.imag
@@ -193,7 +191,7 @@ class _ModulationRun(ModeByModeRun):
 
 
 def _average_lines(rounds: list[SpectralLines]) -> SpectralLines:
-    """The same lines from several rounds."""
+    """Mean of the same lines from several rounds."""
     variance = np.sum([np.square(lines.sigma) for lines in rounds], axis=0)
     amplitude = np.mean([lines.amplitude for lines in rounds], axis=0)
     return SpectralLines(amplitude, np.sqrt(variance) / len(rounds), rounds[0].frequency)
@@ -202,10 +200,10 @@ def _average_lines(rounds: list[SpectralLines]) -> SpectralLines:
 def _measure_batch(
     run: _ModulationRun, m2c: NDArray[np.float64], amplitude: NDArray[np.float64]
 ) -> Procedure[SpectralLines]:
-    """Drive some modes for a while and find their lines."""
+    """Drive some modes for a batch of frames and fit their lines."""
     bench, frames = run.bench, run.frames
     frequency = choose_line_frequencies(amplitude.size, frames, BAND)
-    # Phases that grow with the square of the number keep the sum of many sinusoids low (Schroeder 1970).
+    # Quadratic phases minimise the peak of the sum of many sinusoids (Schroeder 1970).
     phase = np.pi * np.arange(amplitude.size) ** 2 / amplitude.size
     sinusoids = amplitude * np.sin(np.outer(np.arange(frames + _SETTLING_FRAMES), frequency) + phase)
     shapes = sinusoids @ m2c.T
@@ -216,7 +214,7 @@ def _measure_batch(
     while not times or times[-1] + 1 < len(shapes):
         frame = next_frame(bench)
         first = frame.index if first is None else first
-        # Steps go by the camera's count: a lost frame delays one shape and puts none out of step.
+        # By the camera's frame index, so that a lost frame delays one shape and shifts none.
         step = frame.index - first
         slopes = run.slopes_of(frame.data)
         run.flux_monitor(run.slopes_of.flux)
@@ -235,7 +233,7 @@ def _measure_batch(
 
 
 def _amplitude_scale(bench: Bench, shapes: NDArray[np.float64]) -> float:
-    """Share of a sequence of shapes that the mirror can take without a limit touching any of them."""
+    """Largest factor up to 1 with which a sequence of shapes is within the mirror's limits."""
     dm = bench.dm
     scale = min(1.0, *(float(dm.largest_legal_scale(shape)) for shape in shapes))
     if dm.limits.max_slew is not None:
@@ -253,7 +251,7 @@ def _concatenate_lines(batch_lines: list[SpectralLines]) -> SpectralLines:
 
 
 def _as_temporal_response(delay: float, error: float, lags: int) -> TemporalResponse:
-    """The delay as the temporal response of the other methods: weights of whole frames."""
+    """The delay as a temporal response with weights of whole frames."""
     whole_frames = min(int(delay), lags - 2)
     weights, sigma = np.zeros(lags), np.zeros(lags)
     weights[whole_frames : whole_frames + 2] = 1 - (delay - whole_frames), delay - whole_frames

@@ -1,4 +1,4 @@
-"""Push-pull: the baseline interaction matrix, mode by mode (paper, Methodology)."""
+"""Push-pull: interaction matrix column by column from positive and negative pokes (paper, Methodology)."""
 
 from __future__ import annotations
 
@@ -20,27 +20,31 @@ from escape_hw.calibration.acquisition.frames import (
     ramp_to,
     validate_frame_count,
 )
+from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
 from escape_hw.calibration.acquisition.preview import MatrixPreview
 from escape_hw.calibration.acquisition.sensor_setup import (
-    build_modal_basis,
     build_slope_function,
-    compute_poke_amplitudes,
     ensure_sensor_ready,
     get_sensor_kind,
 )
 from escape_hw.calibration.acquisition.stopping import Target, reject_accuracy_target
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.push_pull.run_state import MAX_ROUNDS, ModeByModeRun
 from escape_hw.errors import Aborted, CalibrationError
 from escape_hw.io.fits.run_state import RunState
 
-#: Frames watched after a test step, to see when the sensor has settled.
+#: Frames after a test step from which the settling time is found.
 _STEP_FRAMES = 30
-#: The response has settled when it stays within this share of its end.
+#: Relative deviation from the final response below which it has settled.
 _SETTLED_FRACTION = 0.02
+#: Relative scatter of the final response above which there is none.
+_MAX_SCATTER = 0.3
 
 
-def settling_frames(bench: Bench, slopes_of: SlopeFunction, command: NDArray[np.float64]) -> Procedure[int]:
-    """Frames to skip after a step until the sensor shows all of it, found by a test step.
+def _find_settling_frames(
+    bench: Bench, slopes_of: SlopeFunction, command: NDArray[np.float64]
+) -> Procedure[int]:
+    """Find the number of frames to skip after a step, by a test step ``command (n_act,)``.
 
     Raises
     ------
@@ -58,12 +62,12 @@ def settling_frames(bench: Bench, slopes_of: SlopeFunction, command: NDArray[np.
     direction = end.mean(axis=0)
     response = steps @ direction / float(direction @ direction)
     scatter = float((end @ direction).std() / (direction @ direction))
-    if not scatter < 0.3:
+    if not scatter < _MAX_SCATTER:
         raise CalibrationError(
             "the wavefront sensor does not respond to a test step of the mirror; "
             "is the light on, and is the turbulence out of the beam?"
         )
-    # Averaged over the front, noise and vibration may exceed the band without meaning anything.
+    # Noise and vibration may exceed the band later on; only the first half counts.
     off = np.flatnonzero(np.abs(response[: _STEP_FRAMES // 2] - 1) > _SETTLED_FRACTION + 3 * scatter)
     return int(off[-1]) + 2 if off.size else 1
 
@@ -77,43 +81,42 @@ def push_pull(
     until: Target | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
-    """Push and pull every mode and average the slopes.
+    """Push and pull every mode and average the slopes: ``D_i = (s(+a e_i) - s(-a e_i)) / 2 a`` (paper).
 
-    ``D_i = (s(+a e_i) - s(-a e_i)) / 2 a`` (paper). Take it on a calibration source: on starlight the
-    turbulence drowns it.
+    Needs a calibration source; turbulence would dominate the result.
 
     Parameters
     ----------
     bench
         An open bench without turbulence.
     poke
-        Amplitude, rms surface as fraction of full stroke; as configured by default.
+        Amplitude, rms surface as fraction of full stroke; by default as configured.
     frames
-        Frames averaged per push and per pull; as configured by default.
+        Frames averaged per push and per pull; by default as configured.
     grid
-        The sensor's grid; found first when not given.
+        Geometry of the sensor; found first if not given.
     until
-        Push and pull each mode again until it has this signal-to-noise ratio, up to
+        Repeat each mode until it has this signal-to-noise ratio, at most
         :data:`~escape_hw.calibration.push_pull.run_state.MAX_ROUNDS` times.
-    keep
-        Where the state is kept meanwhile, and what to go on with.
+    checkpoint
+        Where the state is saved, and the state to resume from.
 
     Returns
     -------
     CalibrationResult
-        Standard errors from the scatter of the frames. Stopped early, ``partial`` is true and the
-        modes that were not reached are left out.
+        Standard errors are from the scatter of the frames. After an abort ``partial`` is true and the modes
+        not measured yet are left out.
 
     Raises
     ------
     ConfigError
-        A number of frames, a poke or a target that means nothing; nothing moved.
+        The number of frames, the poke or the target is out of range; nothing moved.
     ProductError
-        The state to go on with is damaged or of another run; nothing moved.
+        The state to resume from is damaged or of another run; nothing moved.
     CalibrationError
         No spots or pupil images, no light, or no response.
     Aborted
-        Stopped before the first mode was measured.
+        Aborted before the first mode was measured.
     """
     c = bench.config.calibration
     n_frames = c.push_pull_frames if frames is None else validate_frame_count(frames)
@@ -121,18 +124,15 @@ def push_pull(
     m2c = build_modal_basis(bench)
     amplitude = compute_poke_amplitudes(bench, m2c, poke)
     reject_accuracy_target(until)
-    state = (
-        None
-        if checkpoint is None
-        else checkpoint.begin(bench, "push-pull", m2c, {"poke": poke, "frames": n_frames})
-    )
+    settings = {"poke": poke, "frames": n_frames}
+    state = None if checkpoint is None else checkpoint.begin(bench, "push-pull", m2c, settings)
     known_grid = grid if state is None else state.grid
     try:
         grid, mean_frame = yield from ensure_sensor_ready(
             bench, known_grid, get_sensor_kind(bench).source_references
         )
         slopes_of = build_slope_function(bench, grid)
-        skip = yield from settling_frames(bench, slopes_of, m2c[:, 0] * amplitude[0] * 3)
+        skip = yield from _find_settling_frames(bench, slopes_of, m2c[:, 0] * amplitude[0] * 3)
         report = Reporter("push-pull", m2c.shape[1] * 2 * (skip + n_frames))
         run = _PushPullRun(bench, slopes_of, report, mean_frame, checkpoint, skip=skip, frames=n_frames)
         if state is not None:
@@ -141,7 +141,7 @@ def push_pull(
         try:
             for mode in range(len(run.columns), m2c.shape[1]):
                 yield from run.measure(m2c[:, mode], amplitude[mode], until)
-                if preview.due():
+                if preview.is_due():
                     yield report.now(preview(run.estimate_matrix))
         except Aborted:
             run.save_if_due(final=True)
@@ -163,7 +163,7 @@ def push_pull(
 
 
 class _PushPullRun(ModeByModeRun):
-    """The modes measured so far: ``skip`` and ``frames`` are let pass after a step, and averaged."""
+    """Modes measured so far; after each step ``skip`` frames are skipped and ``frames`` averaged."""
 
     def __init__(self, *args: Any, skip: int, frames: int) -> None:
         super().__init__(*args)
@@ -172,12 +172,11 @@ class _PushPullRun(ModeByModeRun):
         self.errors: list[NDArray[np.float64]] = []
 
     def restore(self, state: RunState) -> None:
-        """Go on from a kept state."""
         super().restore(state)
         self.columns, self.errors = list(state.arrays["columns"]), list(state.arrays["errors"])
 
     def measure(self, shape: NDArray[np.float64], amplitude: float, until: Target | None) -> Procedure[None]:
-        """Push and pull one mode, again until it is known as well as asked."""
+        """Push and pull one mode ``(n_act,)``, repeatedly until it has the target's signal-to-noise ratio."""
         columns, variances = [], []
         for _ in range(MAX_ROUNDS if until is not None else 1):
             column, error = yield from _measure_mode(self, shape, amplitude)
@@ -196,7 +195,6 @@ class _PushPullRun(ModeByModeRun):
         return np.stack(self.columns, 1), np.stack(self.errors, 1)
 
     def save_if_due(self, *, final: bool = False) -> None:
-        """Keep the state if it is time."""
         if self.columns:
             self.checkpoint({}, {"columns": np.array(self.columns), "errors": np.array(self.errors)}, final)
 
@@ -204,10 +202,10 @@ class _PushPullRun(ModeByModeRun):
 def _measure_mode(
     run: _PushPullRun, shape: NDArray[np.float64], amplitude: float
 ) -> Procedure[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Column and its standard errors for one mode, each ``(n_slopes,)``."""
+    """Measure the column of one mode and its standard errors, each ``(n_slopes,)``."""
     means, variances, sent = [], [], []
     for sign in (1.0, -1.0):
-        # What the limits took off was not poked: the amplitude is that of the shape really sent.
+        # The amplitude as sent, which the limits may have reduced.
         sent_command = ramp_to(run.bench.dm, sign * amplitude * shape).sent
         sent.append(float(sent_command @ shape / (shape @ shape)))
         stack = yield from _acquire_slopes(
@@ -217,17 +215,15 @@ def _measure_mode(
         for slopes in stack:
             run.slope_statistics.add(slopes)
         means.append(stack.mean(axis=0, dtype=np.float64))
-        variances.append(
-            stack.var(axis=0, ddof=1, dtype=np.float64) / run.frames
-            if run.frames > 1
-            else np.full(stack.shape[1], np.nan)
-        )
+        if run.frames > 1:
+            variances.append(stack.var(axis=0, ddof=1, dtype=np.float64) / run.frames)
+        else:
+            variances.append(np.full(stack.shape[1], np.nan))
     amplitude_difference = sent[0] - sent[1]
     if not amplitude_difference > 0:
-        raise CalibrationError("a poke was clipped away entirely; lower calibration.push_pull_poke")
-    return (means[0] - means[1]) / amplitude_difference, np.sqrt(
-        variances[0] + variances[1]
-    ) / amplitude_difference
+        raise CalibrationError("the limits left nothing of a poke; lower calibration.push_pull_poke")
+    column = (means[0] - means[1]) / amplitude_difference
+    return column, np.sqrt(variances[0] + variances[1]) / amplitude_difference
 
 
 def _acquire_slopes(
@@ -237,7 +233,7 @@ def _acquire_slopes(
     report: Reporter,
     flux_monitor: FluxMonitor | None = None,
 ) -> Procedure[NDArray[np.float32]]:
-    """Slopes of the next frames ``(frames, n_slopes)``; ``report`` counts them on."""
+    """Slopes of the next frames ``(frames, n_slopes)``."""
     stack = np.empty((frames, slopes_of.grid.n_slopes), np.float32)
     for row in stack:
         row[:] = slopes_of(next_frame(bench).data)

@@ -1,4 +1,4 @@
-"""A measurement that goes on from one mode, or batch of modes, to the next."""
+"""State of a measurement that proceeds mode by mode, or batch by batch of modes."""
 
 from __future__ import annotations
 
@@ -12,31 +12,32 @@ from escape_hw.api.procedure import Reporter
 from escape_hw.api.sensor import SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.checkpoint import Checkpoint
-from escape_hw.calibration.acquisition.frames import FluxMonitor, SlopeStatistics
+from escape_hw.calibration.acquisition.frames import FluxMonitor
+from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 from escape_hw.io.fits.run_state import RunState
 
-#: Times that a step is repeated at most, to reach a signal-to-noise ratio.
+#: Largest number of repetitions of a step, to reach a signal-to-noise ratio.
 MAX_ROUNDS = 16
 
 
 class ModeByModeRun:
-    """What the steps so far amount to, beside their results.
+    """State that all measurements mode by mode share: slope statistics, frame counts, checkpoint.
 
     Parameters
     ----------
     bench, slopes_of
-        The bench and its slopes.
+        Bench and slope function.
     report
-        Counts the frames for the progress.
+        Progress reporter, which counts frames.
     mean_frame
-        What the geometry was found on; ``None`` if it was known.
-    keep
-        Where the state goes.
+        Mean frame that the geometry was found on; ``None`` if the geometry was given.
+    checkpoint
+        Where the state is saved; ``None``: it is not saved.
 
     Attributes
     ----------
-    motion, light
-        Watch the slopes and the light of all frames.
+    slope_statistics, flux_monitor
+        Statistics of the slopes and flux check of all frames.
     """
 
     def __init__(
@@ -53,20 +54,20 @@ class ModeByModeRun:
         self._checkpoint, self._start_status, self._resumed_counts = checkpoint, bench.wfs.status(), (0, 0)
 
     def restore(self, state: RunState) -> None:
-        """Go on from a kept state."""
+        """Continue from a saved state."""
         self.mean_frame = state.arrays.get("mean_frame", self.mean_frame)
         self.slope_statistics.restore(state.arrays["motion"])
         self._resumed_counts = int(state.values["delivered"]), int(state.values["lost"])
 
     def count_frames(self) -> tuple[int, int]:
-        """Frames delivered and lost, those of the run it goes on with included."""
+        """Number of frames delivered and lost, including those of a resumed run."""
         now = self.bench.wfs.status()
         delivered, lost = now.delivered - self._start_status.delivered, now.lost - self._start_status.lost
         return self._resumed_counts[0] + delivered, self._resumed_counts[1] + lost
 
     def checkpoint(self, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], final: bool) -> None:
-        """Keep the state if it is time, or in any case; ``values`` and ``arrays`` are the steps' own."""
-        if self._checkpoint is None or not (final or self._checkpoint.due()):
+        """Save the state with these further entries, if it is time or this is the ``final`` state."""
+        if self._checkpoint is None or not (final or self._checkpoint.is_due()):
             return
         delivered, lost = self.count_frames()
         common: dict[str, NDArray[Any]] = {"motion": self.slope_statistics.state()}

@@ -22,9 +22,12 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
-from escape_hw.calibration.docrime.closed_loop_response import responses_differ
-from escape_hw.calibration.docrime.forgetting_sums import whiten_columns
-from escape_hw.calibration.docrime.open_loop import MAX_CORRELATED_SLOPES
+from escape_hw.calibration.docrime.regression import (
+    MAX_CORRELATED_SLOPES,
+    InstrumentalEquations,
+    whiten_columns,
+)
+from escape_hw.calibration.docrime.response import select_response
 from escape_hw.calibration.docrime.whitening import (
     apply_filter,
     apply_history_filters,
@@ -62,7 +65,7 @@ class TelemetryFit:
         The filter over time, for frames with a full past.
     covariance
         Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``;
-        ``None`` with more than :data:`~escape_hw.calibration.docrime.open_loop.MAX_CORRELATED_SLOPES` slopes.
+        ``None`` with more than :data:`~escape_hw.calibration.docrime.regression.MAX_CORRELATED_SLOPES` slopes.
     rows
         Whitened frames that it rests on.
     """
@@ -246,13 +249,14 @@ class _WhitenedFrames:
         """What the frames say of the matrix, in columns with equal and independent noise.
 
         In closed loop the pokes are the instruments of the commands, and what the best matrix makes of
-        the controller's part is taken out beforehand (:mod:`~.fading_sums`).
+        the controller's part is taken out beforehand (:mod:`~escape_hw.calibration.docrime.regression`).
         """
-        delayed_commands, poked = self.delayed_commands(response), np.tensordot(response, self.pokes, axes=1)
-        gram, cross = poked.T @ poked, self.slopes.T @ poked
+        poked = np.tensordot(response, self.pokes, axes=1)
+        sums = InstrumentalEquations.from_rows(self.slopes, self.delayed_commands(response), poked)
+        cross = sums.cross
         if matrix is not None and self.commands is not self.pokes:
-            cross = cross - matrix @ (delayed_commands.T @ poked - gram)
-        return whiten_columns(template, cross, gram, gram, variance)
+            cross = sums.poke_response(matrix)
+        return whiten_columns(template, cross, sums.poke_products, sums.poke_products, variance)
 
 
 def delay_rows(pokes: NDArray[np.floating], lag: int) -> NDArray[np.floating]:
@@ -301,13 +305,7 @@ def _estimate_response(
     scaled = (np.eye(lags) - weights[:, None]) @ bread / total
     covariance = scaled @ (scores @ scores.T) @ scaled.T
     measured = TemporalResponse(weights, np.sqrt(np.diag(covariance)))
-    if (
-        known is not None
-        and known.sigma.max() < measured.sigma.max()
-        and not responses_differ(measured, known)
-    ):
-        return known
-    return measured
+    return select_response(measured, known)
 
 
 def fit_whitener(

@@ -10,8 +10,7 @@ import numpy as np
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import TemporalResponse
 from escape_hw.api.tracking import Alarm
-from escape_hw.calibration.docrime.closed_loop_response import responses_differ
-from escape_hw.calibration.loop.runner import LoopRecord
+from escape_hw.calibration.docrime.response import responses_differ
 from escape_hw.calibration.tracking.live_registration import LiveEstimate
 
 #: Standard errors that an update may miss what was expected by.
@@ -25,9 +24,6 @@ ACTUATOR_GAIN_LIMIT = 0.5
 QUIET_UPDATES = 5
 #: Updates that tell what is usual.
 _BASELINE_UPDATES = 30
-#: The loop is lost when its residual is this many times the usual, or that many if the mirror is held at its
-#: limits for this share of the frames; and the seconds that tell what is usual at least.
-DIVERGED_FACTOR, DIVERGED_AT_LIMIT_FACTOR, _AT_LIMIT_FRACTION, _MIN_BASELINE_SECONDS = 4.0, 2.0, 0.9, 3
 
 
 class AlarmMonitor:
@@ -110,30 +106,6 @@ class AlarmMonitor:
                 f"tracking.max_shift ({self._max_shift:g}); calibrate anew"
             )
         return new_alarms
-
-
-class DivergenceMonitor:
-    """Looks at every second of a loop for one that runs away.
-
-    While pokes are injected a command beyond the limits is shortened as a whole, so a loop that runs away
-    holds a few actuators at their limits, not many; and a pyramid's slopes saturate before the mirror does.
-    """
-
-    def __init__(self) -> None:
-        self._residual: deque[float] = deque(maxlen=_BASELINE_UPDATES)
-
-    def __call__(self, record: LoopRecord, frames: int, shortened: int) -> bool:
-        """Whether the loop was lost in the frames after the first ``frames``, ``shortened`` of them cut."""
-        residual = np.array(record.residual[frames:])
-        rms = float(np.sqrt(np.mean(np.square(residual))))
-        baseline = (
-            float(np.median(self._residual)) if len(self._residual) >= _MIN_BASELINE_SECONDS else np.inf
-        )
-        at_limit = record.shortened - shortened > _AT_LIMIT_FRACTION * len(residual)
-        if rms > (DIVERGED_AT_LIMIT_FACTOR if at_limit else DIVERGED_FACTOR) * baseline:
-            return True
-        self._residual.append(rms)
-        return False
 
 
 def _baseline(values: Sequence[float]) -> float:

@@ -18,9 +18,8 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.results import Estimate, RegistrationEstimate, TemporalResponse
 from escape_hw.api.synthetic_model import HasSystematicError, SyntheticModel
 from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
-from escape_hw.calibration.docrime.closed_loop_response import ResponseAccumulator
-from escape_hw.calibration.docrime.forgetting_sums import ForgettingSums, whiten_columns
-from escape_hw.calibration.docrime.response import FilteredTelemetry, filter_telemetry
+from escape_hw.calibration.docrime.regression import ForgettingSums, whiten_columns
+from escape_hw.calibration.docrime.response import FilteredTelemetry, ResponseAccumulator, filter_telemetry
 from escape_hw.calibration.optical_gain.smoothing import compute_command_curves, gain_curve_basis
 from escape_hw.calibration.sprint.covariance import sandwich_covariance
 from escape_hw.calibration.sprint.extra_parameters import build_fitted_extra_parameters, priors_from_fit
@@ -242,7 +241,7 @@ class LiveRegistration:
         """Gauss-Newton on the sums: one step, or several the first time."""
         state = self._state
         for _ in range(_FIRST_ITERATIONS if state is None else 1):
-            columns = self._sums.columns(self._template, self._matrix)
+            columns = self._sums.build_columns(self._template, self._matrix)
             weighted = apply_model_weights(
                 WeightedMatrix.of(columns, np.arange(columns.n_modes)), self._model
             )

@@ -18,19 +18,16 @@ from escape_hw.api.results import CalibrationResult, RegistrationEstimate, Tempo
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.tracking import Alarm, TrackResult
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.frames import SlopeStatistics, next_frame
-from escape_hw.calibration.acquisition.sensor_setup import (
-    build_slope_function,
-    compute_poke_amplitudes,
-    prepare_sensor,
-)
+from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
+from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry, TelemetryBuffer
-from escape_hw.calibration.loop.performance import build_integrator
-from escape_hw.calibration.loop.runner import RunningLoop
+from escape_hw.calibration.loop.control import build_integrator
+from escape_hw.calibration.loop.divergence import BlockResidualMonitor, DivergenceLimits
+from escape_hw.calibration.loop.runner import SETTLING_S, RunningLoop
 from escape_hw.calibration.optical_gain.smoothing import COEFFICIENT_SIGMA
 from escape_hw.calibration.sprint.fit import sprint, sprint_options_from_config
 from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_matrix, synthesise_calibration
-from escape_hw.calibration.tracking.alarms import AlarmMonitor, DivergenceMonitor
+from escape_hw.calibration.tracking.alarms import AlarmMonitor
 from escape_hw.calibration.tracking.exchange import (
     ActiveReconstructor,
     ExchangeProposal,
@@ -126,8 +123,8 @@ log = logging.getLogger(__name__)
 
 #: Seconds between two looks at the registration.
 STEP_S = 1.0
-#: Seconds in which the loop closes, and then those in which the slopes' motion is measured.
-_CLOSING_S, _MOTION_S = 0.3, 1.0
+#: Seconds after settling in which the slope statistics are measured.
+_MOTION_S = 1.0
 #: Updates before the first exchange: the memory must hold something first.
 _FIRST_EXCHANGE = 3
 #: Updates over which a Strehl ratio is taken.
@@ -232,7 +229,7 @@ class _Tracker:
         self.pending_update: Future[TrackerUpdate | None] | None = None
         self.metrics: dict[str, float] = {}
         self.arrays: dict[str, NDArray[np.float32]] = {}
-        self.divergence_monitor = DivergenceMonitor()
+        self.divergence_monitor = BlockResidualMonitor(DivergenceLimits.from_config(bench.config))
 
     def prepare(self, slope_statistics: SlopeStatistics) -> None:
         """Build the model for the light that the closed loop leaves, and start on it; in the thread.
@@ -256,32 +253,22 @@ class _Tracker:
     def run(self, seconds: float) -> Procedure[TrackResult]:
         """Close the loop, track, open the loop."""
         bench, result = self.bench, self.result
-        prepare_sensor(bench)
-        bench.dm.flatten()
-        next_frame(bench)
-        lost, result.start_ns = bench.wfs.status().lost, bench.wfs.now_ns()
-        science = bench.science if self.psf is not None else None
-        if science is not None:
-            science.stop()
-        slopes_of = build_slope_function(bench, self.grid)
-        loop = RunningLoop(
-            bench, self.in_use.matrix.m2c, slopes_of, self.control, science=science is not None
+        loop = RunningLoop.prepare(
+            bench, self.in_use.matrix, self.grid, self.control, science=self.psf is not None
         )
         report = Reporter("tracking", math.ceil(seconds / STEP_S), "second")
         with ThreadPoolExecutor(1, thread_name_prefix="live registration") as pool:
-            try:
-                yield from self._track(loop, report, pool)
-            except Aborted:
-                result.partial = True
-            except CalibrationError as error:
-                result.alarms.append(Alarm(self._elapsed_s(), "dark", str(error)))
-                result.stable = False
-            finally:
-                bench.dm.flatten()
-                if science is not None:
-                    science.stop()
+            with loop.closed():
+                result.start_ns = loop.closed_at_ns
+                try:
+                    yield from self._track(loop, report, pool)
+                except Aborted:
+                    result.partial = True
+                except CalibrationError as error:
+                    result.alarms.append(Alarm(self._elapsed_s(), "dark", str(error)))
+                    result.stable = False
             self._handle_update(loop, running=False)
-        result.frames, result.lost_frames = loop.record.frames, bench.wfs.status().lost - lost
+        result.frames, result.lost_frames = loop.record.frames, loop.lost_frames
         result.rate_hz = loop.record.frames / max(self._elapsed_s(), 1e-9)
         return result
 
@@ -289,7 +276,7 @@ class _Tracker:
         """Second after second; the answer of each is taken up at the end of the next."""
         slope_statistics = SlopeStatistics(self.grid.n_slopes)
         rate = self.bench.wfs.settings.frame_rate_hz
-        yield from self._forward_progress(loop.run(max(1, round(_CLOSING_S * rate))), report, 0)
+        yield from self._forward_progress(loop.run(max(1, round(SETTLING_S * rate))), report, 0)
         observers = [lambda *frame: slope_statistics.add(frame[1])]
         yield from self._forward_progress(
             loop.run(max(2, round(_MOTION_S * rate)), observe=observers), report, 0

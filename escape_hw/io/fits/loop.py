@@ -57,7 +57,11 @@ def save_loop(
         name: getattr(result, name)
         for name in ("gain", "leak", "dropped_modes", "frames", "lost_frames", "rate_hz", "residual_rms_nm")
     }
-    run |= {"latency_us": dict(result.latency_us), "notes": list(result.notes)}
+    run |= {
+        "gain_sigma": result.gain_sigma,
+        "latency_us": dict(result.latency_us),
+        "notes": list(result.notes),
+    }
     hdus = [
         primary,
         fits_parts.pack_metrics(run, "RUN"),
@@ -116,5 +120,6 @@ def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> L
         latency_us={str(name): float(value) for name, value in run["latency_us"].items()},
         partial=header["FINISH"] == "aborted",
         notes=tuple(str(note) for note in run["notes"]),
+        gain_sigma=run.get("gain_sigma"),
         **images,
     )

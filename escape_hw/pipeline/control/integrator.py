@@ -12,35 +12,29 @@ from escape_hw.pipeline.control.matrix_products import PACKING_BYTES, PackedMatr
 
 
 class Controller(Protocol):
-    """Turns slopes into modal commands, frame by frame.
-
-    Attributes
-    ----------
-    residual
-        Reconstructed slopes of the last frame ``(n_modes,)``.
-    """
+    """Modal controller: computes a modal command from the slopes of each frame."""
 
     @property
     def residual(self) -> NDArray[np.float32]:
-        """See the class."""
+        """Reconstructed wavefront of the last frame ``(n_modes,)``."""
         ...
 
     def __call__(self, slopes: NDArray[np.float32]) -> NDArray[np.floating]:
-        """Next modal command ``(n_modes,)`` from slopes ``(n_slopes,)``; the same array at every call."""
+        """Modal command ``(n_modes,)`` for slopes ``(n_slopes,)``; the same array at every call."""
         ...
 
     def set_applied(self, modes: NDArray[np.floating]) -> None:
-        """Tell the controller what the mirror really took of its command ``(n_modes,)``."""
+        """Set the state to the command that the mirror executed ``(n_modes,)``."""
         ...
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Set the state to zero."""
         ...
 
 
 @njit(cache=True, nogil=True)
 def _step(matrix, slopes, retention, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """One step, compiled as a whole: in small systems calls cost more than arithmetic."""
+    """Reconstruct and integrate; compiled as a whole because calls dominate in small systems."""
     np.dot(matrix, slopes, residual)
     for k in range(state.size):
         state[k] = retention * state[k] - gains[k] * residual[k]
@@ -55,8 +49,8 @@ def _integrate(retention, gains, residual, state):  # type: ignore[no-untyped-de
 def gain_limit(delay_frames: float) -> float:
     """Largest stable gain of an integrator behind a pure delay.
 
-    ``2 sin(pi / (2 (2 d - 1)))``, exact for whole delays: 2 for one frame, 1 for two (from the
-    phase margin of ``c[k] = c[k-1] - g c[k-d]``).
+    ``2 sin(pi / (2 (2 d - 1)))``, from the phase margin of ``c[k] = c[k-1] - g c[k-d]``; exact for whole
+    delays (2 for one frame, 1 for two).
 
     Parameters
     ----------
@@ -68,16 +62,16 @@ def gain_limit(delay_frames: float) -> float:
 
 
 class LeakyIntegrator:
-    """Modal leaky integrator ``c <- (1 - leak) c - gain R s`` that knows what was really applied.
+    """Modal leaky integrator ``c <- (1 - leak) c - gain R s`` with anti-windup.
 
     Parameters
     ----------
     reconstructor
         ``(n_modes, n_slopes)``.
     gain
-        Loop gain, or one for each mode ``(n_modes,)``.
+        Loop gain, or one per mode ``(n_modes,)``.
     leak
-        Share of the state lost per frame.
+        Share of the state that is lost per frame.
 
     Raises
     ------
@@ -100,7 +94,7 @@ class LeakyIntegrator:
 
     @property
     def reconstructor(self) -> NDArray[np.float32]:
-        """The reconstructor in use ``(n_modes, n_slopes)``; not to be written to."""
+        """The reconstructor in use ``(n_modes, n_slopes)``; must not be modified."""
         return self._matrix
 
     @property
@@ -109,12 +103,12 @@ class LeakyIntegrator:
         return self._gains.copy()
 
     def set_gain(self, gain: float | NDArray[np.floating]) -> None:
-        """Go on with another gain, or other gains ``(n_modes,)``; the state stays.
+        """Change the gain, or the gains ``(n_modes,)``; the state is kept.
 
         Raises
         ------
         ValueError
-            A gain is not positive, or there are not as many as modes.
+            A gain is not positive, or the number of gains is wrong.
         """
         gains = np.asarray(gain, float)
         if gains.shape not in ((), self._gains.shape):
@@ -124,15 +118,15 @@ class LeakyIntegrator:
         self._gains[:] = gains
 
     def set_reconstructor(self, reconstructor: NDArray[np.float32]) -> None:
-        """Go on with another reconstructor ``(n_modes, n_slopes)`` without a bump.
+        """Exchange the reconstructor ``(n_modes, n_slopes)`` without a bump.
 
-        The state, a command in the same modes, stays: the mirror's next shape differs from the present
-        one only by what the next slopes add.
+        The state, a command in the same modes, is kept, so the next shape of the mirror differs from the
+        present one only by the correction from the next slopes.
 
         Raises
         ------
         ValueError
-            It has another shape.
+            The new reconstructor has another shape.
         """
         if reconstructor.shape != self._matrix.shape:
             raise ValueError(
@@ -142,16 +136,13 @@ class LeakyIntegrator:
         self._install(np.array(reconstructor, np.float32, order="C"))
 
     def _install(self, matrix: NDArray[np.float32]) -> None:
-        """Take a reconstructor into use, in the form that is fastest."""
-        self._matrix, self._packed = (
-            matrix,
-            PackedMatrix.of(matrix) if matrix.nbytes > PACKING_BYTES else None,
-        )
+        self._matrix = matrix
+        self._packed = PackedMatrix.of(matrix) if matrix.nbytes > PACKING_BYTES else None
 
     def __call__(self, slopes: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Next modal command ``(n_modes,)`` from slopes ``(n_slopes,)``; also sets ``residual``.
+        """Modal command ``(n_modes,)`` for slopes ``(n_slopes,)``; also sets ``residual``.
 
-        The command and ``residual`` are the same arrays at every call; copy what is to be kept.
+        Command and ``residual`` are the same arrays at every call.
         """
         if self._packed is None:
             _step(self._matrix, slopes, self._retention, self._gains, self.residual, self.state)
@@ -161,9 +152,9 @@ class LeakyIntegrator:
         return self.state
 
     def set_applied(self, modes: NDArray[np.floating]) -> None:
-        """Tell the integrator what the mirror really did, so that it does not wind up."""
+        """Set the state to the command that the mirror executed ``(n_modes,)``, against wind-up."""
         self.state[:] = modes
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Set the state to zero."""
         self.state[:] = 0.0

@@ -9,14 +9,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-#: Bytes in single precision above which a matrix is packed: what a processor's own cache does not hold.
+#: Size in single precision above which a matrix is packed: it does not fit into a processor's cache.
 PACKING_BYTES = 4 << 20
 _MAX_MANTISSA = 32767
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _product(mantissa, scale, vector, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Sums may be taken in any order, which vectorises them; what is not finite stays so."""
+    """Compiled with reordered sums, which vectorises them; NaN and infinity are preserved."""
     rows, columns = mantissa.shape
     for i in range(rows):
         total = np.float32(0)
@@ -27,11 +27,11 @@ def _product(mantissa, scale, vector, out):  # type: ignore[no-untyped-def]  # p
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedMatrix:
-    """A matrix whose rows are whole numbers of 16 bits times a factor each.
+    """A matrix of 16-bit integers with one scale factor per row.
 
-    A product with a vector reads half the memory that single precision does, and takes half the time. Each
-    element is off by at most 1/65534 of the largest in its row, so a product of a reconstructor by about
-    1e-4 of itself: far below the noise of any slope.
+    A product with a vector reads half the memory of single precision and takes half the time. The error of
+    each element is at most 1/65534 of the largest in its row; the relative error of a reconstructed mode is
+    about 1e-4, far below the noise of the slopes.
 
     Parameters
     ----------
@@ -52,24 +52,18 @@ class PackedMatrix:
         return cls(np.ascontiguousarray(np.rint(shares), np.int16), scale.astype(np.float32))
 
     def product(self, vector: NDArray[np.float32], out: NDArray[np.float32]) -> None:
-        """Fill ``out (rows,)`` with the product with ``vector (columns,)``."""
+        """Compute the product with ``vector (columns,)`` into ``out (rows,)``."""
         _product(self.mantissa, self.scale, vector, out)
 
 
-#: Makes of a modal command ``(n_modes,)`` a shape ``(n_act,)``, the same array at every call.
+#: Converts a modal command ``(n_modes,)`` to actuator commands ``(n_act,)``, the same array at every call.
 CommandMapper = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def build_command_mapper(m2c: NDArray[np.float64]) -> CommandMapper:
-    """The fastest way to multiply with a mode-to-command matrix ``(n_act, n_modes)``.
+    """Build the fastest multiplication with a mode-to-command matrix ``(n_act, n_modes)``.
 
-    Zonal modes move one actuator each: no product is needed. A large matrix of other modes is held in single
-    precision, which is a hundred thousand times finer than a mirror's steps.
-
-    Parameters
-    ----------
-    m2c
-        The matrix.
+    Zonal modes need no matrix product. Large matrices of other modes are stored in single precision.
     """
     shape = np.zeros(m2c.shape[0])
     zonal = zonal_actuators(m2c)
@@ -96,7 +90,7 @@ def build_command_mapper(m2c: NDArray[np.float64]) -> CommandMapper:
 
 
 def zonal_actuators(m2c: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]] | None:
-    """Which actuator each mode moves, and by how much, if each moves one of its own; ``None`` otherwise."""
+    """Actuator and amplitude of each mode, if every mode moves one actuator of its own; else ``None``."""
     moved = m2c != 0
     if not (moved.sum(axis=0) == 1).all() or moved.sum(axis=1).max() > 1:
         return None

@@ -15,21 +15,20 @@ def reconstructor(
     dropped_modes: int = 0,
     regularisation: float = 0.0,
 ) -> NDArray[np.float32]:
-    """Pseudo-inverse by singular values, truncated or damped.
+    """Pseudo-inverse by singular values, truncated or with Tikhonov regularisation.
 
-    ``R = V Sigma^+(phi) U^T`` (paper), with the ``phi`` largest of the singular values kept; with
-    Tikhonov regularisation ``sigma^+ = sigma / (sigma^2 + lambda^2)``.
+    ``R = V Sigma^+(phi) U^T`` (paper) with the ``phi`` largest singular values, where
+    ``sigma^+ = sigma / (sigma^2 + lambda^2)``.
 
     Parameters
     ----------
     matrix
         Interaction matrix ``(n_slopes, n_modes)``.
     scale
-        Stroke that a unit of each mode takes ``(n_modes,)``. Eigenmodes are those of slopes per
-        stroke, so that the weakest are what costs the mirror most for the least signal; by default
-        every mode counts alike.
+        Stroke per unit of each mode ``(n_modes,)``; by default equal. The singular values are those of slopes
+        per stroke, so that the weakest eigenmodes need most stroke for least signal.
     dropped_modes
-        How many of the weakest eigenmodes are left out.
+        Number of the weakest eigenmodes that are left out.
     regularisation
         lambda relative to the largest singular value; 0 for none.
 
@@ -40,7 +39,7 @@ def reconstructor(
     Raises
     ------
     CalibrationError
-        Nothing is left, or the matrix is not finite.
+        No eigenmode is left, or the matrix is singular or not finite.
     """
     if not np.isfinite(matrix).all():
         raise CalibrationError("the interaction matrix is not finite; measure it again")
@@ -52,7 +51,7 @@ def reconstructor(
     kept = slice(0, min(n_modes, s.size) - dropped_modes)
     if s[0] <= 0 or s[kept][-1] <= s[0] * 1e-12:
         raise CalibrationError(
-            f"the interaction matrix is singular: eigenmode {s[kept].size} is not seen at all; "
+            f"the interaction matrix is singular: eigenmode {s[kept].size} has no signal; "
             "drop more modes or measure it again"
         )
     inverse = s[kept] / (s[kept] ** 2 + (regularisation * s[0]) ** 2)

@@ -1,4 +1,4 @@
-"""Finding the lenslet grid, the valid sub-apertures and the references from frames."""
+"""Finds the lenslet grid, the valid sub-apertures and the references on mean frames."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes, subaperture_windows
 
-#: How far the real pitch may lie from the nominal one.
+#: Largest relative deviation of the pitch from the nominal one.
 _PITCH_RANGE = 0.03
-#: Least contrast of the light folded at the pitch. Spots under the strongest screen of the bench leave
-#: 0.85, spots that do not stand on the lattice below 0.2.
+#: Least contrast of the light folded at the pitch. Spots under the strongest phase screen of the bench have
+#: 0.85, spots off the lattice less than 0.2.
 _CONTRAST = 0.3
-#: Contrast that the noise of a dark camera does not reach: it makes up to 0.06.
+#: Contrast above that of the noise of a dark camera, which is up to 0.06.
 _NOISE_CONTRAST = 0.1
-#: Spots further off the lattice than this many median distances do not count.
+#: Distance of a spot from the lattice, in median distances, above which it is left out.
 _MAX_DISTANCE = 5.0
-#: A pixel brighter than so many times its brightest neighbour is no part of a spot, but hot.
+#: Ratio of a pixel to its brightest neighbour above which it is hot and not part of a spot.
 _HOT_PIXEL_RATIO = 10.0
+#: Fewest lit sub-apertures.
+_MIN_VALID = 6
 
 
 def _comb_power(profile: NDArray[np.float64], pitch: float) -> complex:
@@ -38,7 +40,7 @@ def _pitch_and_phase(image: NDArray[np.float64], nominal: float) -> tuple[float,
     def negative_power(pitch: float) -> float:
         return -sum(abs(_comb_power(p, pitch)) ** 2 for p in profiles)
 
-    # The comb's peak is about pitch^2 / length wide: scan finer than that, then polish.
+    # The scan is finer than the width of the peak, about pitch^2 / length.
     trial = nominal * (1 + np.linspace(-_PITCH_RANGE, _PITCH_RANGE, 241))
     best = float(trial[np.argmin([negative_power(t) for t in trial])])
     step = float(trial[1] - trial[0])
@@ -50,16 +52,16 @@ def _pitch_and_phase(image: NDArray[np.float64], nominal: float) -> tuple[float,
 
 
 def _contrast(light: NDArray[np.float64], pitch: float) -> float:
-    """How much the light gathers once per pitch: 1 for points on the lattice, 0 for none."""
+    """Contrast of the light folded at a pitch: 1 for points on the lattice, 0 for even light."""
     return sum(abs(_comb_power(light.sum(axis=axis), pitch)) for axis in (0, 1)) / (2 * float(light.sum()))
 
 
 def _check_lattice(light: NDArray[np.float64], pitch: float, nominal: float) -> None:
-    """Raise unless the spots really stand one pitch apart."""
+    """Raise :class:`CalibrationError` unless the spots form a lattice of this pitch."""
     contrast = _contrast(light, pitch)
     if contrast < _NOISE_CONTRAST:
         raise CalibrationError(
-            "no spots on the wavefront sensor, nothing but noise or an even glow; "
+            "no spots on the wavefront sensor, only noise or even light; "
             "check source, beam stop, exposure and sensor.pitch_px"
         )
     if abs(pitch / nominal - 1) > _PITCH_RANGE:
@@ -67,11 +69,11 @@ def _check_lattice(light: NDArray[np.float64], pitch: float, nominal: float) -> 
             f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal}; "
             "check sensor.pitch_px and the binning"
         )
-    # Spots two or three of the assumed pitches apart look regular too, at a harmonic.
+    # Spots two or three pitches apart have contrast at a harmonic.
     wider = max(_contrast(light, m * pitch) for m in (2, 3))
     if contrast < _CONTRAST or wider > contrast / 2:
         raise CalibrationError(
-            f"the spots on the wavefront sensor do not stand {nominal} pixels apart, as the design says; "
+            f"the spots on the wavefront sensor are not {nominal} pixels apart, as the design says; "
             "check sensor.pitch_px and the binning, and that the light comes through the lenslets"
         )
 
@@ -81,7 +83,7 @@ def _lattice_fit(
 ) -> tuple[float, float, float]:
     """Weighted least-squares pitch and origin (x, y) of spots on a square lattice.
 
-    Spots that lie further off than the many do (a hot pixel in the window) are left out.
+    Outliers, such as a window with a hot pixel, are left out.
     """
     n = rows.size
     design = np.zeros((2, n, 3))
@@ -107,26 +109,25 @@ def find_lenslet_grid(
     min_flux: float,
     references: str = "lattice",
 ) -> SubApertureGrid:
-    """Find pitch, offset, valid sub-apertures and references from a mean frame.
+    """Find pitch, offset, valid sub-apertures and references on a mean frame.
 
-    The mean of many frames will do, turbulent ones too: turbulence moves single spots, but a
-    lattice fitted to all of them keeps only the error of the mean tilt and focus.
+    With turbulence, the lattice fitted to all spots has only the error of the mean tilt and focus.
 
     Parameters
     ----------
     mean_frame
         Mean of dark-subtracted frames in counts ``(rows, columns)``.
     n_sub
-        Lenslets across the grid.
+        Number of lenslets across the grid.
     nominal_pitch_px
         Design pitch in pixels; the real one may differ by 3 %.
     threshold
         Centre-of-gravity threshold in counts.
     min_flux
-        Sub-apertures with less flux than this share of the brightest are left out.
+        Least flux of a valid sub-aperture, relative to the brightest.
     references
-        ``"lattice"``: the references are the lattice points (the choice without a source);
-        ``"mean"``: the mean spot positions (the choice with one).
+        ``"lattice"``: the lattice points (without a source); ``"mean"``: the mean spot positions (with a
+        source).
 
     Returns
     -------
@@ -160,18 +161,17 @@ def find_lenslet_grid(
 
 
 def _without_hot_pixels(image: NDArray[np.float64], n_sub: int) -> NDArray[np.float64]:
-    """The image with bright pixels that stand alone lowered to their brightest neighbour.
+    """The image with isolated bright pixels lowered to their brightest neighbour.
 
-    Otherwise, one hot pixel holds as much light as a whole spot, and a dark sub-aperture around it
-    passes for a lit one.
+    A hot pixel has as much light as a spot and would make a dark sub-aperture valid.
     """
     around = np.ones((3, 3), dtype=bool)
     around[1, 1] = False
     brightest = ndimage.maximum_filter(image, footprint=around, mode="nearest")
-    # In the dark, noise stands out from noise; only what is as bright as a spot can pass for one.
+    # In dark areas single pixels exceed their neighbours by noise; only bright ones matter.
     hot = (image > _HOT_PIXEL_RATIO * np.maximum(brightest, 0.0)) & (image > np.percentile(image, 99))
     if hot.sum() > n_sub**2 / 10:
-        # So many are the spots themselves, each on a pixel.
+        # These are spots of a single pixel.
         return image
     return np.where(hot, brightest, image)
 
@@ -181,14 +181,14 @@ def _centre_lattice(
 ) -> tuple[float, float]:
     """Number the lenslets so that the pupil's light is centred on the ``n_sub`` by ``n_sub`` grid."""
     smooth = ndimage.uniform_filter(light, round(pitch))
-    # Opening by more than one pitch removes hot pixels, which would push the outline out.
+    # Opening by more than one pitch removes hot pixels, which would extend the outline.
     kernel_size = round(1.5 * pitch) | 1
     opened = ndimage.maximum_filter(ndimage.minimum_filter(smooth, kernel_size, mode="constant"), kernel_size)
-    # The outline of the pupil, not its brightness: a Gaussian beam need not be centred on it.
+    # By the outline of the pupil, because a Gaussian beam may be off its centre.
     pupil_area = opened > 0.1 * np.percentile(opened, 99)
     if not pupil_area.any():
         raise CalibrationError(
-            "single bright pixels but no evenly lit pupil on the wavefront sensor; "
+            "single bright pixels but no illuminated pupil on the wavefront sensor; "
             "check source, exposure and sensor.pitch_px"
         )
     rows, columns = np.nonzero(pupil_area)
@@ -213,11 +213,11 @@ def _build_grid(
     flux = area[end, right] - area[top, right] - area[end, left] + area[top, left]
     complete = (end - top >= int(pitch)) & (right - left >= int(pitch))
     flux = np.where(complete, np.maximum(flux, 0.0), 0.0).reshape(n_sub, n_sub)
-    # Relative to the typical bright sub-aperture: one hot pixel must not darken all others.
+    # Relative to the 95th percentile, which hot pixels do not affect.
     counts = float(np.percentile(flux[flux > 0.02 * flux.max()], 95))
     flux = flux / counts
     valid = flux >= min_flux
-    if valid.sum() < 6:
+    if valid.sum() < _MIN_VALID:
         raise CalibrationError(
             f"only {int(valid.sum())} sub-apertures are lit above {min_flux:.0%} of the brightest; "
             "check the beam, the camera region and sensor.min_flux"
@@ -228,7 +228,7 @@ def _build_grid(
 
 
 def _measure_spots(grid: SubApertureGrid, light: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Spot offsets ``(n_valid, 2)`` of a mean frame that is no longer made of whole counts."""
+    """Spot offsets ``(n_valid, 2)`` on a mean frame, which is scaled to use the range of 16 bits."""
     rows, columns = light.shape
     extractor = ShackHartmannSlopes(grid, (rows, columns), threshold=0.0)
     scale = 60000.0 / float(light.max())

@@ -1,30 +1,27 @@
-"""The pupil's centre from the shadow of what stands in it: the secondary mirror and its vanes."""
+"""Centre of the pupil from the shadow of the secondary mirror and its vanes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from escape_hw.config.system import TelescopeSection
 from escape_hw.pipeline.geometry.pupil_rims import RIM_SOFTNESS
 
-if TYPE_CHECKING:
-    from escape_hw.config.system import TelescopeSection
-
-#: Points along each side of a sample at which it is asked whether light passes.
+#: Points along each side of a sample at which the transmission is evaluated.
 _POINTS = 8
-#: Share of the radius in which the shadow is looked for: farther out the rim's own troubles begin.
+#: Share of the radius in which the shadow is fitted, away from the rim.
 _FIT_RADIUS = 0.8
-#: Highest power of the smooth light that the shadow falls on: less takes uneven light for a moved shadow.
+#: Degree of the polynomial of the light; with a lower one uneven light is taken for a shift of the shadow.
 _POLYNOMIAL_DEGREE = 6
-#: Steps to where the shadow is, and the largest of them in pixels.
+#: Number of iterations, and largest step of each in pixels.
 _ITERATIONS, _MAX_STEP = 4, 0.7
-#: Samples across a pixel of the shadow's map, an odd number, and points along each side of such a sample.
+#: Samples across a pixel of the shadow map (odd), and points along each side of a sample.
 _OVERSAMPLING, _COARSE_POINTS = 21, 2
-#: Share of the light that passes at coordinates ``(n,)`` along x and ``(m,)`` along y, in pupil diameters.
+#: Transmission ``(m, n)`` at coordinates ``(n,)`` along x and ``(m,)`` along y, in pupil diameters.
 Shadow = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -35,7 +32,7 @@ def transmitted_fraction(
     y_m: NDArray[np.float64] | None = None,
     points: int = _POINTS,
 ) -> NDArray[np.float64]:
-    """Share of each sample that neither the central obscuration nor a vane covers ``(n_y, n_x)``.
+    """Fraction of each sample that is not covered by the central obscuration or a vane ``(n_y, n_x)``.
 
     Parameters
     ----------
@@ -47,7 +44,7 @@ def transmitted_fraction(
         Coordinates of the samples along either axis in metres, evenly spaced; ``y_m`` as ``x_m`` by
         default.
     points
-        Points along each side of a sample at which it is asked whether light passes.
+        Points along each side of a sample.
     """
     x, y = (_subsample(at, diameter_m, points) for at in (x_m, x_m if y_m is None else y_m))
     x, y = x[None, :], y[:, None]
@@ -65,14 +62,14 @@ def _subsample(at: NDArray[np.float64], alone: float, points: int) -> NDArray[np
 
 
 def build_shadow(telescope: TelescopeSection, diameter_m: float) -> Shadow | None:
-    """The shadow of a telescope's obscuration and vanes; ``None`` if it has no obscuration.
+    """Build the transmission of a telescope's obscuration and vanes; ``None`` without an obscuration.
 
     Parameters
     ----------
     telescope
         Obscuration and vanes.
     diameter_m
-        Diameter of the pupil in metres, which the vanes' width is told in.
+        Diameter of the pupil in metres.
     """
     if not telescope.obscuration:
         return None
@@ -88,11 +85,11 @@ def build_shadow(telescope: TelescopeSection, diameter_m: float) -> Shadow | Non
 def fit_shadow_offset(
     image: NDArray[np.float64], centres: NDArray[np.float64], diameter: float, shadow: Shadow
 ) -> tuple[NDArray[np.float64], float]:
-    """How far the shadow lies beside the centres of the images, in common, and with what error.
+    """Fit the common offset of the shadow from the centres of the images.
 
-    Within each image the light is taken for a polynomial of sixth degree, from which the shadow
-    takes a share; all of it is linear but for the shadow's place, which the four images share. The light
-    as it is counts: pressed down, what is uneven from image to image would no longer be smooth.
+    The model of the light in each image is a polynomial of sixth degree times the transmission, linear in all
+    but the offset, which the four images share. The light is not compressed, because unevenness would not
+    remain smooth.
 
     Parameters
     ----------
@@ -103,15 +100,14 @@ def fit_shadow_offset(
     diameter
         Their diameter in pixels.
     shadow
-        What passes.
+        Transmission from :func:`build_shadow`.
 
     Returns
     -------
     offset : ndarray, ``(2,)``
         As (x, y) in pixels.
     sigma : float
-        Standard error along an axis by the scatter of the four. It does not know what they err by in
-        common; and what takes light from one image and gives it to another counts twice in it.
+        Standard error along an axis by the scatter of the four images, without their common errors.
     """
     offset = np.zeros(2)
     moves = np.zeros((4, 2))
@@ -124,14 +120,15 @@ def fit_shadow_offset(
 
 
 def _reach(diameter: float) -> int:
-    """Pixels from the centre to beyond where the shadow is looked for."""
+    """Half width in pixels of the box in which the shadow is fitted."""
     return int(np.ceil(_FIT_RADIUS * diameter / 2)) + 1
 
 
 def _shadow_map(shadow: Shadow, diameter: float) -> NDArray[np.float64]:
-    """Map ``(3, n, n)`` of what a pixel lacks for the shadow, and its derivatives by the shadow's place.
+    """Map ``(3, n, n)`` of the light that a pixel loses, and of its derivatives with respect to the offset.
 
-    By where the pixel's middle lies from the shadow's centre, :data:`_OVERSAMPLING` samples to a pixel.
+    As a function of the position of the pixel from the shadow's centre, with :data:`_OVERSAMPLING` samples
+    per pixel.
     """
     half = (_reach(diameter) + 1) * _OVERSAMPLING
     at = np.arange(-half, half + 1) / (_OVERSAMPLING * diameter)
@@ -144,7 +141,7 @@ def _shadow_map(shadow: Shadow, diameter: float) -> NDArray[np.float64]:
 def _gauss_newton_step(
     image: NDArray[np.float64], centre: NDArray[np.float64], diameter: float, shadow_map: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Gauss-Newton step ``(2,)`` of the shadow in one image."""
+    """Gauss-Newton step ``(2,)`` of the offset in one image."""
     reach = _reach(diameter)
     columns, rows = (round(at) + np.arange(-reach, reach + 1) for at in centre)
     x, y = np.meshgrid(columns - centre[0], rows - centre[1])
@@ -157,7 +154,7 @@ def _gauss_newton_step(
     light = image[np.ix_(rows, columns)][inside]
     lit, depth = np.ones_like(light), 0.0
     for _ in range(2):
-        # The shadow takes its share of whatever light there is.
+        # The lost light is proportional to the light.
         *coefficients, depth = np.linalg.lstsq(np.column_stack([smooth, lit * dark]), light, rcond=None)[0]
         before, lit = lit, smooth @ coefficients
     terms = np.column_stack([smooth, before * dark, *(depth * before * part for part in moving)])

@@ -1,4 +1,4 @@
-"""Finding the four pupil images of a pyramid, the valid pixels and the references from frames."""
+"""Finds the four pupil images of a pyramid, the valid pixels and the references on mean frames."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from escape_hw.pipeline.geometry.pupil_rims import (
 )
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 
-#: How far an image may lie from its nominal place, as a share of its diameter.
+#: Largest distance of an image from its nominal position, in diameters.
 _REACH = 0.25
-#: How far the real diameter may lie from the nominal one: a share of it, and pixels, for diffraction
-#: spreads a rim.
+#: Largest deviation of the diameter from the nominal one: relative, and in pixels, because of diffraction.
 _DIAMETER_RANGE, _DIAMETER_PX = 0.03, 2.0
-#: An image with less than this share of the others' light is not there.
+#: Light of an image relative to the others below which it is missing.
 _MIN_LIGHT_FRACTION = 0.1
-#: Light that is pressed down to one half before rims are fitted, as a share of the usual one; on a telescope
-#: little enough that a rim in the shade of a soiled edge is as steep as any other. A bench's stop is whole,
-#: and what diffraction puts between the images would count for more the harder light is pressed.
+#: Light relative to the median that is compressed to one half before rims are fitted. The value for
+#: telescopes is small enough to make the rim of a vignetted edge as steep as any other; on a bench, whose
+#: stop is clean, compression would emphasise the light that diffraction scatters between the images.
 _COMPRESSION, _COMPRESSION_VIGNETTED = 1.0, 0.25
-#: How much more of a soiled rim is in the first harmonic, where it passes for a shift, than in the second to
-#: fourth.
+#: Ratio of the first harmonic of a vignetted rim, which is taken for a shift, to the second to fourth ones.
 _FIRST_HARMONIC = 1.4
-#: What the shadow errs by beyond its scatter over time, for light is uneven on its scale too, and what rim
-#: and shadow together do, in pixels (docs/decisions/0018-pyramid-registration-uncertainties.md).
+#: Errors in pixels of the shadow beyond its scatter over time, because the light is uneven on its scale, and
+#: of rim and shadow together (docs/decisions/0018-pyramid-registration-uncertainties.md).
 _SHADOW_SIGMA_PX, _COMMON_SIGMA_PX = 0.02, 0.018
+#: Fewest lit pixels of an image.
+_MIN_VALID = 12
 
 
 def find_pupil_images(
@@ -50,11 +50,10 @@ def find_pupil_images(
     modulation: float = 0.0,
     references: str = "mean",
 ) -> PyramidPupils:
-    """Find centres, diameter, valid pixels and references from a mean frame.
+    """Find centres, diameter, valid pixels and references on a mean frame.
 
-    The mean of many frames will do, turbulent ones too: turbulence changes how bright an image is
-    and where, but light ends at its rim all the same. So the rims are fitted, each with a brightness
-    that may vary along it.
+    The rims of the images are fitted, with a brightness that varies along each of them, because turbulence
+    changes the brightness of the images but not their rims.
 
     Parameters
     ----------
@@ -63,16 +62,15 @@ def find_pupil_images(
     n_sub
         Nominal diameter of an image in pixels; the real one may differ by 3 % and two pixels.
     nominal_px
-        Nominal centres ``(4, 2)`` as (x, y), in the order of :data:`~escape_hw.api.pyramid.IMAGES`;
-        the real ones may lie a quarter of a diameter away.
+        Nominal centres ``(4, 2)`` as (x, y), in the order of :data:`~escape_hw.api.pyramid.IMAGES`; the real
+        ones may be a quarter of a diameter away.
     min_flux
-        Pixels with less than this share of a bright one's light are left out.
+        Least flux of a valid pixel, relative to a bright one.
     normalisation, modulation
         See :class:`~escape_hw.api.pyramid.PyramidPupils`.
     references
-        ``"mean"``: the mean slopes (the choice with a source); ``"design"``: the mean slopes without
-        their smooth part (the choice without one, see
-        :func:`~escape_hw.api.pyramid.remove_low_orders`).
+        ``"mean"``: the mean slopes (with a source); ``"design"``: the mean slopes without their smooth part
+        (without a source; see :func:`~escape_hw.api.pyramid.remove_low_orders`).
 
     Returns
     -------
@@ -81,8 +79,8 @@ def find_pupil_images(
     Raises
     ------
     CalibrationError
-        Fewer than four images, an image that the region cuts, another size than the design's, or too
-        few lit pixels.
+        Fewer than four images, an image cut by the region, another size than the design's, or too few lit
+        pixels.
     """
     if references not in ("mean", "design"):
         raise ValueError(f"references is {references!r}; choose 'mean' or 'design'")
@@ -94,12 +92,12 @@ def find_pupil_images(
     light = _summed_light(image, corners, n_sub)
     counts = float(np.percentile(light[light > 0.02 * np.percentile(light, 99)], 95))
     flux = np.maximum(light / counts, 0.0)
-    # How far the images lie beside their boxes, on average: the pupil's centre in a box.
+    # Mean position of the pupil's centre in a box.
     middle = (n_sub - 1) / 2 + (centres - corners - (n_sub - 1) / 2).mean(axis=0)
     line = np.arange(n_sub)
     inside = np.hypot(line[None, :] - middle[0], line[:, None] - middle[1]) <= min(diameter, n_sub) / 2
     valid = inside & (flux >= min_flux)
-    if valid.sum() < 12:
+    if valid.sum() < _MIN_VALID:
         raise CalibrationError(
             f"only {int(valid.sum())} pixels of the pupil images are lit above {min_flux:.0%} of the "
             "brightest; check the beam, the camera region and sensor.min_flux"
@@ -117,24 +115,24 @@ def find_pupil_images(
 def refine_pupil_images(
     means: Sequence[NDArray[np.float32]], pupils: PyramidPupils, shadow: Shadow | None = None
 ) -> PyramidPupils:
-    """The pupils with centres, diameter and light from a longer look, and the error of their mean place.
+    """Refit centres, diameter and flux on the mean of a long run, and estimate the error of the mean centre.
 
-    Under turbulence the rims fitted on a second of frames may be some tenths of a pixel off. Boxes
-    and mask stay as they are, so slopes keep their meaning; a model wants the centres. A soiled edge
-    eats into the rim of all four images alike; the shadow of what stands in the pupil knows nothing
-    of it, and counts by its error against the rim's.
+    Under turbulence the rims fitted on a second of frames may be off by some tenths of a pixel. Boxes and
+    mask stay the same, and with them the slopes; the centres are for the synthetic model. Vignetting at the
+    edge affects the rims of all four images, but not the shadow of the secondary; the two are weighted by
+    their errors.
 
     Parameters
     ----------
     means
-        Means of equally many frames in counts ``(rows, columns)``, background subtracted, one after
-        the other in time; the scatter from one to the next tells the error.
+        Means of equally many frames in counts ``(rows, columns)``, background subtracted, in order of time.
+        Their scatter gives the error.
     pupils
-        As found before.
+        Pupil images as found before.
     shadow
-        What passes the telescope's obscuration and vanes; ``None``: there are none.
+        Transmission of the telescope's obscuration and vanes; ``None`` without them.
     """
-    # The products are many and small.
+    # Many small matrix products.
     with limit_to_one_thread():
         return _refine(means, pupils, shadow)
 
@@ -174,7 +172,7 @@ def _offset_from_shadow(
     diameter: float,
     shadow: Shadow,
 ) -> tuple[NDArray[np.float64], float]:
-    """How far the shadow lies beside the centres ``(2,)``, and the variance of that along an axis."""
+    """Offset of the shadow from the centres ``(2,)``, and its variance along an axis."""
     offset, sigma = fit_shadow_offset(image, centres, diameter, shadow)
     variance = sigma**2
     if len(means) > 1:
@@ -186,7 +184,7 @@ def _offset_from_shadow(
 
 
 def _summed_light(image: NDArray[np.float64], corners: NDArray[np.intp], n_sub: int) -> NDArray[np.float64]:
-    """Light ``(n_sub, n_sub)`` of the boxes of all images together."""
+    """Sum of the boxes of all images ``(n_sub, n_sub)``."""
     return np.asarray(np.sum([image[y : y + n_sub, x : x + n_sub] for x, y in corners], axis=0))
 
 
@@ -202,13 +200,13 @@ def _fit_centres(
     centres, radius = fit_rims(compressed, rough, n_sub / 2, n_sub / 2)
     if order > 1:
         centres, radius = fit_rims(compressed, centres, radius, n_sub / 2, ITERATIONS // 3, order)
-    # Pressed light ends a little late; where it really ends on average, the light itself tells.
+    # Compression enlarges the radius, which is therefore fitted to the light itself.
     _, radius = fit_rims(image, centres, radius, n_sub / 2, ITERATIONS // 3)
     return centres, 2 * radius
 
 
 def _compress_bright(image: NDArray[np.float64], compression: float) -> NDArray[np.float64]:
-    """The image with its bright parts pressed down: a rim is to be as steep in bright light as in dim."""
+    """Compress bright parts, so that rims are equally steep in bright and in dim light."""
     lit = image > 0.1 * np.percentile(image, 99)
     level = compression * float(np.median(image[lit])) if lit.any() else 1.0
     light = np.maximum(image, 0.0)
@@ -218,14 +216,14 @@ def _compress_bright(image: NDArray[np.float64], compression: float) -> NDArray[
 def _find_rough_centres(
     image: NDArray[np.float64], n_sub: int, nominal_px: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Rough centres ``(4, 2)``: where a disk is bright and the ring around it is dark."""
+    """Rough centres ``(4, 2)`` of bright disks with dark rings around them."""
     pad = n_sub
     radius, half = n_sub / 2, n_sub // 2 + 4
     line = np.arange(-half, half + 1)
     distance = np.hypot(line[:, None], line[None, :])
     disk, ring = (distance <= radius - 1).astype(float), (distance > radius + 1) & (distance < radius + 4)
     kernel = disk / disk.sum() - ring / ring.sum()
-    # The square root evens out what is bright and what is dim within an image.
+    # The square root reduces the contrast within an image.
     light = np.pad(np.sqrt(np.maximum(image, 0.0)), pad, mode="edge")
     score = signal.fftconvolve(light, kernel, mode="same")
     centres, contrast = [], []
@@ -243,15 +241,15 @@ def _find_rough_centres(
 def _check_light(
     image: NDArray[np.float64], n_sub: int, nominal_px: NDArray[np.float64], contrast: NDArray[np.float64]
 ) -> None:
-    """Raise unless there is an image at each of the four places."""
+    """Raise :class:`CalibrationError` unless there is an image near each of the four nominal centres."""
     rows, columns = np.indices(image.shape)
     apart = np.min([np.hypot(columns - x, rows - y) for x, y in nominal_px], axis=0) > 0.75 * n_sub
     rest = np.sqrt(np.maximum(image[apart] if apart.any() else image, 0.0))
-    # A disk of noise alone differs from its ring by a small share of the noise of a pixel.
+    # The noise of the difference between the means of disk and ring is much smaller than that of a pixel.
     noise = 6 * float(rest.std()) / np.sqrt(2 * n_sub) + 1e-3 * float(rest.mean())
     if not contrast.max() > noise:
         raise CalibrationError(
-            "no pupil images on the wavefront sensor, nothing but noise or an even glow; "
+            "no pupil images on the wavefront sensor, only noise or even light; "
             "check source, beam stop, exposure and sensor.pupils_px"
         )
     share = np.square(np.maximum(contrast, 0.0))
@@ -274,9 +272,9 @@ def _check_fit(
     n_sub: int,
     shape: tuple[int, ...],
 ) -> None:
-    """Raise unless the images are whole, round, and of the design's size."""
+    """Raise :class:`CalibrationError` unless the images are complete, round, and of the design's size."""
     low, high = centres - diameter / 2, centres + diameter / 2
-    # Half a pixel lies between a pixel's centre and its edge; diffraction takes another half.
+    # Half a pixel from the centre to the edge of a pixel, and another half for diffraction.
     cut = (low < -1.0).any(axis=1) | (high > np.array(shape[::-1])).any(axis=1)
     if cut.any():
         names = " and ".join(IMAGES[k] for k in np.flatnonzero(cut))

@@ -1,4 +1,4 @@
-"""The rims of pupil images: where the light ends, whatever its brightness along the way."""
+"""Fit of the rims of pupil images, with a brightness that varies along the rim."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-#: Softness of a rim in pixels (rms): a pixel's own width and a little diffraction.
+#: Softness of a rim in pixels (rms): the width of a pixel and diffraction.
 RIM_SOFTNESS = 0.45
 #: Half width in pixels of the ring in which a rim is fitted, and harmonics of its brightness.
 _RING, _HARMONICS = 4.0, 6
-#: Iterations, and how many of the last with a narrow ring.
+#: Iterations, and how many of the last ones use the narrow ring.
 ITERATIONS, _NARROW_ITERATIONS = 12, 8
-#: Pixels that come so near to another image (in pixels from its rim) are left out.
+#: Largest step of a parameter per iteration, in pixels.
+_MAX_STEP = 1.5
+#: Distance in pixels from the rim of another image within which pixels are left out.
 _NEIGHBOUR_MARGIN = 2.0
-#: Harmonics of a rim's radius that are told apart.
+#: Highest harmonic of a rim's radius that is fitted.
 MAX_HARMONIC = 4
 
 
@@ -26,7 +28,7 @@ def fit_rims(
     iterations: int = ITERATIONS,
     order: int = 1,
 ) -> tuple[NDArray[np.float64], float]:
-    """Centres ``(4, 2)`` and the common radius of the images, from their rims alone.
+    """Fit centres ``(4, 2)`` and common radius of the images to their rims.
 
     Parameters
     ----------
@@ -35,11 +37,11 @@ def fit_rims(
     rough
         Centres ``(4, 2)`` to start from.
     radius, nominal
-        Radius to start from, and that of the design, in pixels.
+        Radius to start from, and radius of the design, in pixels.
     iterations
-        How many; at the end of them the ring is narrow.
+        Number of iterations; the last ones use a narrow ring.
     order
-        Harmonics of the radius that are fitted beside: 1 is a circle, more let the rim be out of round.
+        Highest harmonic of the radius that is fitted: 1 for a circle, more for rims that are out of round.
     """
     centres = rough.copy()
     for iterations_left in reversed(range(iterations)):
@@ -48,7 +50,7 @@ def fit_rims(
         moves = [
             _rim_step(image, centres, k, radius, width, nominal + _NEIGHBOUR_MARGIN, order) for k in range(4)
         ]
-        limited = np.clip(moves, -1.5, 1.5)
+        limited = np.clip(moves, -_MAX_STEP, _MAX_STEP)
         centres += limited[:, 1:3]
         radius = max(radius + float(np.median(limited[:, 0])), nominal / 2)
     return centres, radius
@@ -65,9 +67,9 @@ def _rim_step(
 ) -> NDArray[np.float64]:
     """Gauss-Newton step ``(2 order + 1,)`` of one image's radius, centre (x, y) and higher harmonics.
 
-    In a ring around the rim the light is taken for ``outside(angle) + inside(angle, depth) * edge``,
-    all of which is linear but for the edge's place. Pixels ``min_distance`` or less from another image's
-    centre are left out.
+    The model of the light in a ring around the rim is ``outside(angle) + inside(angle, depth) * edge``,
+    linear in all but the position of the edge. Pixels within ``min_distance`` of another image's centre are
+    left out.
     """
     x, y = centres[number]
     pixels, light = _ring_pixels(image, x, y, radius, width)
@@ -75,7 +77,7 @@ def _rim_step(
     isolated = np.hypot(*(pixels[:, None] - others.T[:, :, None])).min(axis=0) > min_distance
     (dx, dy), light = pixels[:, isolated] - centres[number][:, None], light[isolated]
     r = np.hypot(dx, dy)
-    # A rim of few pixels tells few harmonics.
+    # Fewer harmonics for rims of few pixels.
     waves = _harmonics(np.arctan2(dy, dx), min(_HARMONICS, int(radius // 3)))
     depth = (radius - r) / RIM_SOFTNESS
     edge = special.ndtr(depth)
@@ -92,16 +94,18 @@ def _rim_step(
 def estimate_roundness_error(
     image: NDArray[np.float64], centres: NDArray[np.float64], radius: float, nominal: float
 ) -> float:
-    """How far the first harmonic of the images' common rim may lie off its true place, in pixels (rms).
+    """Estimate the error of the images' common shift by the roundness of their rims, in pixels (rms).
 
-    What eats into the rim of a pupil does so in all four images alike and no frames average it out. A
-    rim that is out of round by so much in the second to fourth harmonic is so in the first as well,
-    where it passes for a shift.
+    Vignetting at the rim of the pupil is the same in all four images and does not average out. Its first
+    harmonic, which is taken for a shift, is assumed to be as large as the second to fourth ones, which are
+    measured.
 
     Parameters
     ----------
-    image, centres, radius, nominal
-        As for :func:`fit_rims`, and what it found.
+    image, nominal
+        As for :func:`fit_rims`.
+    centres, radius
+        Result of :func:`fit_rims`.
     """
     width = min(_RING, nominal / 2)
     steps = [
@@ -112,7 +116,7 @@ def estimate_roundness_error(
 
 
 def _least_squares(terms: NDArray[np.float64], light: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares of the terms in the light, by the normal equations: few terms, many pixels."""
+    """Coefficients of the terms, by the normal equations."""
     scale = np.sqrt(np.maximum(np.square(terms).sum(axis=0), 1e-30))
     unit = terms / scale
     return np.asarray(np.linalg.lstsq(unit.T @ unit, unit.T @ light, rcond=1e-12)[0] / scale)
@@ -128,7 +132,7 @@ def _harmonics(angle: NDArray[np.float64], order: int) -> NDArray[np.float64]:
 def _ring_pixels(
     image: NDArray[np.float64], x: float, y: float, radius: float, width: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places ``(2, n)`` as (x, y) and light ``(n,)`` of the pixels around a rim; outside it is dark."""
+    """Positions ``(2, n)`` as (x, y) and light ``(n,)`` of the pixels around a rim."""
     reach = int(np.ceil(radius + width)) + 1
     columns, rows = np.meshgrid(
         round(x) + np.arange(-reach, reach + 1), round(y) + np.arange(-reach, reach + 1)

@@ -1,21 +1,26 @@
-"""Frames of a long run in memory that does not grow with it."""
+"""Frames of a long run in bounded memory."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-#: Frames kept; more are averaged two by two.
+#: Largest number of images kept; beyond it neighbours are averaged.
 MAX_IMAGES = 4096
 
 
 class FrameStack:
-    """Keeps the frames of a run, or, once they are too many, the means of 2, 4, 8 ... neighbours.
+    """Frames of a run, or the means of 2, 4, 8 ... consecutive frames once there are too many.
 
     Parameters
     ----------
     limit
         Largest number of images kept, even.
+
+    Attributes
+    ----------
+    count, clipped
+        Number of frames added, and of those with a saturated peak.
     """
 
     def __init__(self, limit: int = MAX_IMAGES) -> None:
@@ -25,11 +30,10 @@ class FrameStack:
         self._stored: list[NDArray[np.float32]] = []
         self._sum: NDArray[np.float32] | None = None
         self._n_summed = 0
-        #: Frames taken, and those of them whose brightest spot was cut off.
         self.count = self.clipped = 0
 
     def add(self, image: NDArray[np.integer], *, clipped: bool = False) -> None:
-        """Take one frame ``(rows, columns)``; ``clipped`` says that its brightest spot was cut off."""
+        """Add one frame ``(rows, columns)``; ``clipped`` if its peak is saturated."""
         self.count += 1
         self.clipped += clipped
         self._sum = image.astype(np.float32) if self._sum is None else self._sum + image
@@ -45,5 +49,5 @@ class FrameStack:
             self._frames_per_image *= 2
 
     def images(self) -> NDArray[np.float32]:
-        """What is kept ``(n, rows, columns)``, each the mean of equally many frames in their order."""
+        """Images ``(n, rows, columns)`` in order, each the mean of the same number of frames."""
         return np.stack(self._stored) if self._stored else np.zeros((0, 0, 0), np.float32)

@@ -1,4 +1,4 @@
-"""Diffraction image of the design pupil, and Strehl ratios three ways: peak, optical transfer function, encircled energy."""
+"""Diffraction image of a pupil, and Strehl ratios by peak, optical transfer function, encircled energy."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from escape_hw.api.results import Estimate, StrehlEstimate
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.statistics import standard_error
 
+#: Radius of the encircled energy in pixels: about the first minimum of the bench's PSF (paper).
+RADIUS_PX = 3.0
+#: Width of the border of an image that contains background only, in pixels.
+_BORDER_PX = 4
+
 
 def diffraction_psf(
     pupil: NDArray[np.bool_], samples_across: float, psf_px: float, shape: tuple[int, int]
@@ -20,7 +25,7 @@ def diffraction_psf(
     Parameters
     ----------
     pupil
-        Where light passes ``(n, n)``.
+        Mask of the transmitted light ``(n, n)``.
     samples_across
         Samples across the diameter D of the pupil.
     psf_px
@@ -31,7 +36,7 @@ def diffraction_psf(
     Returns
     -------
     ndarray of float32, ``(rows, columns)``
-        Sums to one over an infinite camera; its peak lies on the middle pixel.
+        Of unit sum over an infinite camera, with its peak on the middle pixel.
     """
     n = pupil.shape[0]
     places = (np.arange(n) - (n - 1) / 2) / samples_across
@@ -41,39 +46,33 @@ def diffraction_psf(
     return np.asarray(np.abs(field) ** 2 / power, dtype=np.float32)
 
 
-#: Radius of the encircled energy in pixels: about the first minimum of the bench's PSF (paper).
-RADIUS_PX = 3.0
-#: Width of the frame around the image that holds background only, in pixels.
-_BORDER_PX = 4
-
-
 def subtract_background(image: NDArray[np.floating]) -> NDArray[np.float64]:
     """Image minus the median of its border."""
     return np.asarray(image - np.median(image[_border_mask(image.shape)]), dtype=np.float64)
 
 
 def _border_mask(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The border of an image."""
+    """Mask of the border of an image."""
     border = np.ones(shape, dtype=bool)
     border[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = False
     return border
 
 
 def has_light(image: NDArray[np.floating]) -> bool:
-    """True when something stands clearly above the scatter of the image's border."""
+    """Whether the brightest pixel exceeds the background by ten times the scatter of the border."""
     rim = image[_border_mask(image.shape)]
-    # Of the 16,384 pixels of a dark image the brightest stands out by about four times the scatter.
+    # The brightest of the 16,384 pixels of a dark image exceeds it by about four times the scatter.
     return bool(np.max(image) - np.median(rim) > 10 * np.std(rim))
 
 
 def is_peak_saturated(frame: Frame) -> bool:
-    """Whether pixels of a frame are saturated within the encircled energy's radius of the brightest one.
+    """Whether pixels within :data:`RADIUS_PX` of the peak of a frame are saturated.
 
-    A cut-off peak makes every Strehl ratio wrong; a hot pixel far away does not.
+    A saturated peak biases all Strehl ratios; a hot pixel elsewhere does not.
     """
     if not frame.n_saturated:
         return False
-    # The light as it falls on some pixels together: a hot pixel alone does not lead astray.
+    # Smoothed, so that a single hot pixel is not taken for the peak.
     smooth = ndimage.gaussian_filter(frame.data.astype(np.float32), 1.0)
     row, column = np.unravel_index(np.argmax(smooth), smooth.shape)
     y, x = np.ogrid[: frame.data.shape[0], : frame.data.shape[1]]
@@ -84,7 +83,7 @@ def is_peak_saturated(frame: Frame) -> bool:
 
 
 def find_peak(image: NDArray[np.float64]) -> tuple[float, float]:
-    """Sub-pixel position (row, column) of the peak: a parabola through it and its neighbours."""
+    """Sub-pixel position (row, column) of the peak, by a parabola through it and its neighbours."""
     row, column = (int(v) for v in np.unravel_index(np.argmax(image), image.shape))
     out = []
     for axis, at in ((0, row), (1, column)):
@@ -99,19 +98,18 @@ def find_peak(image: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def centre_image(image: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Background-free image of unit sum, shifted so that its peak falls on the middle pixel.
-
-    The shift is done in Fourier space: band-limited images suffer no loss.
-    """
+    """Image of unit sum without background, shifted (in Fourier space) to have its peak in the middle."""
     clean = subtract_background(image)
     total = clean.sum()
     if not total > 0:
-        raise CalibrationError("the science camera sees no light above its background")
+        raise CalibrationError(
+            "the science camera sees no light above its background; check the source and the region"
+        )
     return np.asarray(_shift_image(clean, _shift_to_centre(clean)) / total)
 
 
 def _shift_to_centre(clean: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shift (rows, columns) that takes an image's peak to the middle pixel."""
+    """Shift (rows, columns) from an image's peak to the middle pixel."""
     peak = find_peak(ndimage.gaussian_filter(clean, 1.0))
     return np.asarray(np.array(clean.shape) // 2 - np.array(peak))
 
@@ -121,14 +119,13 @@ def _shift_image(image: NDArray[np.float64], shift: NDArray[np.float64]) -> NDAr
 
 
 def encircled(image: NDArray[np.float64], radius_px: float = RADIUS_PX) -> float:
-    """Share of a centred image's light within ``radius_px`` of its middle."""
+    """Fraction of a centred image's light within ``radius_px`` of its middle."""
     return float((image * _aperture(image.shape, radius_px)).sum())
 
 
 def _aperture(shape: tuple[int, ...], radius_px: float) -> NDArray[np.float64]:
-    """One within a circle about the middle; its rim counts by the share of each pixel inside it."""
+    """Mask of a circle about the middle, with the covered fraction of each pixel to first order."""
     y, x = np.ogrid[: shape[0], : shape[1]]
-    # To first order.
     return np.asarray(np.clip(radius_px + 0.5 - np.hypot(y - shape[0] // 2, x - shape[1] // 2), 0, 1))
 
 
@@ -140,24 +137,24 @@ def strehl_ratios(
     Parameters
     ----------
     image, model
-        Images ``(rows, columns)`` of the same scale; backgrounds are taken out.
+        Images ``(rows, columns)`` of the same scale; backgrounds are subtracted.
     cutoff
-        Radius in cycles per pixel within which the transfer functions are summed; by default where
-        the model's falls to 1 % of its peak.
+        Radius in cycles per pixel within which the transfer functions are summed; by default where the
+        model's exceeds 1 % of its peak.
     """
     weights = _ratio_weights(centre_image(model), cutoff)
     return np.asarray(weights @ centre_image(image).ravel())
 
 
 def _ratio_weights(model: NDArray[np.float64], cutoff: float | None = None) -> NDArray[np.float64]:
-    """Images ``(3, n_pixels)`` that a centred image of unit sum is multiplied by for the three ratios."""
+    """Weights ``(3, n_pixels)`` whose products with a centred image of unit sum are the three ratios."""
     ideal = np.fft.fft2(np.fft.ifftshift(model)).real
     f = np.hypot(*np.meshgrid(*map(np.fft.fftfreq, model.shape), indexing="ij"))
     inside = f <= cutoff if cutoff else ideal > 0.01 * ideal.max()
     peak = np.zeros(model.shape)
     middle = tuple(n // 2 for n in model.shape)
     peak[middle] = 1 / model[middle]
-    # The sum of a transfer function over a set of frequencies is a sum over the image, too.
+    # A sum of a transfer function over frequencies is a weighted sum over the image.
     otf = np.fft.fftshift(np.fft.fft2(inside.astype(float)).real) / ideal[inside].sum()
     circle = _aperture(model.shape, RADIUS_PX) / encircled(model)
     return np.stack([peak, otf, circle]).reshape(3, -1)
@@ -166,33 +163,33 @@ def _ratio_weights(model: NDArray[np.float64], cutoff: float | None = None) -> N
 def strehl(frames: NDArray[np.floating], model: NDArray[np.floating]) -> StrehlEstimate:
     """Strehl ratios of a stack of frames, with standard errors.
 
-    The value is that of the mean of all frames. Each ratio is a weighted sum over that image divided
-    by its light, so every frame's share in it is known, and its error is that of the mean of those
-    shares (see :func:`~escape_hw.pipeline.statistics.standard_error`). It holds for another
-    stretch of the same turbulence; the error of the model PSF is not in it.
+    The value is that of the mean of all frames. Each ratio is a weighted sum over that image divided by its
+    light, so the contribution of every frame is known, and the error is that of the mean of the contributions
+    (see :func:`~escape_hw.pipeline.statistics.standard_error`). It does not include the error of the model
+    PSF.
 
     Parameters
     ----------
     frames
-        Science frames in their order ``(n, rows, columns)``.
+        Science frames in order ``(n, rows, columns)``.
     model
         Model PSF, taken without turbulence.
 
     Returns
     -------
     StrehlEstimate
-        Errors are NaN for fewer than :data:`~escape_hw.pipeline.statistics.LEAST` frames.
+        Errors are NaN for fewer than :data:`~escape_hw.pipeline.statistics.MIN_SAMPLES` frames.
 
     Raises
     ------
     CalibrationError
-        No frames, no light, or the peak at the edge.
+        There are no frames, no light, or the peak is at the edge.
     """
     if len(frames) == 0:
         raise CalibrationError("no science frames to take a Strehl ratio from; run the loop for longer")
     mean = frames.mean(axis=0)
     values = strehl_ratios(mean, model)
-    # The frames are not moved onto the middle; the weights are moved onto the image instead.
+    # The weights are shifted onto the image instead of all frames onto the middle.
     shift_back = -_shift_to_centre(subtract_background(mean))
     weights = np.stack(
         [_shift_image(w.reshape(mean.shape), shift_back).ravel() for w in _ratio_weights(centre_image(model))]
@@ -200,7 +197,7 @@ def strehl(frames: NDArray[np.floating], model: NDArray[np.floating]) -> StrehlE
     weights = np.concatenate([weights, np.ones((1, mean.size))])
     rim = _border_mask(mean.shape)
     rims = frames[:, rim].mean(axis=1, dtype=np.float64)
-    # Every frame has its own share in the background's error, too, which the whole image's light takes up.
+    # The background of each frame varies, too, and with it the light of the whole image.
     dark = float(np.median(mean[rim])) + rims - rims.mean()
     sums = frames.reshape(len(frames), -1) @ weights.T.astype(np.float32)
     sums = sums - np.outer(dark, weights.sum(axis=1))

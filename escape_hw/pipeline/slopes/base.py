@@ -1,4 +1,4 @@
-"""From a frame to slopes: what all kinds of sensors share."""
+"""Base class of the slope functions of all kinds of sensors."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from escape_hw.api.sensor import G
 
 
 class FrameSlopes(abc.ABC, Generic[G]):
-    """Slopes of one geometry on one camera region; a sensor fills in ``_compute``.
+    """Slope function of a geometry on a camera region; subclasses implement ``_compute``.
 
-    Each pixel counts as ``max(frame * gain - offset, 0)``, with the gain one over the flat.
+    Calibrated pixels are ``max(frame * gain - offset, 0)``, with the gain one over the flat.
 
     Parameters
     ----------
@@ -27,12 +27,12 @@ class FrameSlopes(abc.ABC, Generic[G]):
     flat
         Relative pixel response, ones by default.
     threshold
-        Level in counts above the dark that is subtracted.
+        Level in counts above the dark frame that is subtracted.
 
     Raises
     ------
     ValueError
-        Frame, dark or flat do not fit each other.
+        Region, dark and flat have different shapes, or the flat is not positive.
     """
 
     def __init__(
@@ -58,9 +58,9 @@ class FrameSlopes(abc.ABC, Generic[G]):
 
     @property
     def flux(self) -> NDArray[np.float32]:
-        """Light above the threshold of each valid sub-aperture in the last frame ``(n_valid,)``, in counts.
+        """Flux above the threshold of each valid sub-aperture in the last frame ``(n_valid,)``, in counts.
 
-        Overwritten by the next frame, unless that one was given a flux array of its own.
+        Overwritten by the next call without a flux array of its own.
         """
         return self._light
 
@@ -70,7 +70,7 @@ class FrameSlopes(abc.ABC, Generic[G]):
         flux: NDArray[np.float32] | None = None,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Slopes ``(n_slopes,)``, in ``out`` if given; ``flux (n_valid,)`` is filled when given."""
+        """Slopes ``(n_slopes,)``, written into ``out``, and flux into ``flux (n_valid,)``, if given."""
         if frame.shape != self.shape:
             raise ValueError(f"frame has shape {frame.shape}; the slopes were set up for {self.shape}")
         slopes = np.empty(self.grid.n_slopes, np.float32) if out is None else out
@@ -81,4 +81,4 @@ class FrameSlopes(abc.ABC, Generic[G]):
     def _compute(
         self, frame: NDArray[np.uint16], slopes: NDArray[np.float32], light: NDArray[np.float32]
     ) -> None:
-        """Fill ``slopes (n_slopes,)`` and ``light (n_valid,)``."""
+        """Write ``slopes (n_slopes,)`` and ``light (n_valid,)``."""

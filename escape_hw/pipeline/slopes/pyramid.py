@@ -1,4 +1,4 @@
-"""Pyramid slopes: differences of the four pupil images, pixel by pixel."""
+"""Pyramid slopes: normalised differences of the four pupil images, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from escape_hw.pipeline.slopes.base import FrameSlopes
 
 
 def slopes_of_image(image: NDArray[Any], pupils: PyramidPupils) -> NDArray[np.float64]:
-    """Slopes ``(n_slopes,)`` of a calibrated image, in plain numpy; see :class:`PyramidPupils`.
+    """Slopes ``(n_slopes,)`` of a calibrated image, without compiled code; see :class:`PyramidPupils`.
 
     Parameters
     ----------
@@ -42,11 +42,10 @@ def _calibrated(frame, gain, offset, at):  # type: ignore[no-untyped-def]  # pra
 def quad_cell_slopes(frame, gain, offset, corners, runs, zero_points, local, slopes, flux):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Normalised differences of four images, minus references.
 
-    Each pixel counts as ``frame * gain - offset``. ``corners (4,)`` holds the place of each image's
-    box in the flat frame, ``runs (m, 3)`` the place in a box, the length and the number of the first
-    pixel of each unbroken run of valid pixels, so that the inner loop reads four straight lines.
-    Fills ``slopes (2 n,)`` (all x, then all y) and ``flux (n,)``, the sum of the four. Without light
-    a slope is 0.
+    Calibrated pixels are ``frame * gain - offset``. ``corners (4,)`` are the indices of each image's box in
+    the flattened frame; ``runs (m, 3)`` are offset in a box, length and first pixel number of each contiguous
+    run of valid pixels, so that the inner loop reads four lines. Writes ``slopes (2 n,)`` (all x, then all y)
+    and ``flux (n,)``, the sum of the four images. Slopes without light are 0.
     """
     pixels, scale, cut = frame.ravel(), gain.ravel(), offset.ravel()
     n = flux.size
@@ -78,12 +77,12 @@ def quad_cell_slopes(frame, gain, offset, corners, runs, zero_points, local, slo
 
 
 class PyramidSlopes(FrameSlopes[PyramidPupils]):
-    """Slopes of one set of pupil images on one camera region.
+    """Slope function of pupil images on a camera region.
 
     Parameters
     ----------
     grid
-        The pupil images; their ``normalisation`` decides what the differences are divided by.
+        The pupil images; ``normalisation`` selects the divisor of the differences.
     shape
         Region (rows, columns).
     dark
@@ -94,7 +93,7 @@ class PyramidSlopes(FrameSlopes[PyramidPupils]):
     Raises
     ------
     ValueError
-        Pupils, dark or flat do not fit the region.
+        The pupil images extend beyond the region, or dark or flat have another shape.
     """
 
     def __init__(
@@ -124,7 +123,7 @@ class PyramidSlopes(FrameSlopes[PyramidPupils]):
 
 
 def _runs(valid: NDArray[np.bool_], stride: int) -> NDArray[np.int64]:
-    """Unbroken runs of valid pixels in each row, see :func:`quad_cell_slopes`."""
+    """Contiguous runs of valid pixels in each row, see :func:`quad_cell_slopes`."""
     edges = np.diff(np.pad(valid.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     rows, starts = np.nonzero(edges == 1)
     ends = np.nonzero(edges == -1)[1]

@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.pipeline.slopes.base import FrameSlopes
 
-#: Single-precision numbers in one vector register of common processors.
+#: Single-precision numbers in a vector register of common processors.
 _VECTOR = 8
 
 
 def subaperture_windows(
     centres_px: NDArray[np.float64], pitch_px: float, shape: tuple[int, int]
 ) -> NDArray[np.int32]:
-    """Whole-pixel windows of the sub-apertures.
+    """Windows of the sub-apertures in whole pixels.
 
-    A window holds the pixels whose centres lie within half a pitch of the lenslet's centre, so
-    every pixel belongs to one lenslet.
+    A window contains the pixels whose centres are within half a pitch of the lenslet's centre, so every pixel
+    belongs to one lenslet.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def subaperture_windows(
     pitch_px
         Lenslet pitch in pixels.
     shape
-        Region (rows, columns); windows are cut at its edge.
+        Region (rows, columns), which limits the windows.
 
     Returns
     -------
@@ -59,17 +59,15 @@ def _calibrated(frame, gain, offset, at, pixel):  # type: ignore[no-untyped-def]
 def centres_of_gravity(frame, gain, offset, per_pixel, places, weights, zero_points, slopes, flux):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Thresholded centre of gravity of every window, minus centre and reference.
 
-    Each pixel counts as ``max(frame * gain - offset, 0)``. With ``per_pixel`` 1 gain and offset are of the
-    frame's shape; with 0 they hold ``(width,)`` equal numbers, and do not fill the processor's cache. A
-    window without light above the threshold yields slope 0 and flux 0. ``places (n, 3)`` holds each
-    window's first row, number of rows and first column, ``weights (n, 2, width)`` its mask and its lever
-    along x, ``zero_points (2 n,)`` what to subtract. Fills ``slopes (2 n,)`` (all x, then all y) and
-    ``flux (n,)``.
+    Calibrated pixels are ``max(frame * gain - offset, 0)``. With ``per_pixel`` 1, gain and offset have the
+    frame's shape; with 0 they are ``(width,)`` equal numbers, which saves cache. A window without light above
+    the threshold has slope 0 and flux 0. ``places (n, 3)`` are each window's first row, number of rows and
+    first column, ``weights (n, 2, width)`` its mask and its x coordinates, ``zero_points (2 n,)`` the values
+    to subtract. Writes ``slopes (2 n,)`` (all x, then all y) and ``flux (n,)``.
 
-    Three things make it fast. All windows are read equally wide, a whole number of vectors, and
-    their weights are zero where they end. Four rows go through the inner loop together, for its
-    sums across a vector cost more than what they add up. Positions are unsigned, or numba would
-    look for negative ones at each pixel and not vectorise.
+    For speed, all windows have the same width, a whole number of vectors, with zero weights beyond their end;
+    the inner loop processes four rows together, because the sum across a vector is slow; and indices are
+    unsigned, because numba does not vectorise with a check for negative ones.
     """
     zero, two, three = np.float32(0), np.float32(2), np.float32(3)
     pixels, scale, cut = frame.ravel(), gain.ravel(), offset.ravel()
@@ -124,7 +122,7 @@ def centres_of_gravity(frame, gain, offset, per_pixel, places, weights, zero_poi
 
 
 class ShackHartmannSlopes(FrameSlopes[SubApertureGrid]):
-    """Slopes of one grid on one camera region.
+    """Slope function of a grid on a camera region.
 
     Parameters
     ----------
@@ -142,7 +140,7 @@ class ShackHartmannSlopes(FrameSlopes[SubApertureGrid]):
     Raises
     ------
     ValueError
-        Frame, dark or flat do not fit each other.
+        Region, dark and flat have different shapes.
     """
 
     def __init__(
@@ -155,10 +153,6 @@ class ShackHartmannSlopes(FrameSlopes[SubApertureGrid]):
         threshold: float = 0.0,
     ) -> None:
         super().__init__(grid, shape, dark, flat, threshold)
-        self._place_windows()
-
-    def _place_windows(self) -> None:
-        """Windows in the form that :func:`centres_of_gravity` wants."""
         centres = self.grid.centres_px()
         boxes = subaperture_windows(centres, self.grid.pitch_px, self.shape).astype(np.int64)
         top, end, left, right = boxes.T

@@ -207,7 +207,7 @@ class CalibrationProcedure(ProcedureSpec["CalibrationResult"]):
     def finish(self) -> None:
         """Remove the saved state."""
         if self._checkpoint is not None:
-            self._checkpoint.done()
+            self._checkpoint.remove()
 
 
 class ClosedLoopCalibration(CalibrationProcedure):

@@ -53,14 +53,14 @@ def gains_converged(result: GainsResult) -> dict[str, Any]:
 
 
 def injected_value_recovered(
-    label: str, estimate: RegistrationEstimate, planted: Registration
+    label: str, estimate: RegistrationEstimate, injected: Registration
 ) -> dict[str, Any]:
-    """The planted registration lies within the error bars."""
+    """The injected registration lies within the error bars."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        pulls = np.abs(estimate.registration.to_array() - planted.to_array()) / estimate.sigma
+        pulls = np.abs(estimate.registration.to_array() - injected.to_array()) / estimate.sigma
     worst = float(pulls.max())  # NaN, from no error and no difference, counts as not met
     return criterion(
-        f"{label}: planted registration recovered within {_LARGEST_PULL:g} standard errors "
+        f"{label}: injected registration recovered within {_LARGEST_PULL:g} standard errors "
         f"(largest pull {worst:.1f}, {_readable_name(PARAMETERS[int(pulls.argmax())])})",
         worst <= _LARGEST_PULL,
     )

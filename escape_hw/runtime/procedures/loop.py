@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from escape_hw.errors import ConfigError
@@ -57,7 +58,7 @@ class LoopProcedure(MatrixProcedure["LoopResult"]):
 
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[LoopResult]:
         """Measure the model PSF, search for the best gain if wanted, then close the loop."""
-        from escape_hw.calibration.loop.gain_search import best_gain
+        from escape_hw.calibration.loop.gain_search import find_best_gain
         from escape_hw.calibration.loop.performance import close_loop
 
         require_hardware_matrix(self.product, bench, self.force)
@@ -68,13 +69,15 @@ class LoopProcedure(MatrixProcedure["LoopResult"]):
             self._recorder = LoopTelemetryRecorder(self.record, grid.n_slopes, bench.dm.info.n_act)
             bench.callbacks = self._recorder.callbacks
         model = yield from self.take_model_psf(bench)
-        gain = None
+        gain = gain_sigma = None
         if self.best_gain:
-            gain, runs = yield from best_gain(bench, matrix, grid, model_psf=model)
-            stopped = [run for run in runs if run.partial]
+            search = yield from find_best_gain(bench, matrix, grid, model_psf=model)
+            gain, gain_sigma = search.gain, search.sigma
+            stopped = [run for run in search.runs if run.partial]
             if stopped:
                 return stopped[-1]
-        return (yield from close_loop(bench, matrix, grid, gain=gain, frames=self.frames, model_psf=model))
+        result = yield from close_loop(bench, matrix, grid, gain=gain, frames=self.frames, model_psf=model)
+        return replace(result, gain_sigma=gain_sigma)
 
     def save(
         self, folder: RunFolder, record: BenchRecord, result: LoopResult, wall_seconds: float

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from escape_hw.calibration.acquisition.checkpoint import Checkpoint
     from escape_hw.calibration.acquisition.sensor_setup import SensorSetup
     from escape_hw.calibration.acquisition.stopping import Target
+    from escape_hw.calibration.loop.gain_search import GainSearch
     from escape_hw.calibration.optical_gain.bootstrap import GainsRun
     from escape_hw.io.fits.matrix import MatrixProduct
     from escape_hw.runtime.sweep.result import SweepResult
@@ -210,8 +211,8 @@ class System(Bench):
         frames: int = 1500,
         model_psf: NDArray[np.float32] | None = None,
         progress: bool = False,
-    ) -> tuple[float, list[LoopResult]]:
-        """Find the gain with the smallest residual or, given a model PSF, the highest Strehl ratio.
+    ) -> GainSearch:
+        """Close the loop at several gains and find the one with the highest Strehl ratio or lowest residual.
 
         Parameters
         ----------
@@ -228,9 +229,8 @@ class System(Bench):
 
         Returns
         -------
-        gain : float
-        runs : list of LoopResult
-            One run per gain.
+        GainSearch
+            ``gain``, its standard error ``sigma``, and ``runs``, one per gain; unpacks as ``gain, runs``.
 
         Raises
         ------
@@ -239,10 +239,10 @@ class System(Bench):
         Aborted
             Stopped by Ctrl-C.
         """
-        from escape_hw.calibration.loop.gain_search import best_gain
+        from escape_hw.calibration.loop.gain_search import find_best_gain
 
         matrix, grid = as_matrix_and_grid(matrix, grid)
-        procedure = best_gain(self, matrix, grid, gains=gains, frames=frames, model_psf=model_psf)
+        procedure = find_best_gain(self, matrix, grid, gains=gains, frames=frames, model_psf=model_psf)
         return self.run(procedure, progress=progress)
 
     @procedure_method(GainsProcedure)

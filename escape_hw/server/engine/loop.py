@@ -93,7 +93,7 @@ class LoopRunner:
         settings = self._merge(request)
         product = None if request.matrix is None else self._load_matrix(request.matrix)
         if control is not None:
-            control.change(
+            control.request_change(
                 calibration=None if product is None else product.result,
                 gain=request.gain, leak=request.leak, dropped_modes=request.dropped_modes,
             )  # fmt: skip

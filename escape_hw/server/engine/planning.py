@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from escape_hw.calibration.acquisition.sensor_setup import build_modal_basis, compute_poke_amplitudes
+from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
 from escape_hw.calibration.docrime.open_loop import minimum_frames
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.remote.state import Arguments, ProcedurePlan
 from escape_hw.runtime.procedures.registry import find_procedure
 

@@ -202,7 +202,7 @@ class EngineState:
         """Reserve the engine for a procedure, see :meth:`check_can_start`; opens a closed loop."""
         loop_before = self.check_can_start(needs_loop)
         if self._now.loop_control is not None:
-            self._now.loop_control.open()
+            self._now.loop_control.request_open()
         run = ActiveRun(
             id=self._next_run_id, name=name, arguments=arguments, stage="starting",
             started_utc=format_utc(),

@@ -1,0 +1,102 @@
+"""Rules that detect a diverging loop: what opens it, when, and what does not."""
+
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+import pytest
+from small_system import configuration
+
+from escape_hw.calibration.loop.divergence import (
+    BlockResidualMonitor,
+    DivergenceLimits,
+    ResidualMonitor,
+    SaturationMonitor,
+    is_steady,
+)
+from escape_hw.calibration.loop.runner import LoopRecord
+
+RATE_HZ = 500.0
+
+
+def frames_until_opened(monitor: ResidualMonitor, residual: np.ndarray, block: int = 50) -> int | None:
+    for start in range(0, residual.size, block):
+        if monitor(array("f", residual[start : start + block].tolist())):
+            return start + block
+    return None
+
+
+def converging(frames: int, level: float = 50.0) -> np.ndarray:
+    noise = np.random.default_rng(1).normal(0, 0.1 * level, frames)
+    return level + noise + 500 * np.exp(-np.arange(frames) / 10)
+
+
+def test_factor_and_time_come_from_the_configuration():
+    config = configuration(
+        "server.diverging_factor=3", "server.diverging_s=0.4", "server.saturated_share=0.5"
+    )
+    limits = DivergenceLimits.from_config(config)
+    assert (limits.residual_factor, limits.residual_s, limits.saturated_fraction) == (3, 0.4, 0.5)
+    assert DivergenceLimits.from_config(configuration()) == DivergenceLimits()
+
+
+@pytest.mark.parametrize("seconds", [0.4, 1.0])
+def test_a_residual_that_stays_too_large_opens_the_loop_after_the_time_configured(seconds):
+    residual = np.concatenate([converging(2000), np.full(2000, 700.0)])
+    monitor = ResidualMonitor(DivergenceLimits(residual_s=seconds), RATE_HZ)
+    opened = frames_until_opened(monitor, residual)
+    assert opened is not None
+    assert 2000 + seconds * RATE_HZ <= opened <= 2000 + seconds * RATE_HZ + 150
+    assert monitor.growth > 4
+
+
+@pytest.mark.parametrize(
+    "residual",
+    [
+        converging(4000),
+        np.concatenate([converging(2000), np.full(200, 700.0), converging(2000)[500:]]),
+        np.concatenate([converging(2000), np.full(2000, 150.0)]),
+        np.concatenate([converging(2000), np.full(2000, 480.0)]),
+    ],
+    ids=["converges", "a gust", "below the factor", "below the residual at closing"],
+)
+def test_these_leave_it_closed(residual):
+    assert frames_until_opened(ResidualMonitor(DivergenceLimits(), RATE_HZ), residual) is None
+
+
+def test_a_residual_that_is_not_finite_opens_it_at_once():
+    residual = converging(300)
+    residual[120:] = np.nan
+    assert frames_until_opened(ResidualMonitor(DivergenceLimits(), RATE_HZ), residual) == 150
+
+
+def test_saturation_must_last():
+    is_saturated = SaturationMonitor(DivergenceLimits(), 100)
+    assert not any(is_saturated(21) for _ in range(49))
+    assert not is_saturated(20)
+    assert not any(is_saturated(100) for _ in range(49))
+    assert is_saturated(21)
+
+
+def test_a_loop_with_pokes_is_compared_with_its_last_blocks():
+    monitor, record = BlockResidualMonitor(DivergenceLimits()), LoopRecord()
+
+    def block(level: float, shortened: int = 0) -> bool:
+        frames, before = len(record.residual), record.shortened
+        record.residual.extend([level] * 100)
+        record.shortened += shortened
+        return monitor(record, frames, before)
+
+    assert not any(block(level) for level in (1000.0, 50.0, 50.0, 150.0))
+    assert not block(120.0, shortened=80)
+    assert block(260.0, shortened=95)
+    assert block(500.0)
+
+
+def test_a_run_is_steady_unless_it_doubles_at_its_end():
+    residual = converging(3000).astype(np.float32)
+    assert is_steady(residual)
+    residual[2000:] *= 2.2
+    assert not is_steady(residual)
+    assert not is_steady(np.array([1.0, np.nan], np.float32))
