@@ -321,7 +321,7 @@ def run_tracker(options: argparse.Namespace) -> None:
         found = bench.run(
             track(
                 bench, result.matrix, result.grid, seconds=options.seconds, registration=result.registration,
-                response=result.response, model_psf=psf, memory_s=options.memory, poke=options.poke,
+                response=result.response, model_psf=psf, forgetting_time_s=options.memory, poke=options.poke,
             ),
             observers=(ProgressLog(options.out / "live.jsonl"),),
         )  # fmt: skip

@@ -16,6 +16,7 @@ T = TypeVar("T")
 RENAMED_KEYS: dict[str, str] = {
     "calibration.actuators": "actuator_model",
     "calibration.also": "extra_parameters",
+    "tracking.memory_s": "forgetting_time_s",
     "tracking.worth": "exchange_threshold",
     "tracking.limit": "exchange_limit",
     "tracking.largest_shift": "max_shift",

@@ -53,7 +53,7 @@ class TrackingSection(Section):
         le=0.1,
         description="closed-loop pokes are uniform in +-poke, rms surface as fraction of full stroke",
     )
-    memory_s: float = Field(
+    forgetting_time_s: float = Field(
         10.0,
         ge=1,
         le=1e5,

@@ -152,7 +152,7 @@ def test_names_of_earlier_versions_are_accepted_with_a_warning() -> None:
         assert DocrimeProcedure.from_arguments({"plain": True}).whiten is False
     with pytest.warns(RenamedWarning, match="--memory is called --forgetting-time-s"):
         request = TrackProcedure.from_arguments({"im": "im.fits", "memory": 5.0}, option_name)
-    assert request.overrides == ("tracking.memory_s=5.0",)
+    assert request.overrides == ("tracking.forgetting_time_s=5.0",)
     with pytest.warns(RenamedWarning, match="budget is called allowed_strehl_loss"):
         arguments = ProcedureRegistry(configuration()).arguments("gains", {"budget": 0.02})
     assert arguments["allowed_strehl_loss"] == 0.02

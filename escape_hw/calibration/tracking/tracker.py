@@ -66,7 +66,7 @@ def track(
     registration: RegistrationEstimate | None = None,
     response: TemporalResponse | None = None,
     poke: float | None = None,
-    memory_s: float | None = None,
+    forgetting_time_s: float | None = None,
     exchange: bool = True,
     gain: float | None = None,
     model_psf: NDArray[np.float32] | None = None,
@@ -85,7 +85,7 @@ def track(
         Temporal response, if it is known.
     poke
         Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke; as configured.
-    memory_s
+    forgetting_time_s
         Time in which the weight of a frame falls to ``1 / e``; as configured by default.
     exchange
         Whether a new matrix may be used without confirmation, within the configured limits; false: new
@@ -109,10 +109,10 @@ def track(
     """
     t = bench.config.tracking
     poke = t.poke if poke is None else poke
-    memory = t.memory_s if memory_s is None else memory_s
+    memory = t.forgetting_time_s if forgetting_time_s is None else forgetting_time_s
     if not (STEP_S <= seconds < math.inf and 0 < poke < math.inf and 0 < memory < math.inf):
         raise ConfigError(
-            f"seconds is {seconds}, poke {poke} and memory_s {memory}; the first must be at least "
+            f"seconds is {seconds}, poke {poke} and forgetting_time_s {memory}; the first must be at least "
             f"{STEP_S:g}, the others positive"
         )
     tracker = _Tracker(bench, matrix, grid, registration, response, poke, memory, exchange, gain, model_psf)
@@ -145,7 +145,7 @@ class _Tracker:
         registration: RegistrationEstimate | None,
         response: TemporalResponse | None,
         poke: float,
-        memory_s: float,
+        forgetting_time_s: float,
         exchange: bool,
         gain: float | None,
         model_psf: NDArray[np.float32] | None,
@@ -159,7 +159,7 @@ class _Tracker:
                 f"the matrix has no registration to start from: {'; '.join(start.warnings)}"
             )
         self.amplitude = compute_poke_amplitudes(bench, matrix.m2c, poke)
-        self.response, self.memory = response, memory_s / STEP_S
+        self.response, self.memory = response, forgetting_time_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
         self.in_use = ActiveReconstructor(matrix, invert_matrix(matrix, self.dropped), start, 1.0)
         self.alarm_monitor = AlarmMonitor(start.registration, t.max_shift, response)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 #: Reason why a report does not show the injected registration of a drifting twin.
 INJECTED_UNKNOWN = (
-    "the twin behind these drivers drifts with a clock of its own, so the injected registration is not known"
+    "the twin behind these drivers drifts with a clock of its own, so its true registration is not known"
 )
 
 
@@ -41,7 +41,7 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
     )  # fmt: skip
     forgetting_time_s: float | None = parameter(
         default=None, help="Time in which the weight of a frame falls to 1/e.", unit="s", low=1, high=1e5,
-        config_key="tracking.memory_s", sets_config=True, deprecated=("memory", "memory_s"),
+        config_key="tracking.forgetting_time_s", sets_config=True, deprecated=("memory", "memory_s"),
         label="Forgetting time",
     )  # fmt: skip
     gain: float | None = parameter(

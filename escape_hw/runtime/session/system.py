@@ -392,7 +392,7 @@ class System(Bench):
         procedure = track(
             self, calibration.matrix, calibration.grid, seconds=seconds,
             registration=calibration.registration, response=calibration.response, poke=poke,
-            memory_s=forgetting_time_s, exchange=exchange, gain=gain, model_psf=model_psf,
+            forgetting_time_s=forgetting_time_s, exchange=exchange, gain=gain, model_psf=model_psf,
         )  # fmt: skip
         return self.run(procedure, progress=progress)
 
