@@ -319,7 +319,8 @@ def measure_optical_gains(
     found = result.calibrations["ESCAPE"]
     beside = {label: one.matrix for label, one in result.calibrations.items() if label != "ESCAPE"}
     run = yield from bootstrap_gains(
-        bench, found, comparisons=beside, frames=frames, accuracy=accuracy, closed_loop_matrix=static_light_matrix(bench, found),
+        bench, found, comparisons=beside, frames=frames, accuracy=accuracy,
+        closed_loop_matrix=static_light_matrix(bench, found),
         model_psf=model,
     )  # fmt: skip
     result.gains, result.rescaled_calibration, result.partial = (
