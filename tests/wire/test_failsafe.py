@@ -1,4 +1,4 @@
-"""The fail-safe process with an adaptive secondary: a floating shell is rested, a rested one is not lifted."""
+"""The fail-safe process with an adaptive secondary: a floating shell is rested, a rested one not lifted."""
 
 from __future__ import annotations
 
