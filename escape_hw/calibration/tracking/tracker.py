@@ -289,7 +289,10 @@ class _Tracker:
             frames, shortened = loop.record.frames, loop.record.shortened
             steps = loop.run(self.frames, inject=self._draw_poke, observe=[self.buffer])
             yield from self._forward_progress(steps, report, second)
-            if loop.record.diverged or self.divergence_monitor(loop.record, frames, shortened):
+            record = loop.record
+            if record.diverged or self.divergence_monitor(
+                record.residual[frames:], record.shortened - shortened
+            ):
                 self._report_divergence()
                 return
             # A twin's clock stands still meanwhile; at a real bench the loop does not wait.
