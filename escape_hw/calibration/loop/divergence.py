@@ -53,7 +53,7 @@ class DivergenceLimits:
 
     @classmethod
     def from_config(cls, config: SystemConfig) -> Self:
-        """Limits ``diverging_factor``, ``diverging_s`` and ``saturated_fraction`` of the section ``[server]``."""
+        """Limits of ``[server]``: ``diverging_factor``, ``diverging_s``, ``saturated_fraction``."""
         server = config.server
         return cls(server.diverging_factor, server.diverging_s, server.saturated_fraction)
 
