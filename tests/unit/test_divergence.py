@@ -15,7 +15,6 @@ from escape_hw.calibration.loop.divergence import (
     SaturationMonitor,
     is_steady,
 )
-from escape_hw.calibration.loop.runner import LoopRecord
 
 RATE_HZ = 500.0
 
@@ -34,7 +33,7 @@ def converging(frames: int, level: float = 50.0) -> np.ndarray:
 
 def test_factor_and_time_come_from_the_configuration():
     config = configuration(
-        "server.diverging_factor=3", "server.diverging_s=0.4", "server.saturated_share=0.5"
+        "server.diverging_factor=3", "server.diverging_s=0.4", "server.saturated_fraction=0.5"
     )
     limits = DivergenceLimits.from_config(config)
     assert (limits.residual_factor, limits.residual_s, limits.saturated_fraction) == (3, 0.4, 0.5)
@@ -80,13 +79,10 @@ def test_saturation_must_last():
 
 
 def test_a_loop_with_pokes_is_compared_with_its_last_blocks():
-    monitor, record = BlockResidualMonitor(DivergenceLimits()), LoopRecord()
+    monitor = BlockResidualMonitor(DivergenceLimits())
 
     def block(level: float, shortened: int = 0) -> bool:
-        frames, before = len(record.residual), record.shortened
-        record.residual.extend([level] * 100)
-        record.shortened += shortened
-        return monitor(record, frames, before)
+        return monitor([level] * 100, shortened)
 
     assert not any(block(level) for level in (1000.0, 50.0, 50.0, 150.0))
     assert not block(120.0, shortened=80)

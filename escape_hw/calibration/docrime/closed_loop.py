@@ -126,7 +126,7 @@ class ClosedLoopAcquisition:
                 loop.open()
                 self._aborted = True
             estimator_thread.finish()
-        require_not_diverged(loop.record)
+        require_not_diverged(loop.record.diverged, loop.record.frames)
         if self._aborted:
             self._save_and_check(final=True)
         return self._aborted

@@ -242,7 +242,7 @@ def _record_frames(
             raise Aborted(
                 f"aborted after {loop.record.frames} of {n_frames} frames, too few for a registration"
             ) from None
-    require_not_diverged(loop.record)
+    require_not_diverged(loop.record.diverged, loop.record.frames)
 
 
 def _take_telemetry(buffer: TelemetryBuffer, n_unknown: int) -> AlignedTelemetry:

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 from array import array
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import CalibrationError
-
-if TYPE_CHECKING:
-    from escape_hw.calibration.loop.runner import LoopRecord
 
 #: Frames of the running means of the squared residual: the present one and the usual one.
 _PRESENT_FRAMES, _USUAL_FRAMES = 50, 2000
@@ -133,20 +131,19 @@ class BlockResidualMonitor:
         self._limits = limits
         self._residual: deque[float] = deque(maxlen=_MAX_USUAL_BLOCKS)
 
-    def __call__(self, record: LoopRecord, frames: int, shortened: int) -> bool:
+    def __call__(self, residual: Sequence[float], n_shortened: int) -> bool:
         """Whether the loop diverged in its last block.
 
         Parameters
         ----------
-        record
-            Record of the loop.
-        frames, shortened
-            Frames and shortened commands in the record before the block.
+        residual
+            Residual of each frame of the block, in nm.
+        n_shortened
+            Number of commands in the block that the limits shortened.
         """
-        residual = np.array(record.residual[frames:])
         rms = float(np.sqrt(np.mean(np.square(residual))))
         usual = float(np.median(self._residual)) if len(self._residual) >= _MIN_USUAL_BLOCKS else np.inf
-        is_limited = record.shortened - shortened > self._limits.limited_fraction * len(residual)
+        is_limited = n_shortened > self._limits.limited_fraction * len(residual)
         factor = self._limits.limited_residual_factor if is_limited else self._limits.residual_factor
         if rms > factor * usual:
             return True
@@ -163,11 +160,11 @@ def is_steady(residual: NDArray[np.float32]) -> bool:
     return bool(np.isfinite(residual).all() and last < _MAX_GROWTH_BETWEEN_THIRDS * middle)
 
 
-def require_not_diverged(record: LoopRecord) -> None:
+def require_not_diverged(diverged: bool, frames: int) -> None:
     """Raise :class:`CalibrationError` if the loop was opened because it diverged."""
-    if record.diverged:
+    if diverged:
         raise CalibrationError(
-            f"the loop diverged after {record.frames} frames and was opened: the actuators stayed at their "
+            f"the loop diverged after {frames} frames and was opened: the actuators stayed at their "
             "limits. Lower loop.gain or raise loop.dropped_modes; if that does not help, measure the matrix "
             "again or check the loop delay"
         )

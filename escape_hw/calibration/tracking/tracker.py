@@ -230,7 +230,10 @@ class _Tracker:
             frames, shortened = loop.record.frames, loop.record.shortened
             steps = loop.run(self.frames, inject=self._draw_poke, observe=[self.buffer])
             yield from self._forward_progress(steps, report, second)
-            if loop.record.diverged or self.divergence_monitor(loop.record, frames, shortened):
+            record = loop.record
+            if record.diverged or self.divergence_monitor(
+                record.residual[frames:], record.shortened - shortened
+            ):
                 self.result.stable = False
                 text = "the loop diverged and was opened; calibrate again"
                 self.result.alarms.append(Alarm(self._elapsed_s(), "diverged", text))
