@@ -118,8 +118,8 @@ def save_comparison(
         # A matrix scaled by its optical gains comes from the one saved.
         add_loop(folder, record, f"loop_{product_key(label)}", loop, saved[label.removesuffix(WITH_GAINS)])
     if result.gains is not None:
-        beside = {product_key(label): saved[label] for label in result.gains.beside}
-        add_gains(folder, record, "gains", result.gains, {"im": saved["ESCAPE"], **beside})
+        others = {product_key(label): saved[label] for label in result.gains.comparisons}
+        add_gains(folder, record, "gains", result.gains, {"im": saved["ESCAPE"], **others})
     escape = result.calibrations.get("ESCAPE")
     estimate = None if escape is None else escape.registration
     checks = (

@@ -219,7 +219,7 @@ def reproduce_maps(
         No gain gives a stable loop.
     """
     from escape_hw.calibration.docrime.open_loop import require_enough_frames
-    from escape_hw.calibration.sprint.synthetic_matrix import simulated
+    from escape_hw.calibration.sprint.synthetic_matrix import nominal_calibration
 
     require_enough_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
     result = CalibrationComparison()
@@ -234,7 +234,7 @@ def reproduce_maps(
         result.calibrations["ESCAPE"] = found
         yield from _close_loops(bench, loop_frames, result)
         if not result.partial:
-            result.calibrations["simulation"] = simulated(bench, found.grid, found.matrix.m2c)
+            result.calibrations["simulation"] = nominal_calibration(bench, found.grid, found.matrix.m2c)
     except Aborted:
         result.partial = True
     return result

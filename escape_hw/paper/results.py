@@ -59,7 +59,7 @@ def _table1_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
     found: dict[str, dict[str, float]] = {}
     for column, stated in TABLE1.items():
         result = _calibration(run, f"ESCAPE {column}")
-        measured = None if result is None or result.registration is None else result.registration.measured()
+        measured = None if result is None or result.registration is None else result.registration.parameters()
         for name, value in stated.items():
             title, unit = TITLES[name]
             ours = None
@@ -115,7 +115,7 @@ def _format_gains(gains: OpticalGains | None) -> str | None:
 
 def _pywfs_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
     result = None if run is None else next(iter(run.gains.values()), None)
-    beside: Mapping[str, OpticalGains] = {} if result is None else result.beside
+    beside: Mapping[str, OpticalGains] = {} if result is None else result.comparisons
     yield PaperNumber(
         "pyramid, optical gain of the baseline",
         "< 1, roughly constant",

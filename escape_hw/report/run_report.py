@@ -215,15 +215,16 @@ def _track_section(run: RunContent) -> str:
         (
             f"{one['seconds']:.0f}", "exchanged" if one["accepted"] else "proposed",
             f"{one['mismatch']:.1%} ± {one['mismatch_sigma']:.1%}",
-            f"{one['slowest']:.3f}", f"{one['fastest']:.3f}",
+            f"{one.get('min_loop_gain', one.get('slowest')):.3f}",
+            f"{one.get('max_loop_gain', one.get('fastest')):.3f}",
         )
         for one in exchanges
     )  # fmt: skip
     parts = [html.figure("track", drawing, caption)]
     if lines:
-        heads = ("seconds", "", "change of the matrix", "slowest mode", "fastest mode")
+        heads = ("seconds", "", "change of the matrix", "smallest loop gain", "largest loop gain")
         what = (
-            "New matrices. Slowest, fastest: loop gain of the modes with the previous matrix; 1 is nominal."
+            "New matrices. Loop gains: of the modes with the previous matrix, relative to the nominal gain."
         )
         parts.append(html.table(tables.Table(heads, lines), what))
     parts.append(html.note_list([f"after {one['seconds']:.0f} s: {one['text']}" for one in alarms], "bad"))

@@ -80,7 +80,7 @@ def registration_table(
         The truth hidden in a twin, shown in a last column; beside each estimate then stands its
         difference from the truth over its standard error.
     """
-    return parameters_table({k: {**one.measured(), **one.extras} for k, one in estimates.items()}, injected)
+    return parameters_table({k: {**one.parameters(), **one.extras} for k, one in estimates.items()}, injected)
 
 
 def parameters_table(

@@ -12,6 +12,7 @@ import fake_results as fake
 import pytest
 
 from escape_hw.api.procedure import Progress
+from escape_hw.calibration.loop.gain_search import GainSearch
 from escape_hw.config.loader import load_system
 from escape_hw.errors import Aborted
 
@@ -96,12 +97,12 @@ class FakeProcedures:
             return fake.loop(matrix.method, partial=True)
         return replace(fake.loop(matrix.method), **self.changes)
 
-    def best_gain(self, bench: FakeBench, matrix: Any, grid: Any, **options: Any):
+    def find_best_gain(self, bench: FakeBench, matrix: Any, grid: Any, **options: Any):
         self.calls.append(("best_gain", {"method": matrix.method}))
         yield from steps("gain")
-        return 0.35, [replace(fake.loop(matrix.method), gain=g) for g in (0.25, 0.35, 0.45)]
+        return GainSearch(0.35, 0.02, [replace(fake.loop(matrix.method), gain=g) for g in (0.25, 0.35, 0.45)])
 
-    def simulated(self, bench: FakeBench, grid: Any, m2c: Any):
+    def nominal_calibration(self, bench: FakeBench, grid: Any, m2c: Any):
         self.calls.append(("simulated", {}))
         return fake.calibration("simulated")
 
@@ -126,9 +127,9 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         "escape.method": ("escape",),
         "sprint.fit": ("estimate_registration",),
         "loop.performance": ("close_loop",),
-        "loop.gain_search": ("best_gain",),
+        "loop.gain_search": ("find_best_gain",),
         "acquisition.model_psf": ("measure_model_psf",),
-        "sprint.synthetic_matrix": ("simulated", "synthesise_from_measurement"),
+        "sprint.synthetic_matrix": ("nominal_calibration", "synthesise_from_measurement"),
     }
     # All of them are imported first: a module that is imported later would keep a replaced function.
     for module in places:

@@ -18,7 +18,8 @@ LINKED = ("--set", "devices.dm.mode=hardware", "--set", "devices.dm.options.repl
 @pytest.fixture
 def asm():
     """An emulated mirror and the options that lead to it."""
-    made = make_emulator(EmulatorRequest(port=0, options={"transition_speed": "1000", "hold_s": "20", "rest_s": "60"}))
+    options = {"transition_speed": "1000", "hold_s": "20", "rest_s": "60"}
+    made = make_emulator(EmulatorRequest(port=0, options=options))
     with made:
         port = made.start().rpartition(":")[2]
         yield made, ("maps-nir", *LINKED, "--set", f"devices.dm.options.port={port}")

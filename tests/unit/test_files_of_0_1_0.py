@@ -35,7 +35,7 @@ def reported(run: str) -> dict[str, Any]:
 def test_a_matrix_has_the_registration_that_its_run_reported():
     result, run = load_matrix(OLD / "escape" / "im.fits").result, reported("escape")
     assert result.registration is not None
-    for name, estimate in result.registration.measured().items():
+    for name, estimate in result.registration.parameters().items():
         expected = run["registration"][name]
         assert (estimate.value, estimate.sigma) == pytest.approx((expected["value"], expected["sigma"]))
     assert result.registration.converged

@@ -55,7 +55,7 @@ class DivergenceLimits:
 
     @classmethod
     def from_config(cls, config: SystemConfig) -> Self:
-        """Limits of the section ``[server]``: ``diverging_factor``, ``diverging_s``, ``saturated_fraction``."""
+        """Limits of ``[server]``: ``diverging_factor``, ``diverging_s``, ``saturated_fraction``."""
         server = config.server
         return cls(server.diverging_factor, server.diverging_s, server.saturated_fraction)
 

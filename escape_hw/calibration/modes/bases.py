@@ -266,7 +266,7 @@ def _fit_shapes(
     """Least-squares fit of the mirror to shapes ``(n_modes, n_pixels)``, without piston."""
     pupil_surfaces = _pupil_surfaces(surfaces, pupil)
     shapes = shapes - shapes.mean(axis=1, keepdims=True)
-    m2c = np.linalg.lstsq(pupil_surfaces.T, shapes.T, rcond=1e-6)[0]
+    m2c = np.asarray(np.linalg.lstsq(pupil_surfaces.T, shapes.T, rcond=1e-6)[0], dtype=np.float64)
     fitted_surfaces = m2c.T @ pupil_surfaces
     values = np.linalg.svd(
         fitted_surfaces / np.linalg.norm(fitted_surfaces, axis=1, keepdims=True), compute_uv=False

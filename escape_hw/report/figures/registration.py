@@ -38,7 +38,7 @@ def convergence(estimate: RegistrationEstimate, injected: Registration | None = 
         f"{state} after {len(steps)} iterations, reduced χ² {estimate.chi2:.3g}",
         loc="left", color=style.INK, fontsize=9.5,
     )  # fmt: skip
-    for panel, (name, value) in zip(panels[1:], estimate.measured().items(), strict=True):
+    for panel, (name, value) in zip(panels[1:], estimate.parameters().items(), strict=True):
         title, unit = TITLES[name]
         track = [getattr(step.registration, name) for step in steps]
         panel.plot(number, track, "o-", color=style.SERIES[2], ms=2.5, lw=1.3)

@@ -116,10 +116,10 @@ def measure_optical_gains(
 
     model = yield from model_psf(bench)
     found = result.calibrations["ESCAPE"]
-    beside = {label: one.matrix for label, one in result.calibrations.items() if label != "ESCAPE"}
+    others = {label: one.matrix for label, one in result.calibrations.items() if label != "ESCAPE"}
     run = yield from bootstrap_gains(
-        bench, found, beside=beside, frames=frames, accuracy=accuracy, shape=static_light_matrix(bench, found),
-        model_psf=model,
+        bench, found, comparisons=others, frames=frames, accuracy=accuracy,
+        closed_loop_matrix=static_light_matrix(bench, found), model_psf=model,
     )  # fmt: skip
     result.gains, result.partial = run.result, run.result.partial
     result.rescaled_calibration = run.rescaled_calibration
@@ -131,17 +131,17 @@ def with_and_without_optical_gains(
 ) -> Iterator[tuple[str, CalibrationResult]]:
     """Each matrix unscaled and scaled by its optical gains, with its label."""
     from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
-    from escape_hw.calibration.optical_gain.smoothing import usable
+    from escape_hw.calibration.optical_gain.smoothing import clip_gains
 
     if result.gains is None or result.gains.gains is None:
         return
-    gains_of = {"ESCAPE": result.gains.gains, **result.gains.beside}
+    gains_of = {"ESCAPE": result.gains.gains, **result.gains.comparisons}
     for label, one in known.items():
         yield label, one
         if label == "ESCAPE" and result.rescaled_calibration is not None:
             yield label + WITH_GAINS, result.rescaled_calibration
             continue
-        scaled = scale_matrix(one.matrix, usable(gains_of[label]), gains_of[label].best_sigma)
+        scaled = scale_matrix(one.matrix, clip_gains(gains_of[label]), gains_of[label].best_sigma)
         yield label + WITH_GAINS, replace(one, matrix=scaled, measured=None)
 
 

@@ -104,7 +104,7 @@ def read_variants(
     scaled = {} if gains is None else _scale_by_gains({k: one.result for k, one in named.items()}, gains)
     if gains is not None and not scaled:
         raise ConfigError(
-            f"the optical gains are those of {', '.join((gains.method, *gains.beside))}; "
+            f"the optical gains are those of {', '.join((gains.method, *gains.comparisons))}; "
             f"the matrices are {', '.join(named)}"
         )
     variants = []
@@ -120,14 +120,14 @@ def _scale_by_gains(
     known: Mapping[str, CalibrationResult], gains: GainsResult
 ) -> dict[str, CalibrationResult]:
     from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
-    from escape_hw.calibration.optical_gain.smoothing import usable
+    from escape_hw.calibration.optical_gain.smoothing import clip_gains
 
-    vectors = {METHOD_LABELS.get(gains.method, gains.method): gains.gains, **gains.beside}
+    vectors = {METHOD_LABELS.get(gains.method, gains.method): gains.gains, **gains.comparisons}
     found = {}
     for label, one in known.items():
         vector = vectors.get(label) or vectors.get(product_key(label))
         if vector is not None:
-            matrix = scale_matrix(one.matrix, usable(vector), vector.best_sigma)
+            matrix = scale_matrix(one.matrix, clip_gains(vector), vector.best_sigma)
             found[label] = replace(one, matrix=matrix, measured=None)
     return found
 
