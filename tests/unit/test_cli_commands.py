@@ -110,8 +110,8 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
         "solver": "mixed-effects",
         "modes_choice": "snr",
         "loss": "squares",
-        "actuators": "fitted",
-        "also": (),
+        "actuator_model": "fitted",
+        "extra_parameters": (),
     }
     assert bench.calls == [("sprint", asked)]
     assert (
